@@ -1,0 +1,397 @@
+"""A robot's motion as arrays: `Log` as it was recorded, `Trajectory` as it is identified from.
+
+Reading and writing files is in `robotid.log_files`.
+"""
+
+import difflib
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+
+__all__ = ["Log", "LogUnits", "Trajectory", "check_units"]
+
+#: Divisors that turn a time unit into seconds.
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_DEGREES = 180 / np.pi  # degrees in a radian
+_SLOWEST = 0.1  # [s] a longer median step is taken for another unit
+_FARTHEST = 4 * np.pi  # [rad] joints beyond two turns are taken for degrees
+_STRETCH = 0.1  # [s] motion is compared over stretches this long: noise and jitter average out
+_GAP = 5  # a step longer than this many median steps is a gap
+_ALIKE = 0.9  # correlation from which two signals are one but for a factor
+_NEAR = 0.1  # relative tolerance on that factor
+
+
+@dataclass(frozen=True)
+class LogUnits:
+    """Units of a log file; None means SI, and is refused if the numbers look otherwise.
+
+    Attributes:
+        time: Unit of the time stamps: "s", "ms", "us" or "ns". Velocities stay per second.
+        angle: Unit of q, dq and ddq of joints that turn: "rad" or "deg".
+    """
+
+    time: str | None = None
+    angle: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, known in (("time", list(PER_SECOND)), ("angle", ["rad", "deg"])):
+            value = getattr(self, name)
+            if value is not None and value not in known:
+                raise SettingsError(f"units: {name} is {value!r}, wanted one of {known}")
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A recording, sample by sample, in SI units. The arrays cannot be written to.
+
+    Attributes:
+        t: Time stamps, strictly increasing, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        tau: Joint torques, shape (N, n) [N m or N].
+        joints: Names of the n joints, in the order of the columns.
+        v: Measured velocities, shape (N, n) [rad/s or m/s], or None.
+        a: Measured accelerations, shape (N, n) [rad/s^2 or m/s^2], or None.
+        path: The file it was read from; "" if it was made in memory.
+        notes: What the reader should know, as columns that were ignored.
+    """
+
+    t: Array
+    q: Array
+    tau: Array
+    joints: tuple[str, ...]
+    v: Array | None = None
+    a: Array | None = None
+    path: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = _where(self.path)
+        _settle(self, where, {"q": self.q, "dq": self.v, "ddq": self.a, "tau": self.tau})
+        if len(self.t) < 2:
+            raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
+        _require_increasing(self.t, where)
+
+    def window(self, start: float | None = None, end: float | None = None) -> "Log":
+        """Return the rows from start to end, both included.
+
+        Args:
+            start: First time stamp kept, on the log's own clock [s]; None for the first row.
+            end: Last time stamp kept [s]; None for the last row.
+
+        Returns:
+            The shorter log.
+
+        Raises:
+            DataError: If fewer than two rows are left.
+        """
+        first = self.t[0] if start is None else start
+        last = self.t[-1] if end is None else end
+        rows = np.flatnonzero((self.t >= first) & (self.t <= last))
+        if len(rows) < 2:
+            raise DataError(
+                f"{_where(self.path)}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
+                f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
+            )
+        kept = slice(rows[0], rows[-1] + 1)
+        cut: dict[str, Any] = {
+            name: x if x is None else x[kept] for name, x in self._arrays().items()
+        }
+        return replace(self, t=self.t[kept], **cut)
+
+    def select(self, joints: Sequence[str]) -> "Log":
+        """Return the log of some joints.
+
+        Args:
+            joints: Names of the joints kept, in the order wanted.
+
+        Returns:
+            The narrower log.
+
+        Raises:
+            DataError: If a joint is not in the log.
+        """
+        for name in joints:
+            if name not in self.joints:
+                raise DataError(
+                    f"joint {name!r} is not in {_where(self.path)}; joints: {list(self.joints)}"
+                    f"{suggestion(name, self.joints)}"
+                )
+        kept = [self.joints.index(name) for name in joints]
+        cut: dict[str, Any] = {
+            name: x if x is None else x[:, kept] for name, x in self._arrays().items()
+        }
+        return replace(self, joints=tuple(joints), **cut)
+
+    def _arrays(self) -> dict[str, Any]:
+        """Return the arrays with a column per joint."""
+        return {"q": self.q, "tau": self.tau, "v": self.v, "a": self.a}
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion that is smooth within each segment, in SI units. The arrays cannot be written to.
+
+    Attributes:
+        t: Time stamps, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        v: Velocities, shape (N, n) [rad/s or m/s].
+        a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
+        tau: Torques, shape (N, n) [N m or N].
+        joints: Names of the n joints, in the order of the columns.
+        rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
+        segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    joints: tuple[str, ...]
+    rate: float | None
+    segment: Array
+
+    def __post_init__(self) -> None:
+        _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
+        segment = np.asarray(self.segment)
+        if segment.shape != self.t.shape or segment.dtype.kind not in "iu":
+            raise DataError(
+                f"trajectory: segment is {segment.dtype} of shape {segment.shape}, wanted integers "
+                f"of shape {self.t.shape}"
+            )
+        object.__setattr__(self, "segment", _frozen(segment, np.int_))
+        if self.rate is not None and not 0 < self.rate < np.inf:
+            raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
+
+
+def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
+    """Refuse a log whose numbers look like another unit than SI, unless the unit was stated.
+
+    The measured velocity is compared with the position over short stretches: the factor between
+    the integral of dq and the change of q is 1 if both are in SI units.
+
+    Args:
+        log: The log.
+        units: The units that were stated; what is stated is not suspected.
+        prismatic: Names of the joints that slide; the others turn.
+
+    Raises:
+        DataError: If time, angle or the sign of the velocity is suspect.
+    """
+    where = _where(log.path)
+    turns = np.array([name not in prismatic for name in log.joints])
+    factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
+    if units.time is None:
+        _check_step(float(np.median(np.diff(log.t))), where)
+        _check_clock(log, factor, where)
+    if units.angle is None:
+        _check_reach(log, turns, where)
+        _check_degrees(log, np.where(turns, factor, np.nan), where)
+    for j in np.flatnonzero(_is_near(factor, -1.0)):
+        raise DataError(
+            f"{where}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of q_{log.joints[j]}. "
+            "Negate one of them in the recording, or leave the dq columns out"
+        )
+
+
+def suggestion(name: str, known: Collection[str]) -> str:
+    """Return the question whether the nearest known name was meant, or "" if none is near.
+
+    Args:
+        name: The name that is not known.
+        known: The names that are.
+
+    Returns:
+        A sentence to put behind an error, with a full stop and a space before it.
+    """
+    near = difflib.get_close_matches(name, known, n=1)
+    return f". Did you mean {near[0]!r}?" if near else ""
+
+
+def repeated(names: Sequence[str]) -> list[str]:
+    """Return the names that occur more than once.
+
+    Args:
+        names: The names.
+
+    Returns:
+        Each repeated name once, sorted.
+    """
+    return sorted(name for name, count in Counter(names).items() if count > 1)
+
+
+def _check_step(step: float, where: str) -> None:
+    """Refuse a median time step that is too long for seconds."""
+    if step <= _SLOWEST * (1 + 1e-6):
+        return
+    unit = "ms" if step <= 1e2 else "us" if step <= 1e5 else "ns"
+    raise DataError(
+        f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]} "
+        f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
+        f"{_how_to_state('time', unit, 's')}"
+    )
+
+
+def _check_clock(log: Log, factor: Array, where: str) -> None:
+    """Refuse time stamps that make the measured velocity wrong by a power of 1000."""
+    for power, unit in ((1, "ms"), (2, "us"), (3, "ns"), (-1, "s"), (-2, "s"), (-3, "s")):
+        for j in np.flatnonzero(_is_near(np.abs(factor), 1000.0**power)):
+            looks = f"; the time looks like {_TIME_NAMES[unit]}" if power > 0 else ""
+            raise DataError(
+                f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt{looks}. "
+                f"{_how_to_state('time', unit, 's')}"
+            )
+
+
+def _check_reach(log: Log, turns: NDArray[np.bool_], where: str) -> None:
+    """Refuse joints that turn too far for radians."""
+    reach = np.where(turns, np.abs(log.q).max(axis=0), 0.0)  # (n,)
+    j = int(np.argmax(reach))
+    if reach[j] > _FARTHEST:
+        raise DataError(
+            f"{where}: q_{log.joints[j]} reaches {reach[j]:.4g}, which looks like degrees (in "
+            f"radians {reach[j] / (2 * np.pi):.1f} turns). {_how_to_state('angle', 'deg', 'rad')}"
+        )
+
+
+def _check_degrees(log: Log, factor: Array, where: str) -> None:
+    """Refuse joints of which only one of position and velocity is in degrees."""
+    for wrong, ratio in (("velocity", _DEGREES), ("position", 1 / _DEGREES)):
+        for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
+            raise DataError(
+                f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the {wrong} "
+                "looks like degrees, the other like radians. Convert one of them in the recording. "
+                f"{_how_to_state('angle', 'deg', 'rad', both=True)}"
+            )
+
+
+def _how_to_state(kind: str, unit: str, si: str, both: bool = False) -> str:
+    """Return how to state a unit, in the job file, on the command line and in Python."""
+    stated = si if both else unit
+    ways = (
+        f'units {kind} = "{stated}" (job file table [units], CLI --{kind}-unit {stated}, '
+        f'Python units=LogUnits({kind}="{stated}"))'
+    )
+    if stated == si:
+        return f"To read it as it is, state {ways}"
+    return f'State {ways}, or likewise "{si}" if that is right'
+
+
+def _velocity_factor(log: Log) -> Array:
+    """Return f with dq = f d(q)/dt for each joint, shape (n,); NaN where they are not alike."""
+    factor = np.full(len(log.joints), np.nan)
+    if log.v is None:
+        return factor
+    dt = np.diff(log.t)
+    median = float(np.median(dt))
+    length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
+    for j, (q, v) in enumerate(zip(log.q.T, log.v.T, strict=True)):
+        step = np.diff(q)
+        jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)  # a full turn
+        broken = (dt > _GAP * median) | jump
+        moved = _sums(np.where(broken, 0.0, step), length)
+        swept = _sums(np.where(broken, 0.0, dt * (v[1:] + v[:-1]) / 2), length)
+        both = float(moved @ swept)
+        size = float(np.sqrt((moved @ moved) * (swept @ swept)))
+        if len(dt) >= 10 and abs(both) > _ALIKE * size:
+            factor[j] = np.copysign(np.sqrt((swept @ swept) / (moved @ moved)), both)
+    return factor
+
+
+def _sums(steps: Array, length: int) -> Array:
+    """Return the sums over each stretch of so many consecutive steps."""
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    sums: Array = total[length:] - total[:-length]
+    return sums
+
+
+def _is_near(values: Array, wanted: float) -> NDArray[np.bool_]:
+    """Return which values are within the tolerance of the one wanted."""
+    near: NDArray[np.bool_] = np.abs(values / wanted - 1) < _NEAR
+    return near
+
+
+def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]) -> None:
+    """Check joints, shapes and values of the arrays, and replace them by read-only ones."""
+    if isinstance(owner.joints, str) or not owner.joints:
+        raise DataError(f"{where}: joints is {owner.joints!r}, wanted at least one name in a tuple")
+    joints = tuple(owner.joints)
+    if twice := repeated(joints):
+        raise DataError(f"{where}: joints {twice} are named twice; name each joint once")
+    t = _frozen(owner.t)
+    if t.ndim != 1:
+        raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
+    _require_finite(t[:, None], t, ["time"], where)
+    settled = {"t": t}
+    for name, values in arrays.items():
+        if values is None:
+            continue
+        array = _frozen(values)
+        if array.shape != (len(t), len(joints)):
+            raise DataError(
+                f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
+                f"for each time stamp, a column for each of the joints {list(joints)}"
+            )
+        _require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
+        settled[{"dq": "v", "ddq": "a"}.get(name, name)] = array
+    for name, array in settled.items():
+        object.__setattr__(owner, name, array)
+    object.__setattr__(owner, "joints", joints)
+
+
+def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
+    """Return the values as a read-only array; copied unless they cannot be written to already."""
+    array: Array = np.asarray(values, dtype=dtype)
+    if array.flags.writeable:
+        array = array.copy()
+        array.flags.writeable = False
+    return array
+
+
+def _require_finite(values: Array, t: Array, names: Sequence[str], where: str) -> None:
+    """Refuse NaN and infinite values, naming the first."""
+    if np.isfinite(values).all():
+        return
+    row, column = (int(i) for i in np.argwhere(~np.isfinite(values))[0])
+    found = "NaN" if np.isnan(values[row, column]) else str(values[row, column])
+    at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
+    raise DataError(
+        f"{where}: {names[column]} is {found} at row {row}{at}; remove the row or mend the "
+        "recording"
+    )
+
+
+def _require_increasing(t: Array, where: str) -> None:
+    """Refuse time stamps that repeat or go back, naming the first."""
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back) == 0:
+        return
+    k = int(back[0]) + 1
+    if t[k] == t[k - 1]:
+        raise DataError(
+            f"{where}: t must increase, but t[{k}] = {_stamp(t[k])} s is a duplicate time stamp, "
+            f"the same as t[{k - 1}]; remove one of the two rows"
+        )
+    raise DataError(
+        f"{where}: t must increase, but t[{k}] = {_stamp(t[k])} s follows t[{k - 1}] = "
+        f"{_stamp(t[k - 1])} s; sort the rows, or mend the recording"
+    )
+
+
+def _stamp(t: float) -> str:
+    """Return a time stamp with three decimals, or with as many as it has."""
+    return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
+
+
+def _where(path: str) -> str:
+    """Return what a log is called in errors."""
+    return Path(path).name or "log"

@@ -1,0 +1,88 @@
+"""The interface of estimators and what they return."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.factors import Factors, compress
+from robotid.problem import Problem
+
+__all__ = ["Estimate", "Estimator", "as_factors"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimated parameters and how well they are known.
+
+    Attributes:
+        theta: Parameters, shape (c,), SI units.
+        covariance: Their covariance, shape (c, c); infinite variance where the data say nothing.
+        names: Their names.
+        sigma: Standard deviation of the torque residual per joint, shape (n,) [N m or N].
+        rank: Number of directions that the data determine.
+        condition: Condition number of the columns scaled to unit norm, over those directions.
+        undetermined: Names of the parameters that the data leave open.
+        converged: Whether the iteration ended by its own criterion.
+        n_iter: Number of iterations.
+        message: What the estimator says of its run.
+    """
+
+    theta: Array
+    covariance: Array
+    names: tuple[str, ...]
+    sigma: Array
+    rank: int
+    condition: float
+    undetermined: tuple[str, ...]
+    converged: bool
+    n_iter: int
+    message: str
+
+    @property
+    def std_error(self) -> Array:
+        """Standard error of each parameter, shape (c,); inf where the data say nothing."""
+        errors: Array = np.sqrt(np.diag(self.covariance))
+        return errors
+
+
+class Estimator(ABC):
+    """Settings go into the constructor, data only into :meth:`fit`."""
+
+    @abstractmethod
+    def fit(self, data: Problem | Factors) -> Estimate:
+        """Estimate the parameters.
+
+        Args:
+            data: A problem in base parameters, or its factors.
+
+        Returns:
+            The estimate.
+
+        Raises:
+            DataError: If there are fewer rows than parameters.
+        """
+
+
+def as_factors(data: Problem | Factors) -> Factors:
+    """Return the factors of the data, and refuse data that cannot determine anything.
+
+    Args:
+        data: A problem or its factors.
+
+    Returns:
+        The factors.
+
+    Raises:
+        DataError: If there are fewer rows than parameters: a perfect fit would mean nothing.
+    """
+    factors = compress(data) if isinstance(data, Problem) else data
+    rows, columns = int(factors.rows.sum()), len(factors.names)
+    if rows < columns:
+        raise DataError(
+            f"{rows} torque rows for {columns} parameters: too few rows to fit; record at least "
+            f"{-(-10 * columns // len(factors.rows))} samples, or loosen min_velocity and trim"
+        )
+    return factors

@@ -1,0 +1,49 @@
+"""Robots of the installed package example-robot-data, found by file name."""
+
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+from robotid.exceptions import MissingDependencyError, ModelError
+
+__all__ = ["example_urdf", "example_urdfs"]
+
+
+def example_urdfs() -> tuple[Path, ...]:
+    """Return every URDF of example-robot-data.
+
+    Returns:
+        Paths, sorted.
+
+    Raises:
+        MissingDependencyError: If example-robot-data is not installed.
+    """
+    # its wheel ships data without a Python loader, so the files are found in its own record
+    try:
+        found = distribution("example-robot-data")
+    except PackageNotFoundError as error:
+        raise MissingDependencyError(
+            "finding example robots", "example-robot-data", "dev"
+        ) from error
+    files = [file for file in found.files or [] if file.suffix == ".urdf"]
+    return tuple(sorted(Path(str(found.locate_file(file))).resolve() for file in files))
+
+
+def example_urdf(name: str) -> Path:
+    """Return the path of one example robot.
+
+    Args:
+        name: File name, as "ur5_robot.urdf".
+
+    Returns:
+        Its path.
+
+    Raises:
+        MissingDependencyError: If example-robot-data is not installed.
+        ModelError: If it holds no such file.
+    """
+    urdfs = example_urdfs()
+    for path in urdfs:
+        if path.name == name:
+            return path
+    names = [path.name for path in urdfs]
+    raise ModelError(f"example-robot-data has no {name!r}; it has {names}")

@@ -1,0 +1,73 @@
+"""The errors of the package: each keeps its facts as attributes and says what to do next."""
+
+from collections.abc import Sequence
+
+__all__ = [
+    "DataError",
+    "MissingDependencyError",
+    "ModelError",
+    "NotConvergedError",
+    "RankDeficientError",
+    "RobotIdError",
+    "SettingsError",
+]
+
+
+class RobotIdError(Exception):
+    """Base class of all errors that robotid raises on purpose."""
+
+
+class ModelError(RobotIdError, ValueError):
+    """The URDF or the model built from it does not allow what was asked."""
+
+
+class DataError(RobotIdError, ValueError):
+    """A log or an array does not hold what it must."""
+
+
+class SettingsError(RobotIdError, ValueError):
+    """A setting is unknown, of the wrong type or out of its range."""
+
+
+class RankDeficientError(RobotIdError):
+    """The data do not determine every parameter.
+
+    Attributes:
+        rank: Number of parameters that the data determine.
+        undetermined: Names of the parameters they leave open.
+    """
+
+    def __init__(self, rank: int, undetermined: Sequence[str], total: int) -> None:
+        self.rank = rank
+        self.undetermined = tuple(undetermined)
+        super().__init__(
+            f"the data excite {rank} of {total} base parameters; undetermined: "
+            f"{list(self.undetermined)}. Record a richer trajectory, or use the "
+            "'consistent' estimator, which keeps the URDF's value where the data say nothing"
+        )
+
+
+class NotConvergedError(RobotIdError):
+    """An iteration or a solver stopped without a solution.
+
+    Attributes:
+        status: What the solver said.
+    """
+
+    def __init__(self, message: str, status: str) -> None:
+        self.status = status
+        super().__init__(f"{message} (status: {status})")
+
+
+class MissingDependencyError(RobotIdError, ImportError):
+    """An optional package is not installed.
+
+    Attributes:
+        package: The package that is missing.
+    """
+
+    def __init__(self, purpose: str, package: str, extra: str) -> None:
+        self.package = package
+        super().__init__(
+            f"{purpose} needs {package}, which is not installed: pip install robotid[{extra}]"
+        )

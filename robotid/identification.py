@@ -1,0 +1,257 @@
+"""identify(): from a model and logs to parameters and how far they can be trusted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.base_parameters import BaseMapping, base_mapping
+from robotid.data import Log
+from robotid.estimators import OLS, WLS, Consistent, Estimate, Estimator
+from robotid.exceptions import DataError, SettingsError
+from robotid.factors import compress, merge
+from robotid.lumping import held_parameters
+from robotid.metrics import Metrics
+from robotid.model import RobotModel
+from robotid.parameters import pseudo_inertia
+from robotid.prior import prior_spread
+from robotid.regressor import build_problem, random_regressor
+from robotid.signals import SignalSettings
+from robotid.validation import Evaluation, Recording, evaluate, pool, prepare
+from robotid.verdict import Verdict, judge
+
+__all__ = ["ESTIMATORS", "EstimatorSettings", "Identification", "identify", "structural_mapping"]
+
+ESTIMATORS = ("ols", "wls", "consistent")
+_FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
+_FROM_PRIOR = 0.9  # ... and above this share, the prior's
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """Which estimator, and its own settings.
+
+    Attributes:
+        name: "ols", "wls" or "consistent".
+        margin: Of "consistent": smallest eigenvalue of a body's pseudo-inertia relative to its
+            prior size [-].
+        prior_weight: Of "consistent": weight of the URDF's values [-].
+    """
+
+    name: str = "consistent"
+    margin: float = 1e-4
+    prior_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.name not in ESTIMATORS:
+            raise SettingsError(f"estimator is {self.name!r}, wanted one of {list(ESTIMATORS)}")
+        for key in ("margin", "prior_weight"):
+            if not getattr(self, key) > 0:
+                raise SettingsError(f"{key} is {getattr(self, key)}, wanted a positive number")
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Everything that an identification found.
+
+    Attributes:
+        model: The robot as the URDF describes it.
+        mapping: Standard to base parameters.
+        estimator: The estimator's settings.
+        estimate: What the estimator returned: base parameters, or standard ones ("consistent").
+        wls: Weighted least squares on the same factors, base parameters.
+        prior: Standard parameters of the URDF, shape (p,).
+        prior_std: How far they may plausibly be wrong, shape (p,).
+        standard: Standard parameters, shape (p,).
+        standard_error: Their standard errors given the prior, shape (p,).
+        base: Base parameters, shape (b,).
+        base_error: Their standard errors, shape (b,); inf where the data say nothing.
+        identification: The recordings that were fitted, with predictions "estimate" and "wls".
+        validation: The same of the recordings that were kept apart.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    estimator: EstimatorSettings
+    estimate: Estimate
+    wls: Estimate
+    prior: Array
+    prior_std: Array
+    standard: Array
+    standard_error: Array
+    base: Array
+    base_error: Array
+    identification: tuple[Evaluation, ...]
+    validation: tuple[Evaluation, ...]
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether every body and drive of the standard parameters is physically possible."""
+        J = pseudo_inertia(self.standard[: self.model.layout.n_inertial])
+        signs = self.standard[self.model.layout.is_nonnegative()]
+        return bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Where each standard parameter comes from: "data", "mixed" or "prior"."""
+        share = self.standard_error / self.prior_std
+        names = np.where(
+            share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
+        )
+        return tuple(names.tolist())
+
+    def metrics(self, name: str = "estimate") -> Metrics:
+        """Return the metrics over all fitted recordings.
+
+        Args:
+            name: "estimate" or "wls".
+
+        Returns:
+            The metrics.
+        """
+        return pool(self.model, self.identification, name)
+
+    @property
+    def verdict(self) -> Verdict:
+        """How far to trust the result."""
+        return judge(
+            self.metrics(),
+            {e.recording.name: e.metrics["estimate"] for e in self.validation},
+            undetermined=self.estimate.undetermined,
+            is_consistent=self.is_consistent,
+        )
+
+
+def identify(
+    model: RobotModel,
+    logs: Sequence[Log],
+    *,
+    validation: Sequence[Log] = (),
+    signals: SignalSettings | None = None,
+    estimator: EstimatorSettings | str = "consistent",
+) -> Identification:
+    """Identify a robot's parameters from motion logs.
+
+    Args:
+        model: The robot, from its URDF.
+        logs: Recordings to fit; their joints must be the model's, in its order.
+        validation: Recordings kept apart to measure the prediction with.
+        signals: How logs become trajectories; the defaults if None.
+        estimator: Name or settings of the estimator.
+
+    Returns:
+        The identification.
+
+    Raises:
+        DataError: If a log does not fit the model or is too short.
+        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        NotConvergedError: If a solver fails.
+        SettingsError: If a setting is out of range.
+    """
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    settings = signals or SignalSettings()
+    if not logs:
+        raise DataError("no log was given; at least one is needed to identify anything")
+    fitted = [prepare(model, log, settings) for log in logs]
+    kept = [prepare(model, log, settings) for log in validation]
+    mapping = structural_mapping(model)
+    factors = merge(
+        [
+            compress(mapping.reduce(build_problem(model, r.trajectory, r.mask.astype(float))))
+            for r in fitted
+        ]
+    )
+    share = min(_independent_share(recording) for recording in fitted)
+    prior = model.standard_parameters()
+    spread = prior_spread(model, [recording.trajectory for recording in fitted])
+    wls = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
+    estimate = _estimator(choice, model, mapping, prior, spread, share).fit(factors)
+    standard, covariance = _standard(estimate, mapping, prior, spread)
+    base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
+    wls_standard = mapping.to_standard(wls.theta, prior, spread)
+    candidates = {"estimate": standard, "wls": wls_standard}
+    is_base = estimate.names == mapping.base_names
+    return Identification(
+        model=model,
+        mapping=mapping,
+        estimator=choice,
+        estimate=estimate,
+        wls=wls,
+        prior=prior,
+        prior_std=spread,
+        standard=standard,
+        standard_error=np.sqrt(np.maximum(np.diag(covariance), 0.0)),
+        base=mapping.to_base(standard),
+        # exact data leave a variance of rounding size, of either sign
+        base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
+        identification=tuple(evaluate(model, r, candidates, prior) for r in fitted),
+        validation=tuple(evaluate(model, r, candidates, prior) for r in kept),
+    )
+
+
+def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
+    """Return the base parameters that any motion of a robot can show.
+
+    Args:
+        model: The robot.
+        inertial_only: Whether to leave the drive terms out.
+
+    Returns:
+        The mapping; always the same for the same robot.
+    """
+    columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
+    samples = 2 * columns // model.n_rows + 20
+    W = random_regressor(model, samples, np.random.default_rng(0))
+    return base_mapping(
+        W[:, :columns],
+        model.layout.names[:columns],
+        scales=model.layout.scales(model.length)[:columns],
+        preference=model.layout.preference()[:columns],
+    )
+
+
+def _estimator(
+    choice: EstimatorSettings,
+    model: RobotModel,
+    mapping: BaseMapping,
+    prior: Array,
+    spread: Array,
+    share: float,
+) -> Estimator:
+    if choice.name == "ols":
+        return OLS(independent_share=share)
+    if choice.name == "wls":
+        return WLS(independent_share=share)
+    return Consistent(
+        layout=model.layout,
+        K=mapping.K,
+        prior=prior,
+        prior_std=spread,
+        held=held_parameters(model),
+        margin=choice.margin,
+        prior_weight=choice.prior_weight,
+        independent_share=share,
+    )
+
+
+def _independent_share(recording: Recording) -> float:
+    """Return the share of rows that are independent behind the filter: its band over Nyquist's."""
+    signals = recording.signals
+    if signals.cutoff is None or signals.rate is None:
+        return 1.0
+    return min(1.0, 2.0 * signals.cutoff / signals.rate)
+
+
+def _standard(
+    estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Return the standard parameters and their covariance, prior included."""
+    if estimate.names == mapping.names:
+        return estimate.theta, estimate.covariance
+    G, K = mapping.gain(spread), mapping.K
+    before = np.diag(spread**2)
+    # what the data leave open (infinite variance) stays as wide as the prior has it
+    base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
+    covariance = before - G @ K @ before + G @ base @ G.T
+    return mapping.to_standard(estimate.theta, prior, spread), covariance

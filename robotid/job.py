@@ -1,0 +1,350 @@
+"""The job: which robot, which logs, which settings; read from TOML with every key checked."""
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from robotid.data import Log, LogUnits
+from robotid.exceptions import SettingsError
+from robotid.identification import EstimatorSettings
+from robotid.log_files import read_log
+from robotid.model import GRAVITY, RobotModel
+from robotid.parameters import DRIVE_TERMS, Coupling
+from robotid.signals import SignalSettings
+
+__all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
+
+_FRICTION = {
+    "none": (),
+    "viscous": ("viscous",),
+    "viscous+coulomb": ("viscous", "coulomb"),
+}
+_NUMBER = (int, float)
+_TABLE: dict[str, Any] = {
+    "urdf": str,
+    "joints": list,
+    "locked": dict,
+    "gravity": list,
+    "free_flyer": bool,
+    "mimic": str,
+    "signals": {
+        "rate": _NUMBER,
+        "cutoff": (*_NUMBER, bool),
+        "order": int,
+        "velocity": str,
+        "acceleration": str,
+        "trim": _NUMBER,
+        "min_velocity": _NUMBER,
+        "max_gap": _NUMBER,
+    },
+    "model": {"armature": bool, "friction": str, "offset": bool},
+    "torque": {"gains": dict},
+    "columns": dict,
+    "units": {"time": str, "angle": str},
+    "coupling": [{"name": str, "ratios": dict}],
+    "estimator": {"name": str, "margin": _NUMBER, "prior_weight": _NUMBER},
+    "identification": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
+    "validation": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
+}
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """One log of a job.
+
+    Attributes:
+        path: The file.
+        start: Start of the window in the log's own time [s], or None.
+        end: End of the window [s], or None.
+    """
+
+    path: Path
+    start: float | None = None
+    end: float | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that is needed to run an identification.
+
+    Attributes:
+        urdf: The URDF file.
+        joints: Joints to identify, in order; None for all movable ones.
+        locked: Positions of joints held still [rad or m].
+        gravity: Gravity in the root link's frame [m/s^2].
+        free_flyer: Whether the base floats.
+        mimic: "independent" or "coupled".
+        signals: How logs become trajectories.
+        terms: Drive terms to identify.
+        gains: Torque per current of joints logged as current [N m/A or N/A].
+        couplings: Drives that turn with several joints.
+        columns: Column names in the logs that differ from the standard ones.
+        units: Units of the logs, if not SI.
+        estimator: The estimator and its settings.
+        identification: Logs to fit.
+        validation: Logs kept apart.
+    """
+
+    urdf: Path
+    joints: tuple[str, ...] | None = None
+    locked: Mapping[str, float] = field(default_factory=dict)
+    gravity: tuple[float, ...] = GRAVITY
+    free_flyer: bool = False
+    mimic: str = "independent"
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    terms: tuple[str, ...] = DRIVE_TERMS
+    gains: Mapping[str, float] = field(default_factory=dict)
+    couplings: tuple[Coupling, ...] = ()
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: LogUnits = field(default_factory=LogUnits)
+    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
+    identification: tuple[LogEntry, ...] = ()
+    validation: tuple[LogEntry, ...] = ()
+
+    def model(self) -> RobotModel:
+        """Return the robot.
+
+        Returns:
+            The model with the job's joints, gravity and drive terms.
+
+        Raises:
+            ModelError: If the URDF cannot be used, or a joint is not in it.
+        """
+        return RobotModel.from_urdf(
+            self.urdf,
+            joints=self.joints,
+            locked=self.locked,
+            free_flyer=self.free_flyer,
+            mimic=self.mimic,
+            gravity=self.gravity,
+            terms=self.terms,
+            couplings=self.couplings,
+        )
+
+    def read(self, entry: LogEntry, model: RobotModel) -> Log:
+        """Return one log of the job.
+
+        Args:
+            entry: Which log.
+            model: The job's robot.
+
+        Returns:
+            The log, of the model's joints in its order.
+
+        Raises:
+            DataError: If the file cannot be used.
+        """
+        return read_log(
+            entry.path,
+            model.joints,
+            gains=self.gains,
+            columns=self.columns,
+            start=entry.start,
+            end=entry.end,
+            units=self.units,
+            prismatic=tuple(model.layout.prismatic),
+        )
+
+    def to_settings(self) -> dict[str, Any]:
+        """Return the job as plain values, in the shape of the job file, paths as given."""
+        signals = {
+            key: getattr(self.signals, key)
+            for key in _TABLE["signals"]
+            if getattr(self.signals, key) is not None
+        }
+        if self.signals.cutoff is None:
+            signals["cutoff"] = False
+        friction = next(
+            name
+            for name, terms in _FRICTION.items()
+            if terms == tuple(t for t in self.terms if t in ("viscous", "coulomb"))
+        )
+        return {
+            "urdf": str(self.urdf),
+            **({"joints": list(self.joints)} if self.joints is not None else {}),
+            "locked": dict(self.locked),
+            "gravity": list(self.gravity),
+            "free_flyer": self.free_flyer,
+            "mimic": self.mimic,
+            "signals": signals,
+            "model": {
+                "armature": "armature" in self.terms,
+                "friction": friction,
+                "offset": "offset" in self.terms,
+            },
+            "torque": {"gains": dict(self.gains)},
+            "columns": dict(self.columns),
+            "units": {
+                key: value
+                for key, value in (("time", self.units.time), ("angle", self.units.angle))
+                if value is not None
+            },
+            "coupling": [{"name": c.name, "ratios": dict(c.ratios)} for c in self.couplings],
+            "estimator": {
+                "name": self.estimator.name,
+                "margin": self.estimator.margin,
+                "prior_weight": self.estimator.prior_weight,
+            },
+            "identification": [_entry_settings(entry) for entry in self.identification],
+            "validation": [_entry_settings(entry) for entry in self.validation],
+        }
+
+
+def read_job(path: str | Path) -> Job:
+    """Read a job file.
+
+    Args:
+        path: The TOML file; paths in it are relative to it, and ``$NAME`` in them is filled in
+            from the environment.
+
+    Returns:
+        The job.
+
+    Raises:
+        SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise SettingsError(f"there is no job file {str(source)!r}")
+    try:
+        table = tomllib.loads(source.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
+    return job_from_settings(table, source.name, source.parent)
+
+
+def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job:
+    """Return the job that a table describes.
+
+    Args:
+        table: The keys of a job file.
+        where: Name of its source, for errors.
+        folder: Folder that paths in it are relative to.
+
+    Returns:
+        The job.
+
+    Raises:
+        SettingsError: If a key or a value is wrong.
+    """
+    _check(table, _TABLE, where, "")
+    if "urdf" not in table:
+        raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
+    model = table.get("model", {})
+    friction = model.get("friction", "viscous+coulomb")
+    if friction not in _FRICTION:
+        raise SettingsError(f"{where}: friction is {friction!r}, wanted one of {list(_FRICTION)}")
+    wanted = {
+        "armature": model.get("armature", True),
+        "offset": model.get("offset", True),
+        **dict.fromkeys(_FRICTION[friction], True),
+    }
+    joints = table.get("joints")
+    entries = {
+        key: tuple(
+            LogEntry(_path(entry["log"], where, folder), entry.get("start"), entry.get("end"))
+            for entry in table.get(key, [])
+        )
+        for key in ("identification", "validation")
+    }
+    try:
+        return Job(
+            urdf=_path(table["urdf"], where, folder),
+            joints=tuple(joints) if joints is not None else None,
+            locked=_numbers(table.get("locked", {}), where, "locked"),
+            gravity=tuple(table.get("gravity", GRAVITY)),
+            free_flyer=table.get("free_flyer", False),
+            mimic=table.get("mimic", "independent"),
+            signals=_signals(table.get("signals", {})),
+            terms=tuple(term for term in DRIVE_TERMS if wanted.get(term)),
+            gains=_numbers(table.get("torque", {}).get("gains", {}), where, "gains"),
+            couplings=tuple(
+                Coupling(c["name"], tuple(_numbers(c["ratios"], where, "ratios").items()))
+                for c in table.get("coupling", [])
+            ),
+            columns=table.get("columns", {}),
+            units=LogUnits(**table.get("units", {})),
+            estimator=EstimatorSettings(**table.get("estimator", {})),
+            **entries,
+        )
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def _path(text: str, where: str, folder: Path) -> Path:
+    """Return a path relative to a folder, with $VARIABLES of the environment filled in."""
+    expanded = os.path.expandvars(text)
+    if "$" in expanded:
+        raise SettingsError(f"{where}: path {text!r} names an environment variable that is not set")
+    return folder / expanded
+
+
+def _signals(table: Mapping[str, Any]) -> SignalSettings:
+    settings = dict(table)
+    if isinstance(settings.get("cutoff"), bool):
+        if settings["cutoff"]:
+            raise SettingsError("cutoff is true, wanted a frequency [Hz], or false for no filter")
+        settings["cutoff"] = None
+    return SignalSettings(**settings)
+
+
+def _numbers(table: Mapping[str, Any], where: str, name: str) -> dict[str, float]:
+    for key, value in table.items():
+        if isinstance(value, bool) or not isinstance(value, _NUMBER):
+            raise SettingsError(f"{where}: {name}.{key} is {value!r}, wanted a number")
+    return {key: float(value) for key, value in table.items()}
+
+
+def _check(table: Mapping[str, Any], schema: Mapping[str, Any], where: str, section: str) -> None:
+    """Refuse keys that are not in the schema and values of another type."""
+    for key, value in table.items():
+        at = f"{where}: {section}{key}"
+        if key not in schema:
+            near = difflib.get_close_matches(key, schema, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise SettingsError(f"{at} is not a known key{hint} Known: {sorted(schema)}")
+        wanted = schema[key]
+        if isinstance(wanted, dict):
+            if not isinstance(value, Mapping):
+                raise SettingsError(f"{at} is {value!r}, wanted a table [{section}{key}]")
+            _check(value, wanted, where, f"{section}{key}.")
+        elif isinstance(wanted, list):
+            _check_array(value, wanted[0], where, f"{section}{key}")
+        elif not isinstance(value, wanted) or (isinstance(value, bool) and not _takes_bool(wanted)):
+            raise SettingsError(f"{at} is {value!r}, wanted {_type_name(wanted)}")
+
+
+def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str) -> None:
+    if not isinstance(value, list) or not all(isinstance(item, Mapping) for item in value):
+        raise SettingsError(f"{where}: {name} is {value!r}, wanted tables written as [[{name}]]")
+    for item in value:
+        _check(item, schema, where, f"{name}.")
+        for required in ("log", "name", "ratios"):
+            if required in schema and required not in item:
+                raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
+
+
+def _takes_bool(wanted: object) -> bool:
+    return wanted is bool or (isinstance(wanted, tuple) and bool in wanted)
+
+
+def _type_name(wanted: type | tuple[type, ...]) -> str:
+    names = {
+        str: "text",
+        bool: "true or false",
+        list: "a list",
+        dict: "a table",
+        int: "a whole number",
+    }
+    if isinstance(wanted, tuple):
+        return "a number or false" if bool in wanted else "a number"
+    return names[wanted]
+
+
+def _entry_settings(entry: LogEntry) -> dict[str, Any]:
+    window = {"start": entry.start, "end": entry.end}
+    return {"log": str(entry.path), **{k: v for k, v in window.items() if v is not None}}

@@ -1,0 +1,286 @@
+"""What of a URDF the dynamics need: links, inertials, joints; read strictly, the rest ignored.
+
+Pinocchio's parser wants meshes' neighbours, limits and ``<dynamics>`` to be right, although the
+dynamics never use them, and only prints what it misses. So the XML is read here, every fault that
+matters is refused by name, and Pinocchio gets the kinematic tree alone.
+"""
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from robotid.exceptions import ModelError
+
+__all__ = ["Inertial", "Joint", "Tree", "read_tree"]
+
+_MOVABLE = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """The ``<inertial>`` of a link.
+
+    Attributes:
+        mass: Mass [kg].
+        com: Centre of mass in the link frame [m].
+        rpy: Roll, pitch, yaw of the frame that the inertia is stated in [rad].
+        inertia: ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2].
+    """
+
+    mass: float
+    com: tuple[float, ...]
+    rpy: tuple[float, ...]
+    inertia: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One ``<joint>`` of a URDF.
+
+    Attributes:
+        name: Its name.
+        type: fixed, revolute, continuous or prismatic.
+        parent: Link it hangs on.
+        child: Link it moves.
+        lower: Lower position limit [rad or m], -inf if none is stated.
+        upper: Upper position limit [rad or m], inf if none is stated.
+        velocity: Velocity limit [rad/s or m/s], inf if none is stated.
+        effort: Effort limit [N m or N], inf if none is stated.
+        mimic: Name of the joint it mimics, multiplier [-], offset [rad or m]; or None.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    velocity: float = math.inf
+    effort: float = math.inf
+    mimic: tuple[str, float, float] | None = None
+
+    @property
+    def is_movable(self) -> bool:
+        """Whether the joint has a degree of freedom."""
+        return self.type in _MOVABLE
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether the URDF states a range of positions; lower = upper = 0 states none."""
+        return math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper
+
+    @property
+    def turns_freely(self) -> bool:
+        """Whether the joint may turn without end, as far as the URDF says."""
+        return self.type == "continuous" or (self.type == "revolute" and not self.has_limits)
+
+
+@dataclass(frozen=True)
+class Tree:
+    """The kinematic tree of a URDF.
+
+    Attributes:
+        path: File it was read from.
+        name: Name of the robot.
+        root: Link that no joint moves.
+        links: Names of the links, in the file's order.
+        joints: The joints, in the file's order.
+        inertials: The ``<inertial>`` of each link that has one, by its name.
+        xml: A URDF with nothing but links, inertials and joints.
+    """
+
+    path: str
+    name: str
+    root: str
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...]
+    inertials: Mapping[str, Inertial]
+    xml: str
+
+    @property
+    def movable(self) -> tuple[Joint, ...]:
+        """The joints that have a degree of freedom, in the file's order."""
+        return tuple(joint for joint in self.joints if joint.is_movable)
+
+
+def read_tree(path: str | Path) -> Tree:
+    """Read the kinematic tree of a URDF file.
+
+    Args:
+        path: The URDF file. Meshes are not looked for.
+
+    Returns:
+        The tree.
+
+    Raises:
+        ModelError: If the file is missing, is no URDF, is no tree, has no movable joint, or if a
+            number that the dynamics use is missing, not a number or not finite.
+    """
+    source = Path(path)
+    robot = _parse(source)
+    where = source.name
+    name = robot.get("name")
+    if not name:
+        raise ModelError(
+            f'{where}: <robot> has no name; write <robot name="..."> in its first line'
+        )
+    links = _unique(robot.findall("link"), "link", where)
+    elements = _unique(robot.findall("joint"), "joint", where)
+    joints = tuple(_joint(element, links, where) for element in elements.values())
+    if not any(joint.is_movable for joint in joints):
+        raise ModelError(
+            f"{where}: robot {name!r} has no movable joint, so there is nothing to identify"
+        )
+    root = _root(tuple(links), joints, where)
+    inertials = {
+        link: _inertial(inertial, f"{where}: link {link!r}: inertial")
+        for link, element in links.items()
+        if (inertial := element.find("inertial")) is not None
+    }
+    minimal = ET.Element("robot", name=name)
+    for element in links.values():
+        minimal.append(_copy(element, ("inertial",)))
+    for element in elements.values():
+        minimal.append(_minimal_joint(element))
+    return Tree(
+        path=str(source),
+        name=name,
+        root=root,
+        links=tuple(links),
+        joints=joints,
+        inertials=MappingProxyType(inertials),
+        xml=ET.tostring(minimal, encoding="unicode"),
+    )
+
+
+def _parse(path: Path) -> ET.Element:
+    if not path.is_file():
+        raise ModelError(f"there is no URDF file {str(path)!r}")
+    if path.suffix == ".xacro":
+        raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
+    try:
+        robot = ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise ModelError(f"{path.name} is not well-formed XML: {error}") from error
+    if robot.tag != "robot":
+        raise ModelError(f"{path.name}: the top element is <{robot.tag}>, wanted <robot>")
+    return robot
+
+
+def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.Element]:
+    named: dict[str, ET.Element] = {}
+    for element in elements:
+        name = element.get("name")
+        if not name:
+            raise ModelError(f"{where}: a <{kind}> has no name; give it one")
+        if name in named:
+            raise ModelError(f"{where}: two {kind}s are named {name!r}; names must be unique")
+        named[name] = element
+    return named
+
+
+def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joint:
+    name, kind = element.get("name", ""), element.get("type", "")
+    at = f"{where}: joint {name!r}"
+    if kind not in (*_MOVABLE, "fixed"):
+        raise ModelError(
+            f"{at} has type {kind!r}; robotid handles fixed, revolute, continuous and prismatic "
+            "joints (a floating base is asked for with free_flyer=True, not with a joint)"
+        )
+    ends = {}
+    for end in ("parent", "child"):
+        tag = element.find(end)
+        ends[end] = tag.get("link", "") if tag is not None else ""
+        if ends[end] not in links:
+            raise ModelError(f"{at} has the {end} link {ends[end]!r}, which the file does not hold")
+    origin, axis = element.find("origin"), element.find("axis")
+    if origin is not None:
+        for key in ("xyz", "rpy"):
+            _numbers(origin.get(key, "0 0 0"), 3, f"{at}: origin {key}")
+    if axis is not None and kind != "fixed":
+        direction = _numbers(axis.get("xyz", "1 0 0"), 3, f"{at}: axis xyz")
+        if math.hypot(*direction) < 1e-9:
+            raise ModelError(f"{at}: axis xyz is zero; give it a direction")
+    limit, mimic = element.find("limit"), element.find("mimic")
+    bounds = {}
+    if limit is not None and kind != "fixed":
+        keys = ["velocity", "effort"]
+        if kind != "continuous":
+            keys += ["lower", "upper"]
+        for key in keys:
+            if limit.get(key) is not None:
+                bounds[key] = _numbers(limit.get(key, ""), 1, f"{at}: limit {key}")[0]
+    return Joint(name, kind, ends["parent"], ends["child"], **bounds, mimic=_mimic(mimic, at))
+
+
+def _mimic(element: ET.Element | None, at: str) -> tuple[str, float, float] | None:
+    if element is None:
+        return None
+    multiplier, offset = (
+        _numbers(element.get(key, default), 1, f"{at}: mimic {key}")[0]
+        for key, default in (("multiplier", "1"), ("offset", "0"))
+    )
+    return element.get("joint", ""), multiplier, offset
+
+
+def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
+    parent: dict[str, str] = {}
+    for joint in joints:
+        if joint.child in parent:
+            raise ModelError(
+                f"{where}: link {joint.child!r} is the child of two joints; a URDF is a tree, so "
+                "closed chains must be opened"
+            )
+        parent[joint.child] = joint.parent
+    roots = [link for link in links if link not in parent]
+    if len(roots) != 1:
+        raise ModelError(f"{where}: a URDF has one root link, but this one has {roots}")
+    return roots[0]
+
+
+def _inertial(inertial: ET.Element, at: str) -> Inertial:
+    mass, inertia, origin = (inertial.find(tag) for tag in ("mass", "inertia", "origin"))
+    if mass is None or inertia is None:
+        raise ModelError(f"{at} needs both <mass> and <inertia>; add the missing one")
+    pose = origin.attrib if origin is not None else {}
+    com, rpy = (_numbers(pose.get(key, "0 0 0"), 3, f"{at} origin {key}") for key in ("xyz", "rpy"))
+    moments = [
+        _numbers(inertia.get(key, "0"), 1, f"{at} {key}")[0]
+        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    ]
+    (value,) = _numbers(mass.get("value", ""), 1, f"{at} mass")
+    return Inertial(value, tuple(com), tuple(rpy), tuple(moments))
+
+
+def _numbers(text: str, count: int, what: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError as error:
+        raise ModelError(f"{what} is {text!r}, wanted {count} number(s)") from error
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise ModelError(f"{what} is {text!r}, wanted {count} finite number(s)")
+    return values
+
+
+def _copy(element: ET.Element, children: tuple[str, ...]) -> ET.Element:
+    copy = ET.Element(element.tag, element.attrib)
+    copy.extend(_present(element, children))
+    return copy
+
+
+def _minimal_joint(element: ET.Element) -> ET.Element:
+    copy = _copy(element, ("origin", "parent", "child", "axis"))
+    if element.get("type") in _MOVABLE:
+        # the parser demands limits; the dynamics do not use them, `Joint` keeps the stated ones
+        ET.SubElement(copy, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")
+    return copy
+
+
+def _present(element: ET.Element, tags: tuple[str, ...]) -> Iterator[ET.Element]:
+    for tag in tags:
+        child = element.find(tag)
+        if child is not None:
+            yield child

@@ -1,0 +1,400 @@
+"""Log files: CSV and Parquet, one row per sample and one column per quantity and joint.
+
+Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
+`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Aliases are read, too.
+"""
+
+import csv
+import difflib
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import chain, islice
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TextIO
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.data import PER_SECOND, Log, LogUnits, check_units, repeated, suggestion
+from robotid.exceptions import DataError, MissingDependencyError, SettingsError
+
+__all__ = ["read_log", "write_log"]
+
+_PREFIXES = {
+    "q": ("q_", "position_"),
+    "dq": ("dq_", "velocity_", "qd_"),
+    "ddq": ("ddq_", "acceleration_", "qdd_"),
+    "tau": ("tau_", "effort_", "torque_"),
+    "current": ("current_", "i_"),
+}
+_NOUNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque or current"}
+_SI = LogUnits()
+
+
+def read_log(
+    path: str | Path,
+    joints: Sequence[str],
+    *,
+    gains: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    units: LogUnits = _SI,
+    prismatic: Collection[str] = (),
+) -> Log:
+    """Return the log in a file.
+
+    Args:
+        path: A .csv or .parquet file.
+        joints: Names of the joints wanted, in the order wanted.
+        gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
+            current with a gain is preferred to a torque column.
+        columns: Name in the file by standard name, as ``{"tau_elbow": "M2"}``, where they differ.
+        start: First time stamp kept, on the log's own clock [s].
+        end: Last time stamp kept [s].
+        units: Units of the file, if not SI.
+        prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
+
+    Returns:
+        The log in SI units; its notes tell what was ignored.
+
+    Raises:
+        DataError: If the file does not hold what is wanted, or looks like other units.
+        SettingsError: If gains or columns name what is not read.
+        MissingDependencyError: If a Parquet file is read without pyarrow.
+    """
+    source = Path(path)
+    is_csv = _is_csv(source)
+    if isinstance(joints, str) or not joints:
+        raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
+    if not source.is_file():
+        raise DataError(f"there is no log file {str(source)!r}")
+    names = _csv_header(source)[0] if is_csv else _parquet_names(source)
+    finder = _Finder(source.name, names, columns or {}, tuple(joints), gains or {})
+    found = finder.find_all()  # names of columns by kind
+    wanted = [name for kind in found.values() for name in kind]
+    table = _read_csv(source, wanted) if is_csv else _read_parquet(source, wanted)
+    values = {kind: np.stack([table[name] for name in found[kind]], axis=1) for kind in found}
+    if units.angle == "deg":
+        radians = [1.0 if joint in prismatic else np.pi / 180 for joint in joints]
+        values |= {kind: values[kind] * radians for kind in ("q", "dq", "ddq") if kind in values}
+    values["tau"] = values["tau"] * finder.factors(found["tau"])
+    for array in values.values():
+        array.flags.writeable = False  # so that the log need not copy it
+    log = Log(
+        t=values["time"][:, 0] / PER_SECOND[units.time or "s"],
+        q=values["q"],
+        v=values.get("dq"),
+        a=values.get("ddq"),
+        tau=values["tau"],
+        joints=tuple(joints),
+        path=str(source),
+        notes=tuple(finder.notes),
+    )
+    check_units(log, units, prismatic)
+    return log if start is None and end is None else log.window(start, end)
+
+
+def write_log(log: Log, path: str | Path) -> None:
+    """Write a log with standard column names; reading it gives the same numbers, to the last bit.
+
+    The file is written beside its final place and then moved there: it is never half-written.
+
+    Args:
+        log: The log.
+        path: A .csv or .parquet file; one that exists is replaced.
+
+    Raises:
+        DataError: If the file name ends in neither.
+        MissingDependencyError: If Parquet is written without pyarrow.
+        OSError: If the folder cannot be written to.
+    """
+    target = Path(path)
+    write = _write_csv if _is_csv(target) else _write_parquet
+    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        write(_to_table(log), partial)
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class _Finder:
+    """Finds the columns of the wanted joints among the names in a file."""
+
+    where: str
+    names: list[str]
+    columns: Mapping[str, str]
+    joints: tuple[str, ...]
+    gains: Mapping[str, float]
+    notes: list[str] = field(default_factory=list)
+    seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
+
+    def find_all(self) -> dict[str, list[str]]:
+        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete."""
+        self._check_arguments()
+        found = {
+            "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
+            "q": [self._find_of("q", joint) or self._missing("q", joint) for joint in self.joints],
+            "tau": [self._find_torque(joint) for joint in self.joints],
+        }
+        found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
+        extra = [name for name in self.names if name not in self.seen]
+        if extra:
+            self.notes.append(f"columns ignored: {extra}")
+        if twice := repeated([name for names in found.values() for name in names]):
+            raise SettingsError(f"{self.where}: {twice} are read twice; correct columns={{...}}")
+        return found
+
+    def factors(self, torques: Sequence[str]) -> Array:
+        """Return what makes each column a torque, shape (n,): a current's gain, or 1."""
+        currents = {self._find_of("current", joint): joint for joint in self.joints}
+        return np.array([self.gains[currents[n]] if n in currents else 1.0 for n in torques])
+
+    def _check_arguments(self) -> None:
+        """Refuse names twice in the file, and gains and columns of what is not read."""
+        if twice := repeated([name for name in self.names if name]):
+            raise DataError(f"{self.where} has more than one column {twice}; rename or remove one")
+        for joint, gain in self.gains.items():
+            if joint not in self.joints:
+                raise SettingsError(
+                    f"{self.where}: a gain is given for {joint!r}, which is not among the joints "
+                    f"read: {list(self.joints)}{suggestion(joint, self.joints)}"
+                )
+            if not np.isfinite(gain) or gain == 0:
+                raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
+        known = ["time", *(f"{kind}_{joint}" for kind in _PREFIXES for joint in self.joints)]
+        for standard, name in self.columns.items():
+            if standard not in known:
+                raise SettingsError(
+                    f"columns: {standard!r} is not the standard name of a column that is read, "
+                    f"as 'time' or 'tau_{self.joints[0]}'{suggestion(standard, known)}"
+                )
+            if name not in self.names:
+                raise DataError(
+                    f"{self.where} has no column {name!r}, which columns gives for {standard!r}; "
+                    f"columns found: {self.names}{suggestion(name, self.names)}"
+                )
+
+    def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
+        """Return the column of one quantity, or None."""
+        found = [a for a in aliases if a in self.names and a not in self.columns.values()]
+        if standard in self.columns:
+            found = [self.columns[standard]]
+        if len(found) > 1:
+            raise DataError(
+                f"{self.where} has {found[0]!r} and {found[1]!r}, two names of the same quantity; "
+                f"remove one, or pass columns={{{standard!r}: ...}}"
+            )
+        self.seen.update(found)
+        return found[0] if found else None
+
+    def _find_of(self, kind: str, joint: str) -> str | None:
+        """Return the column of one quantity of one joint, or None."""
+        return self._find(f"{kind}_{joint}", [prefix + joint for prefix in _PREFIXES[kind]])
+
+    def _find_torque(self, joint: str) -> str:
+        """Return the column of a joint's torque, or of its current if that has a gain."""
+        tau, current = self._find_of("tau", joint), self._find_of("current", joint)
+        has_gain = joint in self.gains
+        if tau and current:
+            used, unused = (current, tau) if has_gain else (tau, current)
+            self.notes.append(
+                f"{unused} ignored: {used} is read ({'a' if has_gain else 'no'} gain)"
+            )
+            return used
+        if tau and has_gain:
+            self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
+        if current and not has_gain:
+            raise DataError(
+                f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
+                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains)"
+            )
+        return tau or current or self._missing("tau", joint)
+
+    def _find_optional(self, kind: str) -> list[str]:
+        """Return the columns of a quantity that every joint has; none if some joint lacks it."""
+        found = {joint: self._find_of(kind, joint) for joint in self.joints}
+        names = [name for name in found.values() if name]
+        without = [joint for joint, name in found.items() if not name]
+        if names and without:
+            self.notes.append(f"{names} ignored: {without} have no {_NOUNS[kind]}")
+        return [] if without else names
+
+    def _missing(self, kind: str, joint: str) -> str:
+        """Refuse a file without a column, naming those of its kind and the nearest."""
+        standard = f"{kind}_{joint}" if joint else kind
+        noun = f"{_NOUNS[kind]} columns" if joint else "columns"
+        prefixes = (*_PREFIXES.get(kind, ("",)), *(_PREFIXES["current"] if kind == "tau" else ()))
+        found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
+        for name in self.names:
+            for prefix in [prefix for prefix in prefixes if name.startswith(prefix)]:
+                found.append(name)
+                if name[len(prefix) :] not in self.joints:
+                    ends[name[len(prefix) :]] = name
+        nearest = difflib.get_close_matches(joint or kind, ends, n=1)
+        near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
+        raise DataError(
+            f"{self.where} has no column {standard!r}; {noun} found: {found}. {hint.format(near)}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}"
+        )
+
+
+def _to_table(log: Log) -> dict[str, Array]:
+    """Return the columns of a log by standard name."""
+    table = {"time": log.t}
+    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
+        if values is not None:
+            table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    return table
+
+
+def _is_csv(path: Path) -> bool:
+    """Return whether a file is CSV rather than Parquet, by its suffix."""
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        raise DataError(f"{path.name}: logs are .csv or .parquet files, not {suffix!r}; convert it")
+    return suffix == ".csv"
+
+
+@contextmanager
+def _open_csv(path: Path) -> Iterator[TextIO]:
+    """Open a text file, whether or not it starts with a byte order mark."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            yield file
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8") from error
+
+
+def _csv_header(path: Path) -> tuple[list[str], str]:
+    """Return the column names of a CSV file and what separates them."""
+    with _open_csv(path) as file:
+        line = file.readline()
+    if not line.strip():
+        raise DataError(f"{path.name} is empty; its first line must name the columns")
+    separator = max(",;\t", key=line.count)  # the comma, if there is none
+    cells = next(csv.reader([line.strip("\r\n").lstrip("# ")], delimiter=separator))
+    names = [cell.strip() for cell in cells]
+    if all(_is_number(name) for name in names):
+        raise DataError(f"{path.name} has no header; its first line must name the columns")
+    return names, separator
+
+
+def _read_csv(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
+    """Return the wanted columns of a CSV file."""
+    names, separator = _csv_header(path)
+    columns = [names.index(name) for name in wanted]
+    with _open_csv(path) as file:
+        file.readline()
+        rows = _whole_rows(file, len(names), separator, path.name)
+        first = list(islice(rows, 1))
+        if not first:
+            raise DataError(f"{path.name} has a header but no rows; record at least 2")
+        how: Any = {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
+        try:
+            values = np.loadtxt(chain(first, rows), usecols=columns, **how)
+        except (DataError, UnicodeDecodeError):
+            raise
+        except ValueError as error:
+            raise _bad_cell(path, names, columns, separator) from error
+    return dict(zip(wanted, values.T, strict=True))
+
+
+def _whole_rows(lines: TextIO, count: int, separator: str, where: str) -> Iterator[str]:
+    """Yield the lines that are not blank, and refuse those with too few or too many cells."""
+    for number, line in enumerate(lines, start=2):
+        if line.isspace():
+            continue
+        if line.count(separator) != count - 1:  # unless a separator stands in quotes
+            found = len(next(csv.reader([line], delimiter=separator)))
+            if found != count:
+                raise DataError(
+                    f"{where}: line {number} has {found} cells, the header has {count}; mend it"
+                )
+        yield line
+
+
+def _bad_cell(path: Path, names: list[str], columns: list[int], separator: str) -> DataError:
+    """Return the error that names the first cell that is not a number."""
+    with _open_csv(path) as file:
+        file.readline()
+        for row, line in enumerate(_whole_rows(file, len(names), separator, path.name)):
+            cells = next(csv.reader([line], delimiter=separator))
+            for i in columns:
+                if not _is_number(cells[i]):
+                    found = repr(cells[i]) if cells[i].strip() else "empty"
+                    hint = "; write decimals with a point" if "," in cells[i] else ""
+                    return DataError(
+                        f"{path.name}: {names[i]} is {found} at row {row}, wanted a number{hint}; "
+                        "remove the row or mend the recording"
+                    )
+    return DataError(f"{path.name} holds a cell that is not a plain decimal number")
+
+
+def _is_number(text: str) -> bool:
+    """Return whether a cell holds a number, NaN and infinity among them."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _write_csv(table: Mapping[str, Array], path: Path) -> None:
+    """Write columns as CSV; the shortest decimals that give the same bits."""
+    rows = np.column_stack(list(table.values()))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(table)
+        writer.writerows(row.tolist() for row in rows)
+
+
+def _pyarrow(purpose: str) -> ModuleType:
+    """Return pyarrow, with its parquet loaded."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise MissingDependencyError(purpose, "pyarrow", "parquet") from error
+    package: ModuleType = pyarrow
+    return package
+
+
+@contextmanager
+def _open_parquet(path: Path) -> Iterator[Any]:
+    """Open a Parquet file; what is wrong with it is told in our words."""
+    pa = _pyarrow("reading Parquet")
+    try:
+        with pa.parquet.ParquetFile(path) as file:
+            yield file
+    except (pa.ArrowInvalid, OSError) as error:
+        raise DataError(f"{path.name}: broken Parquet file ({error}); export it again") from error
+
+
+def _parquet_names(path: Path) -> list[str]:
+    """Return the column names of a Parquet file."""
+    with _open_parquet(path) as file:
+        return list(file.schema_arrow.names)
+
+
+def _read_parquet(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
+    """Return the wanted columns of a Parquet file; null becomes NaN."""
+    types = _pyarrow("reading Parquet").types
+    with _open_parquet(path) as file:
+        for name in wanted:
+            kind = file.schema_arrow.field(name).type
+            if not (types.is_integer(kind) or types.is_floating(kind)):
+                raise DataError(f"{path.name}: {name} holds {kind}, wanted numbers; convert it")
+        table = file.read(columns=list(wanted))
+    return {name: table.column(name).to_numpy().astype(np.float64, copy=False) for name in wanted}
+
+
+def _write_parquet(table: Mapping[str, Array], path: Path) -> None:
+    """Write columns as Parquet."""
+    pa = _pyarrow("writing Parquet")
+    pa.parquet.write_table(pa.table(dict(table)), path)

@@ -1,0 +1,291 @@
+"""Names and order of the standard parameters, pseudo-inertia, physical consistency."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+
+__all__ = [
+    "DRIVE_TERMS",
+    "INERTIAL_TERMS",
+    "PAPER_TERMS",
+    "Coupling",
+    "ParameterLayout",
+    "from_paper_order",
+    "inertial_from_pseudo_inertia",
+    "pseudo_inertia",
+    "pseudo_inertia_basis",
+    "to_paper_order",
+]
+
+#: Inertial parameters of one body in Pinocchio's order; inertia about the joint frame.
+INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+#: The same ten in the paper's order (9).
+PAPER_TERMS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
+#: Parameters of one drive.
+DRIVE_TERMS = ("armature", "viscous", "coulomb", "offset")
+
+_ROTARY_UNITS = {
+    "armature": "kg m^2",
+    "viscous": "N m s/rad",
+    "coulomb": "N m",
+    "offset": "N m",
+}
+_LINEAR_UNITS = {"armature": "kg", "viscous": "N s/m", "coulomb": "N", "offset": "N"}
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A drive that turns with several joints, at the speed w = sum_j ratio_j v_j.
+
+    Its armature Ia, viscous Fv and Coulomb Fc load every joint it turns with:
+    ``tau_j += ratio_j (Ia dw/dt + Fv w + Fc sign w)``.
+
+    Attributes:
+        name: Name of the drive, used in parameter names.
+        ratios: Pairs of joint name and ratio [-].
+    """
+
+    name: str
+    ratios: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """Which standard parameters a model has, and in which order.
+
+    Ten inertial parameters per body, then the drive terms joint by joint, then those of each
+    coupling (which has no offset of its own).
+
+    Attributes:
+        bodies: Names of the bodies, one per movable joint (and one for a floating base).
+        joints: Names of the driven joints.
+        terms: The drive terms that are identified, a subset of ``DRIVE_TERMS`` in its order.
+        couplings: Drives that turn with several joints.
+        prismatic: Names of the joints that slide.
+    """
+
+    bodies: tuple[str, ...]
+    joints: tuple[str, ...]
+    terms: tuple[str, ...] = DRIVE_TERMS
+    couplings: tuple[Coupling, ...] = ()
+    prismatic: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        unknown = [term for term in self.terms if term not in DRIVE_TERMS]
+        if unknown:
+            raise SettingsError(f"unknown drive terms {unknown}; known: {list(DRIVE_TERMS)}")
+        for coupling in self.couplings:
+            missing = [joint for joint, _ in coupling.ratios if joint not in self.joints]
+            if missing:
+                raise SettingsError(
+                    f"coupling {coupling.name!r} names the joints {missing}, which are not "
+                    f"identified; joints: {list(self.joints)}"
+                )
+            if coupling.name in self.joints:
+                raise SettingsError(
+                    f"coupling {coupling.name!r} has the name of a joint; give it another name"
+                )
+
+    @property
+    def n_inertial(self) -> int:
+        """Number of inertial parameters, 10 per body."""
+        return 10 * len(self.bodies)
+
+    @property
+    def coupling_terms(self) -> tuple[str, ...]:
+        """Drive terms of a coupling: those of a joint without the offset."""
+        return tuple(term for term in self.terms if term != "offset")
+
+    @cached_property
+    def inertial_names(self) -> tuple[str, ...]:
+        """Names of the inertial parameters, as ``"forearm.mcx"``."""
+        return tuple(f"{body}.{term}" for body in self.bodies for term in INERTIAL_TERMS)
+
+    @cached_property
+    def drive_names(self) -> tuple[str, ...]:
+        """Names of the drive parameters, as ``"elbow.viscous"``."""
+        own = [f"{joint}.{term}" for joint in self.joints for term in self.terms]
+        coupled = [f"{c.name}.{term}" for c in self.couplings for term in self.coupling_terms]
+        return tuple(own + coupled)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all p parameters."""
+        return self.inertial_names + self.drive_names
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each of the p parameters."""
+        return tuple(self._unit(*name.rsplit(".", 1)) for name in self.names)
+
+    def scales(self, length: float) -> Array:
+        """Return the magnitude 1 kg length^k of each parameter, which makes columns comparable.
+
+        Args:
+            length: A length of the robot [m].
+
+        Returns:
+            Scales, shape (p,): 1 for a mass, length for m c, length^2 for an inertia and for the
+            armature of a rotary joint, 1 for other drive terms.
+        """
+        powers = {"m": 0, **dict.fromkeys(("mcx", "mcy", "mcz"), 1)}
+        inertial = [length ** powers.get(term, 2) for term in INERTIAL_TERMS]
+        drive = [
+            length**2 if name.endswith(".armature") and not self._is_linear(name) else 1.0
+            for name in self.drive_names
+        ]
+        return np.array(inertial * len(self.bodies) + drive)
+
+    def preference(self) -> Array:
+        """Return how much each parameter is favoured as the name of a base parameter.
+
+        Inertias before first moments before masses: the groups then have short expressions, for
+        example 59 coefficients beside the kept columns on a UR where plain pivoting leaves 142.
+
+        Returns:
+            Factors, shape (p,).
+        """
+        favour = {"m": 0.1, "mcx": 0.3, "mcy": 0.3, "mcz": 0.3, "armature": 0.3}
+        return np.array([favour.get(name.rsplit(".", 1)[1], 1.0) for name in self.names])
+
+    def is_nonnegative(self) -> Array:
+        """Return which parameters cannot be negative by physics: armature, viscous, coulomb.
+
+        Returns:
+            Flags, shape (p,), bool.
+        """
+        return np.array([n.endswith((".armature", ".viscous", ".coulomb")) for n in self.names])
+
+    def _is_linear(self, name: str) -> bool:
+        owner = name.rsplit(".", 1)[0]
+        coupled = {c.name: {joint for joint, _ in c.ratios} for c in self.couplings}
+        return coupled.get(owner, {owner}) <= self.prismatic
+
+    def _unit(self, owner: str, term: str) -> str:
+        if term in DRIVE_TERMS:
+            units = _LINEAR_UNITS if self._is_linear(f"{owner}.{term}") else _ROTARY_UNITS
+            return units[term]
+        return {"m": "kg"}.get(term, "kg m" if term.startswith("mc") else "kg m^2")
+
+
+def to_paper_order(pi: Array) -> Array:
+    """Return inertial parameters in the order of the paper's vector (9), (10).
+
+    Args:
+        pi: Inertial parameters in Pinocchio's order, shape (10 n,).
+
+    Returns:
+        The same values, shape (10 n,), body by body as
+        [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m]. Frames are not moved.
+
+    Raises:
+        DataError: If the number of entries is not a multiple of 10.
+
+    References:
+        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
+    """
+    order = [INERTIAL_TERMS.index(term) for term in PAPER_TERMS]
+    return _by_body(pi)[:, order].reshape(-1)
+
+
+def from_paper_order(P: Array) -> Array:
+    """Return inertial parameters in Pinocchio's order; the inverse of :func:`to_paper_order`.
+
+    Args:
+        P: Inertial parameters in the paper's order (9), (10), shape (10 n,).
+
+    Returns:
+        The same values in Pinocchio's order, shape (10 n,).
+
+    Raises:
+        DataError: If the number of entries is not a multiple of 10.
+
+    References:
+        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
+    """
+    order = [PAPER_TERMS.index(term) for term in INERTIAL_TERMS]
+    return _by_body(P)[:, order].reshape(-1)
+
+
+def pseudo_inertia_basis() -> Array:
+    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k.
+
+    Returns:
+        Basis, shape (10, 4, 4), in Pinocchio's parameter order.
+
+    References:
+        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
+        Inertial Parameter Identification, (8).
+    """
+    basis = np.zeros((10, 4, 4))
+    basis[0, 3, 3] = 1.0
+    for axis in range(3):
+        basis[1 + axis, axis, 3] = basis[1 + axis, 3, axis] = 1.0
+    # Sigma = 1/2 tr(I) 1 - I: a second moment of mass about each axis
+    for k, axis in ((4, 0), (6, 1), (9, 2)):
+        basis[k, :3, :3] = 0.5 * np.eye(3)
+        basis[k, axis, axis] = -0.5
+    for k, (i, j) in ((5, (0, 1)), (7, (0, 2)), (8, (1, 2))):
+        basis[k, i, j] = basis[k, j, i] = -1.0
+    return basis
+
+
+def pseudo_inertia(pi: Array) -> Array:
+    """Return the pseudo-inertia J = [[Sigma, m c], [(m c)^T, m]] of each body.
+
+    A body is physically possible exactly when J is positive semidefinite.
+
+    Args:
+        pi: Inertial parameters in Pinocchio's order, shape (10 n,).
+
+    Returns:
+        Pseudo-inertia matrices, shape (n, 4, 4) [kg m^2, kg m, kg].
+
+    Raises:
+        DataError: If the number of entries is not a multiple of 10.
+
+    References:
+        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
+        Inertial Parameter Identification, (8).
+    """
+    J: Array = np.einsum("nk,kij->nij", _by_body(pi), pseudo_inertia_basis())
+    return J
+
+
+def inertial_from_pseudo_inertia(J: Array) -> Array:
+    """Return the ten inertial parameters of one body; the inverse of :func:`pseudo_inertia`.
+
+    Args:
+        J: Pseudo-inertia, shape (4, 4).
+
+    Returns:
+        Inertial parameters in Pinocchio's order, shape (10,).
+    """
+    sigma = J[:3, :3]
+    inertia = np.trace(sigma) * np.eye(3) - sigma
+    return np.array(
+        [
+            J[3, 3],
+            *J[:3, 3],
+            inertia[0, 0],
+            inertia[0, 1],
+            inertia[1, 1],
+            inertia[0, 2],
+            inertia[1, 2],
+            inertia[2, 2],
+        ]
+    )
+
+
+def _by_body(pi: Array | Sequence[float]) -> Array:
+    values = np.asarray(pi, dtype=float)
+    if values.ndim != 1 or values.size % 10:
+        raise DataError(
+            f"inertial parameters come as a vector of 10 per body, but the shape is {values.shape}"
+        )
+    return values.reshape(-1, 10)

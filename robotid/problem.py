@@ -1,0 +1,116 @@
+"""The linear problem W theta = tau as a stream of row blocks; W as a whole is never held."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import TypeAlias
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+
+__all__ = ["Block", "Problem", "Sample", "concatenate"]
+
+#: Rows of k samples: W (k n, c), tau (k n,), weight (k n,); row of sample k, joint j: k n + j.
+Block: TypeAlias = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One instant, for recursive estimators.
+
+    Attributes:
+        Y: Regressor, shape (n, c).
+        tau: Measured torque, shape (n,) [N m or N].
+        weight: Row weights, shape (n,); 0 leaves a row out.
+        mass_regressor: Regressor of the mass matrix, shape (n, n, c), or None.
+    """
+
+    Y: Array
+    tau: Array
+    weight: Array
+    mass_regressor: Array | None = None
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The rows of W theta = tau, read in blocks as often as wanted.
+
+    Attributes:
+        stream: Starts a fresh pass and yields the blocks in order.
+        names: Names of the c columns.
+        n_joints: Number n of rows per sample.
+        support: Shape (n, c), bool: False where row j is zero for every motion.
+    """
+
+    stream: Callable[[], Iterator[Block]]
+    names: tuple[str, ...]
+    n_joints: int
+    support: Array
+
+    def __post_init__(self) -> None:
+        wanted = (self.n_joints, len(self.names))
+        if self.support.shape != wanted:
+            raise DataError(f"support has shape {self.support.shape}, wanted {wanted}")
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the blocks (W (k n, c), tau (k n,), weight (k n,)) from the first one on."""
+        return self.stream()
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the problem instant by instant, for recursive estimators."""
+        n, c = self.n_joints, len(self.names)
+        for W, tau, weight in self.blocks():
+            rows = zip(W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n), strict=True)
+            for Y, torque, row_weight in rows:
+                yield Sample(Y, torque, row_weight)
+
+    def select(self, columns: Array) -> "Problem":
+        """Return the problem with only the given columns.
+
+        Args:
+            columns: Indices of the columns kept, shape (b,).
+
+        Returns:
+            A problem over the same rows.
+        """
+
+        def stream() -> Iterator[Block]:
+            for W, tau, weight in self.blocks():
+                yield W[:, columns], tau, weight
+
+        return replace(
+            self,
+            stream=stream,
+            names=tuple(self.names[i] for i in columns),
+            support=self.support[:, columns],
+        )
+
+
+def concatenate(problems: Sequence[Problem]) -> Problem:
+    """Return one problem with the rows of several, as of several logs of one robot.
+
+    Args:
+        problems: At least one problem; all with the same columns and joints.
+
+    Returns:
+        The rows of the first, then of the second, and so on.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not problems:
+        raise DataError("no problem was given; at least one log is needed")
+    first = problems[0]
+    for other in problems[1:]:
+        if other.names != first.names or other.n_joints != first.n_joints:
+            raise DataError(
+                f"problems differ in their columns: {len(first.names)} of {first.n_joints} "
+                f"joints and {len(other.names)} of {other.n_joints} joints"
+            )
+    return replace(
+        first,
+        stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
+        support=np.any([problem.support for problem in problems], axis=0),
+    )

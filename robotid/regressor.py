@@ -1,0 +1,166 @@
+"""Regressor of joint torques: RobotModel + Trajectory -> Problem.
+
+Pinocchio computes the inertial columns; the drive columns stand beside them.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.data import Trajectory
+from robotid.exceptions import DataError
+from robotid.model import RobotModel
+from robotid.problem import Block, Problem
+
+__all__ = ["build_problem", "joint_torque_regressor", "random_regressor"]
+
+_BLOCK = 512  # samples per block: fits in the cache with 100 columns
+
+
+def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the regressor Y with tau = Y pi at each of N instants.
+
+    The columns are the ten inertial parameters of each body, from Pinocchio, and then
+    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off`` and the like for couplings.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+
+    Returns:
+        Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
+
+    Raises:
+        DataError: If a shape does not fit the model.
+
+    References:
+        Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
+        Links; Carpentier et al. (2019), The Pinocchio C++ library.
+    """
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted:
+        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+    return np.concatenate(
+        [_inertial_columns(model, q, v, a), _drive_columns(model, v, a)], axis=2
+    ).reshape(len(q) * model.n_rows, -1)
+
+
+def build_problem(
+    model: RobotModel, trajectory: Trajectory, weight: Array | None = None
+) -> Problem:
+    """Return the identification problem W pi = tau of a trajectory.
+
+    Args:
+        model: The robot; the trajectory's joints must be its joints, in its order.
+        trajectory: N samples of q, v, a, tau.
+        weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
+
+    Returns:
+        A stream of row blocks with p columns.
+
+    Raises:
+        DataError: If joints or shapes do not fit the model.
+    """
+    if trajectory.joints != model.joints:
+        raise DataError(
+            f"the trajectory has the joints {list(trajectory.joints)}, the model has "
+            f"{list(model.joints)}; read the log with joints=model.joints"
+        )
+    shape = (len(trajectory.t), model.n_rows)
+    weights = np.ones(shape) if weight is None else weight
+    if weights.shape != shape:
+        raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
+
+    def stream() -> Iterator[Block]:
+        for start in range(0, shape[0], _BLOCK):
+            part = slice(start, start + _BLOCK)
+            W = joint_torque_regressor(
+                model, trajectory.q[part], trajectory.v[part], trajectory.a[part]
+            )
+            yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
+
+    return Problem(stream, model.layout.names, model.n_rows, model.support())
+
+
+def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
+    """Return the regressor at random states, which shows what any motion can excite.
+
+    The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
+    gravity and inertia weigh alike on a finger and on a crane.
+
+    Args:
+        model: The robot.
+        samples: Number N of states.
+        rng: Source of the random states.
+
+    Returns:
+        Regressors, shape (N n_rows, p).
+    """
+    n = len(model.joints)
+    rate = np.sqrt(9.81 / model.length)  # [1/s]
+    reach = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
+    q = rng.uniform(-1, 1, (samples, n)) * reach
+    unit = np.minimum(reach, 1.0)  # [rad or m]
+    v = rng.uniform(-1, 1, (samples, n)) * unit * rate
+    a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
+    if model.free_flyer:
+        linear = np.array([model.length] * 3 + [1.0] * 3)
+        pose = np.column_stack([np.zeros((samples, 3)), _random_quaternions(samples, rng)])
+        q = np.hstack([pose, q])
+        v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
+        a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
+    return joint_torque_regressor(model, q, v, a)
+
+
+def _inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return Pinocchio's joint-torque regressor at each instant, shape (N, n_rows, 10 bodies)."""
+    pin_model, G = model.pin_model, model.velocity_map
+    data = pin_model.createData()
+    configurations = np.ascontiguousarray(model.configurations(q))
+    velocities, accelerations = v @ G.T, a @ G.T  # (N, nv)
+    Y = np.empty((len(q), pin_model.nv, model.layout.n_inertial))
+    instants = zip(Y, configurations, velocities, accelerations, strict=True)
+    for out, q_k, v_k, a_k in instants:
+        out[:] = pin.computeJointTorqueRegressor(pin_model, data, q_k, v_k, a_k)
+    if np.array_equal(G, np.eye(len(G))):
+        return Y
+    projected: Array = G.T @ Y  # tau = G^T tau_pinocchio
+    return projected
+
+
+def _drive_columns(model: RobotModel, v: Array, a: Array) -> Array:
+    """Return the columns of armature, viscous, coulomb, offset, shape (N, n_rows, drive)."""
+    layout = model.layout
+    first = model.n_rows - len(layout.joints)
+    columns = np.zeros((len(v), model.n_rows, len(layout.drive_names)))
+    column = 0
+    for j in range(first, model.n_rows):
+        for term in layout.terms:
+            columns[:, j, column] = _drive_term(term, v[:, j], a[:, j])
+            column += 1
+    for coupling in layout.couplings:
+        rows = [first + layout.joints.index(joint) for joint, _ in coupling.ratios]
+        ratios = np.array([ratio for _, ratio in coupling.ratios])
+        w, dw = v[:, rows] @ ratios, a[:, rows] @ ratios  # speed of the drive
+        for term in layout.coupling_terms:
+            columns[:, rows, column] = ratios * _drive_term(term, w, dw)[:, None]
+            column += 1
+    return columns
+
+
+def _drive_term(term: str, v: Array, a: Array) -> Array:
+    if term == "armature":
+        return a
+    if term == "viscous":
+        return v
+    return np.sign(v) if term == "coulomb" else np.ones_like(v)
+
+
+def _random_quaternions(samples: int, rng: np.random.Generator) -> Array:
+    quaternions = rng.standard_normal((samples, 4))
+    unit: Array = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return unit

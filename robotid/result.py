@@ -1,0 +1,261 @@
+"""result.json: what an identification found, in the schema that other programs read."""
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid import __version__
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.identification import Identification, structural_mapping
+from robotid.metrics import Metrics
+from robotid.parameters import pseudo_inertia
+from robotid.validation import Evaluation
+from robotid.verdict import Finding
+
+__all__ = ["build_result", "file_sha256", "read_result", "recording_metrics", "write_json"]
+
+SCHEMA_VERSION = 1
+
+
+def build_result(
+    identification: Identification,
+    settings: Mapping[str, Any],
+    findings: Sequence[Finding] = (),
+    outputs: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Return the content of result.json, plain values only and all of them finite.
+
+    Args:
+        identification: What was found.
+        settings: The job, in the shape of its file.
+        findings: Warnings.
+        outputs: Files written beside it, by kind.
+
+    Returns:
+        The dictionary, schema_version 1.
+    """
+    model, verdict = identification.model, identification.verdict
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "robotid": __version__,
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": dict(settings),
+        "inputs": _inputs(identification),
+        "outputs": dict(outputs or {}),
+        "structure": {
+            "standard": model.layout.n_inertial,
+            "base_inertial": len(structural_mapping(model, inertial_only=True).K),
+            "base": len(identification.base),
+            "rank": identification.wls.rank,
+            "condition": _finite(identification.wls.condition),
+            "undetermined": list(identification.estimate.undetermined),
+        },
+        "base_parameters": _base_parameters(identification),
+        "standard_parameters": _standard_parameters(identification),
+        "drive_parameters": _drive_parameters(identification),
+        "consistency": _consistency(identification),
+        "identification": _metrics(identification.metrics()),
+        "validation": [recording_metrics(e, "estimate") for e in identification.validation],
+        "warnings": [{"code": f.code, "message": f.message, "where": f.where} for f in findings],
+        "wls": {
+            "base_values": identification.wls.theta.tolist(),
+            "identification": _metrics(identification.metrics("wls")),
+            "validation": [recording_metrics(e, "wls") for e in identification.validation],
+        },
+        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons)},
+    }
+
+
+def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
+    """Return the metrics of one recording as result.json has them.
+
+    Args:
+        evaluation: The recording.
+        name: Which parameters predict.
+
+    Returns:
+        The dictionary.
+    """
+    return {"log": evaluation.recording.log.path, **_metrics(evaluation.metrics[name])}
+
+
+def read_result(path: str | Path) -> dict[str, Any]:
+    """Read a result.json.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        DataError: If it is missing, no JSON, or of another schema.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(f"there is no result {str(source)!r}")
+    try:
+        result = json.loads(source.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise DataError(f"{source.name} is not JSON: {error}") from error
+    version = result.get("schema_version") if isinstance(result, dict) else None
+    if version != SCHEMA_VERSION or "verdict" not in result:
+        raise DataError(
+            f"{source.name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
+            "written by 'robotid identify'"
+        )
+    return dict(result)
+
+
+def write_json(content: Mapping[str, Any], target: str | Path) -> None:
+    """Write JSON beside its target, then put it in place.
+
+    Args:
+        content: What to write; non-finite numbers are refused.
+        target: The file.
+    """
+    path = Path(target)
+    text = json.dumps(content, indent=1, allow_nan=False)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside.write_text(text + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def file_sha256(path: str | Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal.
+
+    Args:
+        path: The file.
+
+    Returns:
+        64 hexadecimal digits.
+    """
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _inputs(identification: Identification) -> list[dict[str, Any]]:
+    inputs = [{"role": "urdf", **_source(identification.model.tree.path)}]
+    for role in ("identification", "validation"):
+        for evaluation in getattr(identification, role):
+            recording = evaluation.recording
+            t = recording.log.t
+            inputs.append(
+                {
+                    "role": role,
+                    **_source(recording.log.path),
+                    "samples": len(t),
+                    "rate": float(1.0 / np.median(np.diff(t))),
+                    "start": float(t[0]),
+                    "end": float(t[-1]),
+                    "rows_used": int(recording.mask.sum()),
+                    "segments": int(recording.trajectory.segment[-1]) + 1,
+                    "signals": dataclasses.asdict(recording.signals),
+                }
+            )
+    return inputs
+
+
+def _source(path: str) -> dict[str, Any]:
+    return {"path": str(path), "sha256": file_sha256(path) if path else None}
+
+
+def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
+    mapping, units = identification.mapping, identification.model.layout.units
+    return [
+        {
+            "name": name,
+            "expression": expression,
+            "value": float(value),
+            "std_error": _finite(error),
+            "unit": units[i],
+        }
+        for name, expression, value, error, i in zip(
+            mapping.base_names,
+            mapping.expressions,
+            identification.base,
+            identification.base_error,
+            mapping.independent,
+            strict=True,
+        )
+    ]
+
+
+def _standard_parameters(identification: Identification) -> list[dict[str, Any]]:
+    size = identification.model.layout.n_inertial
+    return [
+        {**entry, "prior": float(prior), "source": source}
+        for entry, prior, source in zip(
+            _entries(identification, slice(0, size)),
+            identification.prior,
+            identification.sources,
+            strict=False,
+        )
+    ]
+
+
+def _drive_parameters(identification: Identification) -> list[dict[str, Any]]:
+    return _entries(identification, slice(identification.model.layout.n_inertial, None))
+
+
+def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:
+    layout = identification.model.layout
+    return [
+        {"name": name, "value": float(value), "std_error": _finite(error), "unit": unit}
+        for name, value, error, unit in zip(
+            layout.names[part],
+            identification.standard[part],
+            identification.standard_error[part],
+            layout.units[part],
+            strict=True,
+        )
+    ]
+
+
+def _consistency(identification: Identification) -> dict[str, Any]:
+    layout = identification.model.layout
+    J = pseudo_inertia(identification.standard[: layout.n_inertial])
+    return {
+        "is_consistent": identification.is_consistent,
+        "links": [
+            {"name": body, "mass": float(J_i[3, 3]), "min_eigenvalue": _smallest(J_i)}
+            for body, J_i in zip(layout.bodies, J, strict=True)
+        ],
+        "total_mass": float(J[:, 3, 3].sum()),
+    }
+
+
+def _smallest(J: Array) -> float:
+    return float(np.linalg.eigvalsh(J)[0])
+
+
+def _metrics(metrics: Metrics) -> dict[str, Any]:
+    return {
+        "per_joint": {
+            joint: {
+                "rmse": m.rmse,
+                "unit": m.unit,
+                "relative_error_pct": m.relative_error_pct,
+                "r2": m.r2,
+                "rows": m.rows,
+                "urdf_relative_error_pct": m.baselines["urdf"],
+                "gravity_only_relative_error_pct": m.baselines["gravity_only"],
+                "better_than_constant": m.better_than_constant,
+            }
+            for joint, m in metrics.per_joint.items()
+        },
+        "pooled_rmse": metrics.pooled_rmse,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

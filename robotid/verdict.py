@@ -1,0 +1,125 @@
+"""How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from robotid.metrics import JointMetrics, Metrics
+
+__all__ = ["Finding", "Verdict", "judge"]
+
+_GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
+_POOR = 50.0  # [%] a joint predicted worse than this is not usable
+_OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something a user must know.
+
+    Attributes:
+        code: A fixed word for programs.
+        severity: "note", "warning" or "error".
+        where: What it is about: a link, a joint, a parameter or a file.
+        message: What was found, what was wanted, what to do.
+    """
+
+    code: str
+    severity: str
+    where: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How far to trust a result.
+
+    Attributes:
+        status: "good", "usable" or "poor".
+        reasons: Why, the worst first; for "good" what was checked.
+    """
+
+    status: str
+    reasons: tuple[str, ...]
+
+
+def judge(
+    identification: Metrics,
+    validation: Mapping[str, Metrics],
+    *,
+    undetermined: Sequence[str],
+    is_consistent: bool,
+) -> Verdict:
+    """Return the verdict on a result.
+
+    Args:
+        identification: Metrics over the fitted recordings.
+        validation: Metrics of each kept recording, by its name.
+        undetermined: Base parameters about which the data say nothing.
+        is_consistent: Whether the parameters are physically possible.
+
+    Returns:
+        The verdict. Without a kept recording it is at best "usable".
+    """
+    poor: list[str] = []
+    doubts: list[str] = []
+    if not validation:
+        doubts.append("the prediction of a new motion was not evaluated: no validation log given")
+    for log, metrics in validation.items():
+        for joint, measured in metrics.per_joint.items():
+            worse, doubt = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
+            poor += worse
+            doubts += doubt
+    missing = sorted(
+        {joint for m in validation.values() for joint in identification.per_joint}
+        - {joint for m in validation.values() for joint in m.per_joint}
+    )
+    if missing:
+        doubts.append(f"the joints {missing} do not move in any validation log: not evaluated")
+    if undetermined:
+        doubts.append(
+            f"the data say nothing about {len(undetermined)} base parameters: {list(undetermined)}"
+        )
+    if not is_consistent:
+        doubts.append(
+            "the standard parameters are not physically consistent, so no URDF was written; the "
+            "base parameters predict torque all the same"
+        )
+    if poor:
+        return Verdict("poor", (*poor, *doubts))
+    if doubts:
+        return Verdict("usable", tuple(doubts))
+    worst = max(_error(m) for metrics in validation.values() for m in metrics.per_joint.values())
+    return Verdict(
+        "good",
+        (
+            f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, "
+            "better than by a constant and than by the URDF, and every parameter is physically "
+            "consistent",
+        ),
+    )
+
+
+def _judge_joint(
+    joint: str, log: str, measured: JointMetrics, fitted: JointMetrics | None
+) -> tuple[list[str], list[str]]:
+    """Return what makes the result poor, and what makes it doubtful, on one joint."""
+    error = _error(measured)
+    urdf = measured.baselines.get("urdf")
+    if not measured.better_than_constant:
+        return [f"{joint}: worse than a constant torque on {log} ({error:.1f} %)"], []
+    if urdf is not None and error > urdf:
+        return [f"{joint}: {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
+    if error > _POOR:
+        return [f"{joint}: predicted to {error:.1f} % only on {log}"], []
+    if error > _GOOD:
+        return [], [f"{joint}: predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"]
+    if fitted is not None and error > max(_OPTIMISM * _error(fitted), 5.0):
+        return [], [
+            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted"
+        ]
+    return [], []
+
+
+def _error(measured: JointMetrics) -> float:
+    value = measured.relative_error_pct
+    return float("inf") if value is None else value

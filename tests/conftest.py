@@ -1,0 +1,37 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotid.examples import example_urdf
+from robotid.model import RobotModel
+
+ROOT = Path(__file__).resolve().parents[1]
+IN_CI = os.environ.get("CI") == "true"
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def ur5():
+    return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="session")
+def panda():
+    arm = [f"panda_joint{i}" for i in range(1, 8)]
+    return RobotModel.from_urdf(example_urdf("panda.urdf"), joints=arm)
+
+
+@pytest.fixture(scope="session")
+def recordings():
+    """The folder of real recordings, which are never part of the project."""
+    for folder in (os.environ.get("ROBOTID_DATA"), ROOT.parent / "shared" / "data"):
+        if folder and Path(folder).is_dir():
+            return Path(folder)
+    assert not IN_CI, "CI must not skip the real recordings: set ROBOTID_DATA"
+    pytest.skip("no real recordings: set ROBOTID_DATA to their folder")

@@ -1,0 +1,132 @@
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError
+from robotid.factors import compress, merge
+from robotid.problem import Problem, concatenate
+
+
+def make(rng, samples=300, n=3, c=5, block=64, weight=None, support=None):
+    W = rng.standard_normal((samples * n, c))
+    support = np.ones((n, c), dtype=bool) if support is None else support
+    W *= np.tile(support, (samples, 1))
+    tau = rng.standard_normal(samples * n)
+    weight = np.ones(samples * n) if weight is None else weight
+
+    def stream():
+        for k in range(0, samples * n, block * n):
+            part = slice(k, k + block * n)
+            yield W[part], tau[part], weight[part]
+
+    return Problem(stream, tuple("abcde"[:c]), n, support), W, tau
+
+
+def gram(R):
+    return R.T @ R
+
+
+def test_a_factor_has_the_gram_matrix_of_its_rows(rng):
+    problem, W, tau = make(rng)
+    factors = compress(problem)
+    for j in range(3):
+        A = np.column_stack([W, tau])[j::3]
+        np.testing.assert_allclose(gram(factors.R[j]), gram(A), atol=1e-11)
+        np.testing.assert_array_equal(factors.R[j], np.triu(factors.R[j]))
+    np.testing.assert_array_equal(factors.rows, [300, 300, 300])
+
+
+def test_columns_that_a_joint_never_sees_are_left_out(rng):
+    support = np.triu(np.ones((3, 5), dtype=bool))
+    problem, W, tau = make(rng, support=support)
+    factors = compress(problem)
+    for j in range(3):
+        A = np.column_stack([W, tau])[j::3]
+        np.testing.assert_allclose(gram(factors.R[j]), gram(A), atol=1e-11)
+        assert not factors.R[j][:, :5][:, ~support[j]].any()
+
+
+def test_factors_of_two_logs_merge_into_the_factor_of_both(rng):
+    first, second = make(rng)[0], make(rng)[0]
+    merged = merge([compress(first), compress(second)])
+    together = compress(concatenate([first, second]))
+    for a, b in zip(merged.R, together.R, strict=True):
+        np.testing.assert_allclose(gram(a), gram(b), atol=1e-11)
+    np.testing.assert_array_equal(merged.rows, together.rows)
+
+
+def test_selecting_columns_equals_reducing_the_problem(rng):
+    problem = make(rng)[0]
+    columns = np.array([0, 3])
+    selected = compress(problem).select(columns)
+    reduced = compress(problem.select(columns))
+    assert selected.names == reduced.names == ("a", "d")
+    for a, b in zip(selected.R, reduced.R, strict=True):
+        np.testing.assert_allclose(gram(a), gram(b), atol=1e-11)
+
+
+def test_rows_of_weight_zero_are_left_out_and_others_scaled(rng):
+    weight = rng.choice([0.0, 1.0, 4.0], 900)
+    problem, W, tau = make(rng, weight=weight)
+    factors = compress(problem)
+    A = np.column_stack([W, tau])
+    for j in range(3):
+        w = weight[j::3]
+        np.testing.assert_allclose(
+            gram(factors.R[j]), A[j::3].T @ (w[:, None] * A[j::3]), atol=1e-11
+        )
+        assert factors.rows[j] == np.sum(w > 0)
+
+
+def test_weighted_factor_divides_by_the_noise_of_each_joint(rng):
+    problem, W, tau = make(rng)
+    sigma = np.array([0.5, 2.0, 3.0])
+    A = np.column_stack([W, tau]) / np.tile(sigma, 300)[:, None]
+    np.testing.assert_allclose(gram(compress(problem).weighted(sigma)), gram(A), atol=1e-10)
+
+
+def test_residuals_need_no_second_pass(rng):
+    problem, W, tau = make(rng)
+    theta = rng.standard_normal(5)
+    squares = ((tau - W @ theta) ** 2).reshape(-1, 3).sum(axis=0)
+    np.testing.assert_allclose(compress(problem).residual_squares(theta), squares, rtol=1e-11)
+    np.testing.assert_allclose(
+        compress(problem).torque_squares(), (tau**2).reshape(-1, 3).sum(axis=0), rtol=1e-11
+    )
+
+
+def test_poor_excitation_keeps_its_digits(rng):
+    # columns that differ by 1e-7: a Gram matrix would lose their difference altogether
+    direction = rng.standard_normal(300)
+    A = np.column_stack([direction, direction + 1e-7 * rng.standard_normal(300)])
+    exact = Problem(
+        lambda: iter([(A, A @ [1.0, 2.0], np.ones(300))]), ("a", "b"), 1, np.ones((1, 2))
+    )
+    R = compress(exact).R[0]
+    np.testing.assert_allclose(np.linalg.solve(R[:2, :2], R[:2, 2]), [1.0, 2.0], rtol=1e-7)
+
+
+def test_a_row_that_is_not_finite_is_refused(rng):
+    problem, W, _ = make(rng)
+    W[17, 2] = np.nan
+    with pytest.raises(DataError, match="a row that is not finite"):
+        compress(problem)
+
+
+def test_problems_with_other_columns_do_not_mix(rng):
+    one, other = make(rng)[0], make(rng, c=4)[0]
+    with pytest.raises(DataError, match="problems differ in their columns"):
+        concatenate([one, other])
+    with pytest.raises(DataError, match="factors differ"):
+        merge([compress(one), compress(other)])
+    with pytest.raises(DataError, match="no factors were given"):
+        merge([])
+    with pytest.raises(DataError, match="no problem was given"):
+        concatenate([])
+
+
+def test_samples_are_the_rows_instant_by_instant(rng):
+    problem, W, tau = make(rng)
+    samples = list(problem.samples())
+    assert len(samples) == 300
+    np.testing.assert_array_equal(samples[7].Y, W[21:24])
+    np.testing.assert_array_equal(samples[7].tau, tau[21:24])

@@ -1,0 +1,47 @@
+from robotid.metrics import JointMetrics, Metrics
+from robotid.verdict import judge
+
+
+def joint(error, *, urdf=100.0, constant=True):
+    return JointMetrics(1.0, "N m", error, 0.9, 100, {"urdf": urdf}, constant)
+
+
+def verdict(validation, fitted=None, undetermined=(), is_consistent=True):
+    fit = Metrics(fitted or {"a": joint(3.0)}, 1.0)
+    logs = {"val.csv": Metrics(validation, 1.0)} if validation is not None else {}
+    return judge(fit, logs, undetermined=undetermined, is_consistent=is_consistent)
+
+
+def test_good_needs_every_joint_good_on_kept_recordings():
+    found = verdict({"a": joint(4.0)})
+    assert found.status == "good"
+    assert "within 4.0 % on recordings that were not fitted" in found.reasons[0]
+
+
+def test_not_evaluated_is_never_a_pass():
+    found = verdict(None)
+    assert found.status == "usable"
+    assert "was not evaluated: no validation log given" in found.reasons[0]
+    found = verdict({"a": joint(4.0)}, fitted={"a": joint(3.0), "b": joint(3.0)})
+    assert found.status == "usable"
+    assert found.reasons == ("the joints ['b'] do not move in any validation log: not evaluated",)
+
+
+def test_worse_than_a_constant_is_said_first():
+    found = verdict({"a": joint(20.0), "b": joint(40.0, constant=False)})
+    assert found.status == "poor"
+    assert found.reasons[0] == "b: worse than a constant torque on val.csv (40.0 %)"
+
+
+def test_worse_than_the_urdf_is_poor():
+    found = verdict({"a": joint(8.0, urdf=6.0)})
+    assert found.status == "poor"
+    assert found.reasons == ("a: 8.0 % on val.csv, worse than the URDF's 6.0 %",)
+
+
+def test_large_errors_and_open_parameters_make_it_usable_at_best():
+    assert verdict({"a": joint(20.0)}).status == "usable"
+    assert verdict({"a": joint(60.0)}).status == "poor"
+    assert verdict({"a": joint(9.0)}).status == "usable"  # three times the error of the fit
+    assert verdict({"a": joint(4.0)}, undetermined=["x.m"]).status == "usable"
+    assert verdict({"a": joint(4.0)}, is_consistent=False).status == "usable"
