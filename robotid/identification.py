@@ -18,7 +18,7 @@ from robotid.parameters import pseudo_inertia
 from robotid.prior import prior_spread
 from robotid.regressor import build_problem, random_regressor
 from robotid.signals import SignalSettings
-from robotid.validation import Evaluation, Recording, evaluate, pool, prepare
+from robotid.validation import Evaluation, Recording, evaluate, pool, prepare, shares_rows
 from robotid.verdict import Verdict, judge
 
 __all__ = ["ESTIMATORS", "EstimatorSettings", "Identification", "identify", "structural_mapping"]
@@ -87,8 +87,12 @@ class Identification:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether every body and drive of the standard parameters is physically possible."""
-        J = pseudo_inertia(self.standard[: self.model.layout.n_inertial])
+        """Whether every body and drive of the standard parameters is physically possible.
+
+        A body must be so without its links on locked joints, which keep their own inertials.
+        """
+        size = self.model.layout.n_inertial
+        J = pseudo_inertia(self.standard[:size] - held_parameters(self.model))
         signs = self.standard[self.model.layout.is_nonnegative()]
         return bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
 
@@ -113,11 +117,20 @@ class Identification:
         return pool(self.model, self.identification, name)
 
     @property
+    def refitted(self) -> tuple[Evaluation, ...]:
+        """Validation recordings that hold rows which were fitted: they show no prediction."""
+        fitted = [evaluation.recording.log for evaluation in self.identification]
+        return tuple(
+            e for e in self.validation if any(shares_rows(e.recording.log, log) for log in fitted)
+        )
+
+    @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
+        kept = [e for e in self.validation if e not in self.refitted]
         return judge(
             self.metrics(),
-            {e.recording.name: e.metrics["estimate"] for e in self.validation},
+            {e.recording.name: e.metrics["estimate"] for e in kept},
             undetermined=self.estimate.undetermined,
             is_consistent=self.is_consistent,
         )

@@ -137,7 +137,7 @@ def _parse(path: Path) -> ET.Element | None:
     """Return the ``<robot>``; None if there is none, which building the model reports."""
     try:
         robot = ET.parse(path).getroot()
-    except (OSError, ET.ParseError):
+    except (OSError, ET.ParseError, LookupError, ValueError):  # the last two: its encoding
         return None
     return robot if robot.tag == "robot" else None
 

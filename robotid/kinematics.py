@@ -163,7 +163,7 @@ def _parse(path: Path) -> ET.Element:
         raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
     try:
         robot = ET.parse(path).getroot()
-    except ET.ParseError as error:
+    except (ET.ParseError, LookupError, ValueError) as error:  # the latter two: its encoding
         raise ModelError(f"{path.name} is not well-formed XML: {error}") from error
     if robot.tag != "robot":
         raise ModelError(f"{path.name}: the top element is <{robot.tag}>, wanted <robot>")

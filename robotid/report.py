@@ -17,7 +17,6 @@ from robotid.report_tables import (
     consistency_table,
     drive_table,
     input_table,
-    label,
     open_section,
     settings_tables,
     standard_table,
@@ -136,13 +135,13 @@ def _chain(signals: SignalSettings) -> str:
 
 
 def _names(evaluations: Sequence[Evaluation]) -> str:
-    return ", ".join(label(e.recording) for e in evaluations)
+    return ", ".join(e.recording.name for e in evaluations)
 
 
 def _errors(found: Identification) -> str:
     tables = [
         _error_table(
-            f"{label(e.recording)}: not fitted", found, e.metrics["estimate"], e.metrics["wls"]
+            f"{e.recording.name}: not fitted", found, e.metrics["estimate"], e.metrics["wls"]
         )
         for e in found.validation
     ]
@@ -210,7 +209,7 @@ def _torques(found: Identification) -> str:
         parts.append("<p>No log was kept apart: these are the fitted logs.</p>\n")
     for k, evaluation in enumerate(shown):
         kind = "not fitted" if found.validation else "fitted"
-        parts.append(f"<h3>{escape(label(evaluation.recording))}: {kind}</h3>\n")
+        parts.append(f"<h3>{escape(evaluation.recording.name)}: {kind}</h3>\n")
         figures = "".join(
             _torque_figure(evaluation, row, name, unit, f"tau{k}-{row}", points)
             for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True))

@@ -17,24 +17,10 @@ __all__ = [
     "consistency_table",
     "drive_table",
     "input_table",
-    "label",
     "open_section",
     "settings_tables",
     "standard_table",
 ]
-
-
-def label(recording: Recording) -> str:
-    """Return the name that a recording has in the report: that of its file, and its times.
-
-    Args:
-        recording: The recording.
-
-    Returns:
-        The name.
-    """
-    name = Path(str(recording.log.path)).name or "log without a file"
-    return f"{name} ({recording.log.t[0]:.4g} to {recording.log.t[-1]:.4g} s)"
 
 
 def drive_table(found: Identification) -> str:
@@ -229,7 +215,7 @@ def _listed(title: str, names: Sequence[str]) -> str:
 def _signal_row(recording: Recording) -> list[Cell]:
     s = recording.signals
     return [
-        code(label(recording)),
+        code(recording.name),
         text("none" if s.cutoff is None else f"{s.cutoff:g} Hz, order {s.order}"),
         number(s.rate, ".6g"),
         text(s.velocity),

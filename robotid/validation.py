@@ -13,7 +13,16 @@ from robotid.model import RobotModel
 from robotid.regressor import build_problem
 from robotid.signals import SignalSettings, process, resolve, unwrap
 
-__all__ = ["Evaluation", "Recording", "evaluate", "pool", "predict", "prepare", "row_mask"]
+__all__ = [
+    "Evaluation",
+    "Recording",
+    "evaluate",
+    "pool",
+    "predict",
+    "prepare",
+    "row_mask",
+    "shares_rows",
+]
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,22 @@ def prepare(model: RobotModel, log: Log, settings: SignalSettings) -> Recording:
     trajectory = process(log, resolved)
     mask = row_mask(model, trajectory, resolved.min_velocity)
     return Recording(log, resolved, trajectory, mask)
+
+
+def shares_rows(one: Log, other: Log) -> bool:
+    """Return whether two logs hold the same recorded rows, whatever their files are called.
+
+    Args:
+        one: A log.
+        other: Another log of the same joints.
+
+    Returns:
+        Whether a row of positions and torques among 200 spread over the first is in the second.
+    """
+    known = {row.tobytes() for row in np.hstack([other.q, other.tau])}
+    every = max(1, len(one.t) // 200)
+    sampled = np.hstack([one.q, one.tau])[::every]
+    return any(row.tobytes() in known for row in sampled)
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:

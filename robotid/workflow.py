@@ -19,7 +19,6 @@ from robotid.model import RobotModel
 from robotid.report import write_report
 from robotid.result import (
     build_result,
-    file_sha256,
     read_result,
     recording_metrics,
     write_json,
@@ -56,7 +55,6 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
     logs = [job.read(entry, model) for entry in job.identification]
     kept = [job.read(entry, model) for entry in job.validation]
     findings = [*_locked_findings(job, model), *_log_findings([*logs, *kept])]
-    findings += _overlap_findings(job)
     identification = identify(
         model, logs, validation=kept, signals=job.signals, estimator=job.estimator
     )
@@ -159,25 +157,6 @@ def _log_findings(logs: Sequence[Log]) -> list[Finding]:
     ]
 
 
-def _overlap_findings(job: Job) -> list[Finding]:
-    """Name validation logs that hold rows which were fitted too."""
-    findings = []
-    for kept in job.validation:
-        for fitted in job.identification:
-            overlap = _start(kept) < _end(fitted) and _start(fitted) < _end(kept)
-            if overlap and file_sha256(kept.path) == file_sha256(fitted.path):
-                findings.append(
-                    Finding(
-                        "validation_was_fitted",
-                        "warning",
-                        str(kept.path),
-                        f"the validation log {kept.path.name} holds rows that were fitted: its "
-                        "score shows the fit, not the prediction; validate on another recording",
-                    )
-                )
-    return findings
-
-
 def _fit_findings(identification: Identification) -> list[Finding]:
     findings = []
     undetermined = identification.estimate.undetermined
@@ -193,6 +172,13 @@ def _fit_findings(identification: Identification) -> list[Finding]:
             "URDF was written; use the 'consistent' estimator for one that loads"
         )
         findings.append(Finding("urdf_not_written", "warning", "urdf", message))
+    for evaluation in identification.refitted:
+        message = (
+            f"the validation log {evaluation.recording.name} holds rows that were fitted: its "
+            "score shows the fit, not the prediction; validate on another recording"
+        )
+        where = evaluation.recording.log.path
+        findings.append(Finding("validation_was_fitted", "warning", where, message))
     ours, wls = identification.metrics(), identification.metrics("wls")
     for joint, measured in ours.per_joint.items():
         if measured.rmse > _DIFFERS * wls.per_joint[joint].rmse:
@@ -203,11 +189,3 @@ def _fit_findings(identification: Identification) -> list[Finding]:
             )
             findings.append(Finding("constraint_costs", "warning", joint, message))
     return findings
-
-
-def _start(entry: LogEntry) -> float:
-    return -np.inf if entry.start is None else entry.start
-
-
-def _end(entry: LogEntry) -> float:
-    return np.inf if entry.end is None else entry.end

@@ -144,6 +144,7 @@ FAULTS = {
     "twice the same link": ('name="upper"', 'name="lower"', "two links are named 'lower'"),
     "no mass": ('<mass value="2"/>', "", "needs both <mass> and <inertia>"),
     "no XML": ("</robot>", "", "is not well-formed XML"),
+    "unknown encoding": ("<robot", '<?xml version="1.0" encoding="klingon"?><robot', "well-formed"),
     "not a robot": ("robot", "sdf", "the top element is <sdf>, wanted <robot>"),
 }
 

@@ -25,7 +25,7 @@ URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;&quot;">
     <inertia ixx="0.005" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial></link>
   <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper &lt;arm&gt;"/>
     <axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="3" effort="50"/></joint>
-  <joint name="elbow &amp; $x$" type="continuous"><parent link="upper &lt;arm&gt;"/>
+  <joint name="elbow &amp; &lt;i&gt;$x$" type="continuous"><parent link="upper &lt;arm&gt;"/>
     <child link="forearm"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/></joint>
 </robot>"""
 VOID = {"meta", "br", "wbr", "link", "img", "input", "hr", "path", "use"}
@@ -151,10 +151,10 @@ def test_ids_are_unique_and_every_reference_finds_one(html):
 
 def test_names_cannot_inject_markup(html):
     assert NAME not in html
-    for name in ("<b>", "<kept>", "<arm>", "<grave>", "<w>"):
+    for name in ("<b>", "<i>", "<kept>", "<arm>", "<grave>", "<w>"):
         assert name not in html
     text = Reader(html).text
-    for name in (NAME, "upper <arm>", "elbow & $x$", "<kept>.csv", "a&b.csv", "gripper <w>"):
+    for name in (NAME, "upper <arm>", "elbow & <i>$x$", "<kept>.csv", "a&b.csv", "gripper <w>"):
         assert name in text
 
 
@@ -176,7 +176,7 @@ def test_every_joint_has_its_error_its_parameters_and_its_plot(html, found):
         assert f"{joint}: error {percent(measured.relative_error_pct).html} %" in text
         assert f"{joint}.coulomb" in text
         assert f"predicted torque and residual of {joint} over time" in text
-    assert text.count("<kept>.csv (0 to 7.99 s): not fitted") == 2  # table and plots
+    assert text.count("<kept>.csv 0-7.99 s: not fitted") == 2  # table and plots
     for name in (*found.model.layout.names, *found.mapping.expressions):
         assert name in text
 
@@ -208,14 +208,13 @@ def test_a_joint_worse_than_the_urdf_is_flagged(model, tmp_path):
     text = Reader(write_report(found, tmp_path / "r.html").read_text(encoding="utf-8")).text
     assert "Verdict: poor" in text
     assert "worse than the URDF" in text[text.rindex("Prediction errors") :]
-    assert "log without a file" in text
 
 
 def test_without_a_validation_log_the_fitted_rows_are_drawn(model, tmp_path):
     found = identify(model, [make_log(model, 1, path="a.csv")])
     text = Reader(write_report(found, tmp_path / "r.html").read_text(encoding="utf-8")).text
     assert "No log was kept apart: these are the fitted logs." in text
-    assert "a.csv (0 to 7.99 s): fitted" in text
+    assert "a.csv 0-7.99 s: fitted" in text
 
 
 def test_lines_are_not_joined_across_a_gap(html, found):

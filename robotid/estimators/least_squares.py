@@ -111,7 +111,8 @@ class WLS(Estimator):
                 return _estimate(factors, solution, covariance, sigma, iteration, message)
         raise NotConvergedError(
             f"the noise levels of WLS still change by {change:.1e} after {_MAX_ITERATIONS} "
-            "iterations; look for a joint that is fitted exactly",
+            f"iterations with {int(factors.rows.sum())} rows for {len(factors.names)} parameters; "
+            "record more, or look for a joint that is fitted exactly",
             "max_iterations",
         )
 
