@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from robotid.base_parameters import BaseMapping
-    from robotid.data import Log, LogUnits, Trajectory
+    from robotid.data import Log, Trajectory
     from robotid.estimators import OLS, WLS, Consistent, Estimate, Estimator
     from robotid.exceptions import DataError, ModelError, RobotIdError
     from robotid.identification import EstimatorSettings, Identification, identify
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from robotid.parameters import Coupling
     from robotid.report import write_report
     from robotid.signals import SignalSettings
+    from robotid.units import LogUnits
     from robotid.urdf import write_urdf
 
 __version__ = "0.1.0"
@@ -48,7 +49,7 @@ __all__ = [
 
 _HOMES = {
     "base_parameters": ["BaseMapping"],
-    "data": ["Log", "LogUnits", "Trajectory"],
+    "data": ["Log", "Trajectory"],
     "estimators": ["OLS", "WLS", "Consistent", "Estimate", "Estimator"],
     "exceptions": ["DataError", "ModelError", "RobotIdError"],
     "identification": ["EstimatorSettings", "Identification", "identify"],
@@ -58,6 +59,7 @@ _HOMES = {
     "parameters": ["Coupling"],
     "report": ["write_report"],
     "signals": ["SignalSettings"],
+    "units": ["LogUnits"],
     "urdf": ["write_urdf"],
 }
 

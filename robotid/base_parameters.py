@@ -20,7 +20,7 @@ __all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping"]
 #: Pivots below this share of the largest are no structure. Over example-robot-data, every pivot
 #: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
-_TIE = 1e-6  # pivots closer than this are equal; the earlier column wins
+_TIE = 1e-6  # share by which each column is shortened against the one before it
 _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
 _SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
 
@@ -189,26 +189,12 @@ def base_mapping(
 def _pivot(R: Array) -> tuple[Array, Array]:
     """Return the order in which columns are chosen and the size of each when it was.
 
-    QR with column pivoting by Householder reflections; among columns whose remaining norms agree
-    the first one wins, so that rounding does not choose.
+    LAPACK's QR with column pivoting takes the longest remaining column; later columns are
+    shortened by a hair, so that among equal ones the first wins and rounding does not choose.
     """
-    A = np.asfortranarray(R.copy())
-    p = A.shape[1]
-    order, pivots = np.arange(p), np.zeros(p)
-    for k in range(p):
-        norms = np.sqrt(np.einsum("ij,ij->j", A[k:, k:], A[k:, k:]))
-        tied = np.flatnonzero(norms >= norms.max() * (1 - _TIE))
-        chosen = k + tied[np.argmin(order[k + tied])]
-        A[:, [k, chosen]] = A[:, [chosen, k]]
-        order[[k, chosen]] = order[[chosen, k]]
-        pivots[k] = norms[chosen - k]
-        if pivots[k] <= 1e-14 * pivots[0]:
-            break
-        reflector = A[k:, k].copy()
-        reflector[0] += np.copysign(pivots[k], reflector[0])
-        reflector /= np.linalg.norm(reflector)
-        A[k:, k:] -= 2.0 * np.outer(reflector, reflector @ A[k:, k:])
-    return order, pivots
+    handicap = 1.0 - _TIE * np.arange(R.shape[1])
+    triangle, order = scipy.linalg.qr(R * handicap, mode="r", pivoting=True)
+    return order, np.abs(np.diag(triangle))
 
 
 def _expression(row: Array, names: tuple[str, ...], first: int) -> str:

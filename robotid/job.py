@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from robotid.data import Log, LogUnits
+from robotid.data import Log
 from robotid.exceptions import SettingsError
 from robotid.identification import EstimatorSettings
 from robotid.log_files import read_log
 from robotid.model import GRAVITY, RobotModel
 from robotid.parameters import DRIVE_TERMS, Coupling
 from robotid.signals import SignalSettings
+from robotid.units import LogUnits
 
 __all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
 

@@ -30,6 +30,11 @@ class LinkPlace:
     role: str
     parameters: Array
 
+    @property
+    def is_lumped(self) -> bool:
+        """Whether its mass counts as that of the moved link of its body."""
+        return self.body >= 0 and self.role == "fixed"
+
 
 def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
     """Return where each link of the URDF sits in the model, in the order of the file.

@@ -23,7 +23,8 @@ from robotid.result import (
     recording_metrics,
     write_json,
 )
-from robotid.urdf import load_identified, write_urdf
+from robotid.sidecar import load_identified
+from robotid.urdf import write_urdf
 from robotid.validation import evaluate, prepare
 from robotid.verdict import Finding, judge
 

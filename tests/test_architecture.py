@@ -16,10 +16,10 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem planar_2r kinematics metrics xml_splice examples",
-    2: "factors log_files model signals base_parameters verdict",
-    3: "estimators regressor simulation lumping prior",
-    4: "excitation validation",
+    1: "parameters data problem planar_2r kinematics metrics xml_splice examples tables",
+    2: "factors units model signals base_parameters verdict",
+    3: "log_files estimators regressor simulation lumping prior",
+    4: "excitation validation sidecar",
     5: "identification",
     6: "urdf job visualization report_plots",
     7: "report_page result inspection",
@@ -35,7 +35,7 @@ PINOCCHIO = {"model", "regressor", "simulation", "visualization", "lumping", "pr
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
-    "pyarrow": {"data", "log_files"},
+    "pyarrow": {"tables"},
     "matplotlib": {"report", "report_plots"},
     "clarabel": {"estimators"},
 }

@@ -10,7 +10,7 @@ from robotid.cli import main
 from robotid.examples import example_urdf
 from robotid.log_files import write_log
 from robotid.model import RobotModel
-from robotid.urdf import load_identified
+from robotid.sidecar import load_identified
 
 URDF = str(example_urdf("ur5_robot.urdf"))
 NOISE = np.array([0.5, 0.5, 0.25, 0.1, 0.1, 0.05])  # [N m]

@@ -6,8 +6,9 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from robotid.data import Log, LogUnits, Trajectory, check_units
+from robotid.data import Log, Trajectory
 from robotid.exceptions import DataError, SettingsError
+from robotid.units import LogUnits, check_units
 
 JOINTS = ("shoulder", "elbow")
 

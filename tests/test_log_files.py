@@ -13,9 +13,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from robotid.data import Log, LogUnits
+from robotid.data import Log
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.log_files import read_log, write_log
+from robotid.units import LogUnits
 
 JOINTS = ("shoulder", "elbow")
 FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[2] / "shared" / "data")

@@ -8,7 +8,7 @@ import pytest
 from robotid.job import read_job
 from robotid.parameters import pseudo_inertia
 from robotid.result import read_result
-from robotid.urdf import load_identified
+from robotid.sidecar import load_identified
 from robotid.validation import predict
 from robotid.workflow import run_job
 

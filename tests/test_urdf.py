@@ -12,7 +12,8 @@ from robotid.lumping import link_places
 from robotid.model import RobotModel
 from robotid.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.regressor import random_regressor
-from robotid.urdf import load_identified, read_sidecar, read_with_yourdfpy, write_urdf
+from robotid.sidecar import load_identified, read_sidecar
+from robotid.urdf import read_with_yourdfpy, write_urdf
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>
