@@ -84,6 +84,9 @@ def _add_job_flags(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--rate", type=float, metavar="HZ", help="grid to resample to")
     flags.add_argument("--cutoff", metavar="HZ", help="of the low-pass filter, or false")
     flags.add_argument("--friction", metavar="MODEL", help="none, viscous or viscous+coulomb")
+    flags.add_argument(
+        "--dynamics", action="store_true", help="write friction into the URDF's <dynamics> too"
+    )
     flags.add_argument("--time-unit", metavar="UNIT", help="s, ms, us or ns")
     flags.add_argument("--angle-unit", metavar="UNIT", help="rad or deg")
 
@@ -171,6 +174,8 @@ def _job(options: argparse.Namespace) -> "Job":
         table["signals"]["rate"] = options.rate
     if options.cutoff is not None:
         table["signals"]["cutoff"] = _cutoff(options.cutoff)
+    if options.dynamics:
+        table["output"] = {"dynamics": True}
     units = {"time": options.time_unit, "angle": options.angle_unit}
     table["units"] = {key: value for key, value in units.items() if value}
     return job_from_settings(table, "command line", Path())
@@ -178,7 +183,7 @@ def _job(options: argparse.Namespace) -> "Job":
 
 _JOB_FLAGS = (
     "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
-    "time_unit", "angle_unit",
+    "time_unit", "angle_unit", "dynamics",
 )  # fmt: skip
 
 

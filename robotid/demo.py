@@ -21,6 +21,7 @@ __all__ = ["run_demo"]
 
 _RATE = 200.0  # [Hz]
 _PERIOD = 10.0  # [s]
+_CENTRE = np.array([0.0, -1.2, 1.2, -1.0, 1.0, 0.0])  # [rad] upright, elbow bent
 _NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # encoder [rad], its rate [rad/s], 2 % of torque
 
 
@@ -46,7 +47,7 @@ def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]
     truth = another_robot(model, rng)
     entries = []
     for name, duration in (("identification", 2 * _PERIOD), ("validation", _PERIOD)):
-        motion = random_fourier(model, rng, period=_PERIOD)
+        motion = random_fourier(model, rng, period=_PERIOD, centre=_CENTRE)
         log = simulate(model, truth, motion, rate=_RATE, duration=duration, rng=rng, noise=_NOISE)
         write_log(log, target / f"{name}.csv")
         entries.append(LogEntry(target / f"{name}.csv"))

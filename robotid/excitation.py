@@ -60,7 +60,12 @@ class FourierTrajectory:
 
 
 def random_fourier(
-    model: RobotModel, rng: np.random.Generator, *, harmonics: int = 5, period: float = 10.0
+    model: RobotModel,
+    rng: np.random.Generator,
+    *,
+    harmonics: int = 5,
+    period: float = 10.0,
+    centre: Array | None = None,
 ) -> FourierTrajectory:
     """Return a random motion within the limits of a robot.
 
@@ -69,22 +74,32 @@ def random_fourier(
         rng: Source of the coefficients.
         harmonics: Number h of harmonics.
         period: Period [s].
+        centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
 
     Returns:
         The motion.
+
+    Raises:
+        DataError: If the centre lies outside the limits.
     """
     n = len(model.joints)
     sine, cosine = rng.standard_normal((2, harmonics, n)) / np.arange(1, harmonics + 1)[:, None]
-    centre, reach, speed = np.zeros(n), np.empty(n), np.empty(n)
+    middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
+    mean = np.array(middle) if centre is None else centre
+    reach, speed = np.empty(n), np.empty(n)
     for j, joint in enumerate(model.limits):
         slides = joint.type == "prismatic"
         reach[j] = _LINEAR_REACH if slides else _ROTARY_REACH
         if joint.has_limits:
-            centre[j] = (joint.lower + joint.upper) / 2
-            reach[j] = min(reach[j], 0.9 * (joint.upper - joint.lower) / 2)
+            reach[j] = min(reach[j], 0.9 * min(joint.upper - mean[j], mean[j] - joint.lower))
+            if reach[j] <= 0:
+                raise DataError(
+                    f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
+                    f"{joint.lower:g} to {joint.upper:g}"
+                )
         usual = _LINEAR_SPEED if slides else _ROTARY_SPEED
         speed[j] = min(usual, 0.9 * joint.velocity) if joint.velocity > 0 else usual
     unit = FourierTrajectory(np.zeros(n), sine, cosine, period)
     q, v, _ = unit.evaluate(np.linspace(0.0, period, 1000))
     scale = np.minimum(reach / np.abs(q).max(axis=0), speed / np.abs(v).max(axis=0))
-    return FourierTrajectory(centre, sine * scale, cosine * scale, period)
+    return FourierTrajectory(mean, sine * scale, cosine * scale, period)

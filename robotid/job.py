@@ -48,6 +48,7 @@ _TABLE: dict[str, Any] = {
     "units": {"time": str, "angle": str},
     "coupling": [{"name": str, "ratios": dict}],
     "estimator": {"name": str, "margin": _NUMBER, "prior_weight": _NUMBER},
+    "output": {"dynamics": bool},
     "identification": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
     "validation": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
 }
@@ -86,6 +87,7 @@ class Job:
         columns: Column names in the logs that differ from the standard ones.
         units: Units of the logs, if not SI.
         estimator: The estimator and its settings.
+        dynamics: Whether the written URDF's ``<dynamics>`` also get the identified friction.
         identification: Logs to fit.
         validation: Logs kept apart.
     """
@@ -103,6 +105,7 @@ class Job:
     columns: Mapping[str, str] = field(default_factory=dict)
     units: LogUnits = field(default_factory=LogUnits)
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
+    dynamics: bool = False
     identification: tuple[LogEntry, ...] = ()
     validation: tuple[LogEntry, ...] = ()
 
@@ -190,6 +193,7 @@ class Job:
                 "margin": self.estimator.margin,
                 "prior_weight": self.estimator.prior_weight,
             },
+            "output": {"dynamics": self.dynamics},
             "identification": [_entry_settings(entry) for entry in self.identification],
             "validation": [_entry_settings(entry) for entry in self.validation],
         }
@@ -270,6 +274,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             columns=table.get("columns", {}),
             units=LogUnits(**table.get("units", {})),
             estimator=EstimatorSettings(**table.get("estimator", {})),
+            dynamics=table.get("output", {}).get("dynamics", False),
             **entries,
         )
     except SettingsError as error:

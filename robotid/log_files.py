@@ -197,7 +197,8 @@ class _Finder:
         if current and not has_gain:
             raise DataError(
                 f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
-                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains)"
+                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains; "
+                f"CLI --gain {joint}=...)"
             )
         return tau or current or self._missing("tau", joint)
 
@@ -222,10 +223,13 @@ class _Finder:
                 if name[len(prefix) :] not in self.joints:
                     ends[name[len(prefix) :]] = name
         nearest = difflib.get_close_matches(joint or kind, ends, n=1)
+        leave_out = (
+            f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
+        )
         near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
         raise DataError(
             f"{self.where} has no column {standard!r}; {noun} found: {found}. {hint.format(near)}"
-            f"Rename it, or pass columns={{{standard!r}: {near}}}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}"
         )
 
 

@@ -67,7 +67,9 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
         outputs = {"report": "report.html"}
         if identification.is_consistent:
             name = f"{Path(model.tree.path).stem}.identified.urdf"
-            sidecar = write_urdf(model, identification.standard, partial / name)
+            sidecar = write_urdf(
+                model, identification.standard, partial / name, dynamics=job.dynamics
+            )
             outputs |= {"urdf": name, "sidecar": sidecar.name}
         write_report(identification, partial / "report.html", findings=findings)
         result = build_result(identification, job.to_settings(), findings, outputs)

@@ -111,6 +111,16 @@ def test_the_written_urdf_holds_the_identified_masses(identified):
     )
 
 
+def test_friction_goes_into_the_urdf_where_asked(logs, tmp_path, capsys):
+    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path), "--json"]
+    assert main([*words, "--dynamics"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    value = {p["name"]: p["value"] for p in result["drive_parameters"]}
+    text = (tmp_path / result["outputs"]["urdf"]).read_text()
+    assert f'damping="{value["elbow_joint.viscous"]!r}"' in text
+    assert f'friction="{value["elbow_joint.coulomb"]!r}"' in text
+
+
 def test_wls_result_without_a_urdf_can_be_validated(logs, tmp_path, capsys):
     # ten times the noise on a tenth of the rows: unconstrained parameters that cannot be
     out = tmp_path / "out"

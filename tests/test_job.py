@@ -40,6 +40,9 @@ ratios = { a = 1, b = -1.0 }
 [estimator]
 name = "wls"
 
+[output]
+dynamics = true
+
 [[identification]]
 log = "ident.parquet"
 start = 0.3
@@ -68,6 +71,7 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.units.time == "ms"
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
     assert job.estimator.name == "wls"
+    assert job.dynamics is True
     (entry,) = job.identification
     assert (entry.path, entry.start, entry.end) == (tmp_path / "ident.parquet", 0.3, 13.5)
     assert job.validation[0].end is None

@@ -136,7 +136,8 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     path = run(make_table(tau_elbow=None))
     with refused(
         f"{path.name} has no column 'tau_elbow'; torque or current columns found: "
-        "['tau_shoulder']. Rename it, or pass columns={'tau_elbow': ...}"
+        "['tau_shoulder']. Rename it, or pass columns={'tau_elbow': ...}; "
+        "if 'elbow' stood still, leave it out of joints and lock it"
     ):
         read_log(path, JOINTS)
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
@@ -151,7 +152,8 @@ def test_misspelt_column_is_suggested(run):
     path = run(make_table(q_elbow=None, q_elbow2=np.zeros(300)))
     with refused(
         f"{path.name} has no column 'q_elbow'; position columns found: ['q_shoulder', 'q_elbow2']. "
-        "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}"
+        "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}; "
+        "if 'elbow' stood still, leave it out of joints and lock it"
     ):
         read_log(path, JOINTS)
     log = read_log(path, JOINTS, columns={"q_elbow": "q_elbow2"})
@@ -163,7 +165,8 @@ def test_the_column_of_another_joint_is_not_suggested(run):
     path = run({"time": np.arange(3), "q_joint_1": zeros, "q_joint_2": zeros, "tau_joint_1": zeros})
     with refused(
         f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
-        "['tau_joint_1']. Rename it, or pass columns={'tau_joint_2': ...}"
+        "['tau_joint_1']. Rename it, or pass columns={'tau_joint_2': ...}; "
+        "if 'joint_2' stood still, leave it out of joints and lock it"
     ):
         read_log(path, ["joint_1", "joint_2"])
 
@@ -256,7 +259,7 @@ def test_current_without_gain_is_refused(run):
     path = run(make_table(tau_elbow=None, i_elbow=np.ones(300)))
     with refused(
         f"{path.name}: joint 'elbow' has the current 'i_elbow' but no gain; give it in N m/A: "
-        "gains={'elbow': ...} (job file table [torque], key gains)"
+        "gains={'elbow': ...} (job file table [torque], key gains; CLI --gain elbow=...)"
     ):
         read_log(path, JOINTS)
 

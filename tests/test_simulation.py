@@ -29,6 +29,13 @@ def test_a_random_motion_stays_within_limits(panda, rng):
         assert np.abs(v[:, j]).max() < joint.velocity
 
 
+def test_a_centre_outside_the_limits_is_refused(panda, rng):
+    centre = np.zeros(7)
+    centre[3] = 0.5
+    with pytest.raises(DataError, match=r"the centre 0.5 of joint 'panda_joint4' is not inside"):
+        random_fourier(panda, rng, centre=centre)
+
+
 def test_coefficients_of_other_shapes_are_refused():
     with pytest.raises(DataError, match=r"must have one shape \(h, 2\)"):
         FourierTrajectory(np.zeros(2), np.zeros((3, 2)), np.zeros((4, 2)), 1.0)

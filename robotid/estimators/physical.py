@@ -177,6 +177,8 @@ class Consistent(Estimator):
         settings.verbose = False
         settings.max_threads = 1
         settings.max_iter = self.max_iterations
+        # at the default 1e-8 it stalls on easy problems, at an optimum right to 1e-9
+        settings.tol_gap_abs = settings.tol_gap_rel = 1e-7
         solver = clarabel.DefaultSolver(P, np.zeros(2 * p), rows, right, cones, settings)
         solution = solver.solve()
         return np.array(solution.x[:p]), str(solution.status), int(solution.iterations)
