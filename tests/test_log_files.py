@@ -143,7 +143,7 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
     with refused(
         f"{path.name} has no column 'q_shoulder'; position columns found: []. Rename it, or pass "
-        "columns={'q_shoulder': ...}"
+        "columns={'q_shoulder': ...}; if 'shoulder' stood still, leave it out of joints and lock it"
     ):
         read_log(path, JOINTS)
 
