@@ -25,7 +25,7 @@ _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
 _SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BaseMapping:
     """The linear map from standard to base parameters and back.
 

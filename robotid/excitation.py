@@ -16,7 +16,7 @@ _ROTARY_SPEED = 1.5  # [rad/s] peak speed where the limit is higher or unknown
 _LINEAR_SPEED = 0.3  # [m/s]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FourierTrajectory:
     """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
 

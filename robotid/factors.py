@@ -18,7 +18,7 @@ from robotid.problem import Problem
 __all__ = ["Factors", "compress", "merge"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Factors:
     """Triangular factors of [W_j tau_j], joint by joint.
 

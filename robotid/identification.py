@@ -51,7 +51,7 @@ class EstimatorSettings:
                 raise SettingsError(f"{key} is {getattr(self, key)}, wanted a positive number")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Identification:
     """Everything that an identification found.
 

@@ -154,7 +154,7 @@ class Job:
         )
 
     def to_settings(self) -> dict[str, Any]:
-        """Return the job as plain values, in the shape of the job file, paths as given."""
+        """Return the job as plain values, in the shape of the job file, paths made absolute."""
         signals = {
             key: getattr(self.signals, key)
             for key in _TABLE["signals"]
@@ -168,7 +168,7 @@ class Job:
             if terms == tuple(t for t in self.terms if t in ("viscous", "coulomb"))
         )
         return {
-            "urdf": str(self.urdf),
+            "urdf": str(self.urdf.resolve()),
             **({"joints": list(self.joints)} if self.joints is not None else {}),
             "locked": dict(self.locked),
             "gravity": list(self.gravity),
@@ -353,4 +353,4 @@ def _type_name(wanted: type | tuple[type, ...]) -> str:
 
 def _entry_settings(entry: LogEntry) -> dict[str, Any]:
     window = {"start": entry.start, "end": entry.end}
-    return {"log": str(entry.path), **{k: v for k, v in window.items() if v is not None}}
+    return {"log": str(entry.path.resolve()), **{k: v for k, v in window.items() if v is not None}}

@@ -16,7 +16,7 @@ __all__ = ["Block", "Problem", "Sample", "concatenate"]
 Block: TypeAlias = tuple[Array, Array, Array]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sample:
     """One instant, for recursive estimators.
 
@@ -33,7 +33,7 @@ class Sample:
     mass_regressor: Array | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """The rows of W theta = tau, read in blocks as often as wanted.
 

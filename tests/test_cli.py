@@ -336,3 +336,12 @@ def test_nothing_stays_behind_when_a_run_fails_late(logs, tmp_path, monkeypatch)
     out = tmp_path / "out"
     assert main(["identify", URDF, str(logs / "fit.csv"), "--out", str(out)]) == 1
     assert list(out.iterdir()) == []
+
+
+def test_a_result_can_be_validated_from_any_folder(logs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(logs)
+    out = tmp_path / "out"
+    assert main(["identify", URDF, "fit.csv", "--out", str(out), "--estimator", "wls"]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["validate", "out/result.json", str(logs / "keep.csv")]) == 0
+    assert "predicted with" in capsys.readouterr().out

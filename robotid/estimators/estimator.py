@@ -13,7 +13,7 @@ from robotid.problem import Problem
 __all__ = ["Estimate", "Estimator", "as_factors"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """Estimated parameters and how well they are known.
 
