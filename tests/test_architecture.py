@@ -40,7 +40,19 @@ INSIDE_FUNCTIONS = {
     "clarabel": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
-ESTIMATOR_FLOORS = {"estimator": 0, "least_squares": 1, "physical": 2, "__init__": 3}
+ESTIMATOR_FLOORS = {
+    name: floor
+    for floor, names in enumerate(
+        (
+            "estimator",
+            "least_squares recursive",
+            "physical rls kalman descent",
+            "prx gradient",
+            "__init__",
+        )
+    )
+    for name in names.split()
+}
 
 
 def modules():
