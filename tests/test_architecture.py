@@ -19,7 +19,7 @@ FLOORS = {
     1: "parameters data problem planar_2r kinematics metrics xml_splice examples",
     2: "factors log_files model signals base_parameters verdict",
     3: "estimators regressor simulation lumping prior",
-    4: "excitation validation",
+    4: "excitation validation estimator_settings",
     5: "identification",
     6: "urdf job visualization report_plots",
     7: "report_page result inspection",

@@ -22,8 +22,8 @@ from robotid.estimators import (
     save_state,
 )
 from robotid.estimators.descent import column_scale
-from robotid.exceptions import DataError, RankDeficientError
 from robotid.examples import example_urdf
+from robotid.exceptions import DataError, RankDeficientError
 from robotid.factors import compress
 from robotid.identification import structural_mapping
 from robotid.model import RobotModel
@@ -228,7 +228,7 @@ def test_exact_prx_needs_two_passes_where_the_printed_step_stands_still(ur10_sta
 
 
 def test_prx_says_what_it_lacks_and_refuses_settings(ur10_states):
-    problem, beta = ur10_states
+    problem, _ = ur10_states
     sample = replace(next(problem.samples()), mass_regressor=None)
     for options in ({"step": "printed"}, {"metric": "mass"}):
         estimator = PRX(np.ones(6), **options)

@@ -85,7 +85,9 @@ def possible_parameters(model, rng):
 
 def assert_same_torque(model, pi, loaded, read_back):
     assert loaded.layout == model.layout
-    np.testing.assert_array_equal(loaded.pin_model.gravity.linear, model.pin_model.gravity.linear)
+    np.testing.assert_array_equal(
+        loaded.pin_model.gravity.linear, model.pin_model.gravity.linear
+    )
     expected, found = (
         (random_regressor(robot, 60, np.random.default_rng(7)) @ x).reshape(60, -1)
         for robot, x in ((model, pi), (loaded, read_back))
@@ -211,7 +213,7 @@ def test_friction_goes_into_dynamics_only_when_asked(source, tmp_path, rng):
     assert joints["slide"].dynamics is None  # not identified
     new, plain = ((tmp_path / f).read_bytes().decode() for f in ("new.urdf", "plain.urdf"))
     friction, damping = (values[f"shoulder.{term}"] for term in ("coulomb", "viscous"))
-    changed = f'<dynamics  friction=\'{friction!r}\' spring="a>b" damping="{damping!r}"/>'
+    changed = f"<dynamics  friction='{friction!r}' spring=\"a>b\" damping=\"{damping!r}\"/>"
     assert plain.count("<dynamics") == 2
     assert new.replace(changed, "<dynamics  friction='9' spring=\"a>b\"/>") == plain.replace(
         '<axis xyz="0 0 1"/>\r\n',
@@ -328,9 +330,7 @@ def test_a_target_that_cannot_be_is_refused(source, tmp_path, rng):
         write_urdf(model, pi, tmp_path / "none" / "new.urdf")
     assert source.read_bytes().decode() == RICH
     source.unlink()
-    with pytest.raises(
-        ModelError, match=r"the model's URDF '.*arm.urdf', which is copied, is gone"
-    ):
+    with pytest.raises(ModelError, match=r"the model's URDF '.*arm.urdf', which is copied, is gone"):
         write_urdf(model, pi, tmp_path / "new.urdf")
 
 
@@ -341,9 +341,7 @@ def test_a_failure_while_writing_leaves_the_folder_as_it_was(source, tmp_path, r
     before = listing(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(urdf, "_text", lambda value: f"{value:.4g}")  # loses digits
-        with pytest.raises(
-            ModelError, match=r"new.urdf was not written: read back, it gives anoth"
-        ):
+        with pytest.raises(ModelError, match=r"new.urdf was not written: read back, it gives anoth"):
             write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
     assert listing(tmp_path) == before
     with monkeypatch.context() as patch:
@@ -357,9 +355,7 @@ def test_a_source_that_changed_since_is_noticed(source, tmp_path, rng):
     model = RobotModel.from_urdf(source)
     source.write_bytes(RICH.replace('xyz="0.5 0 0"', 'xyz="0.6 0 0"').encode())
     before = listing(tmp_path)
-    with pytest.raises(
-        ModelError, match=r"another torque .*\['shoulder'\]; has .*arm.urdf changed"
-    ):
+    with pytest.raises(ModelError, match=r"another torque .*\['shoulder'\]; has .*arm.urdf changed"):
         write_urdf(model, possible_parameters(model, rng), tmp_path / "new.urdf")
     assert listing(tmp_path) == before
 
@@ -411,10 +407,7 @@ SIDECAR_FAULTS = {
     "no JSON": ("{", "new.drive.json is not JSON: "),
     "a list": ("[]", "has schema_version None, wanted 1"),
     "other schema": ('{"schema_version": 2}', "has schema_version 2, wanted 1"),
-    "entries": (
-        '{"schema_version": 1, "joints": 3}',
-        r"lacks the entries \['urdf_sha256', 'joints'",
-    ),
+    "entries": ('{"schema_version": 1, "joints": 3}', r"lacks the entries \['urdf_sha256', 'joints'"),
 }
 
 

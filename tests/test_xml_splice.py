@@ -23,9 +23,7 @@ def first(document, *tags):
     "data",
     [
         b"<r/>",
-        b'<?xml version="1.0"?>\r\n<!-- > -->\r\n<r a=">" b=\'"\' >\r\n<c/ ></r>'.replace(
-            b"/ >", b"/>"
-        ),
+        b'<?xml version="1.0"?>\r\n<!-- > -->\r\n<r a=">" b=\'"\' >\r\n<c/ ></r>'.replace(b"/ >", b"/>"),
         b'\xef\xbb\xbf<r xmlns:x="u"><x:c><![CDATA[<d>]]></x:c><?p <d>?></r>\n\n',
         '<?xml version="1.0" encoding="ISO-8859-1"?><r n="é"/>'.encode("latin-1"),
         '\ufeff<r n="é">\n</r>'.encode("utf-16-le"),
@@ -37,7 +35,7 @@ def test_a_file_without_changes_comes_back_byte_for_byte(data):
 
 
 def test_elements_know_their_bytes():
-    data = "<!-- é --><r><l n=\"a>b\"><i/></l  ><l n='/'/></r>".encode()
+    data = '<!-- é --><r><l n="a>b"><i/></l  ><l n=\'/\'/></r>'.encode()
     document = parse(data, "x.urdf")
     with_end, without = document.root.find_all("l")
     assert data[with_end.start : with_end.end] == b'<l n="a>b"><i/></l  >'
@@ -50,7 +48,9 @@ def test_elements_know_their_bytes():
 def test_a_replaced_element_is_indented_like_the_file():
     data = b"<r>\r\n\t<l>\r\n\t\t<old/>\r\n\t</l>\r\n</r>"
     new = edited(data, lambda d: replace(d, first(d, "l", "old"), LINES))
-    assert new == (b"<r>\r\n\t<l>\r\n\t\t<new>\r\n\t\t\t<a/>\r\n\t\t</new>\r\n\t</l>\r\n</r>")
+    assert new == (
+        b"<r>\r\n\t<l>\r\n\t\t<new>\r\n\t\t\t<a/>\r\n\t\t</new>\r\n\t</l>\r\n</r>"
+    )
 
 
 def test_in_a_file_of_one_line_everything_stays_on_it():
@@ -93,9 +93,7 @@ def test_a_removed_element_takes_its_lines_along_only_if_it_has_them_alone():
 
 def test_attributes_are_changed_in_place_and_missing_ones_added():
     data = b"<r><d a='1' note=\"damping='3'\"  damping = '2' /></r>"
-    new = edited(
-        data, lambda d: set_attributes(d, first(d, "d"), {"damping": "5", "friction": "6"})
-    )
+    new = edited(data, lambda d: set_attributes(d, first(d, "d"), {"damping": "5", "friction": "6"}))
     assert new == b"<r><d a='1' note=\"damping='3'\"  damping = '5' friction=\"6\" /></r>"
 
 
