@@ -80,7 +80,11 @@ def _add_job_flags(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--joints", metavar="A,B,...", help="joints to identify, in order")
     flags.add_argument("--lock", action="append", default=[], metavar="JOINT=POSITION")
     flags.add_argument("--gain", action="append", default=[], metavar="JOINT=N_M_PER_A")
-    flags.add_argument("--estimator", metavar="NAME", help="consistent (default), wls or ols")
+    flags.add_argument(
+        "--estimator",
+        metavar="NAME",
+        help="consistent (default), wls, ols, rls, kalman, prx or gradient",
+    )
     flags.add_argument("--rate", type=float, metavar="HZ", help="grid to resample to")
     flags.add_argument("--cutoff", metavar="HZ", help="of the low-pass filter, or false")
     flags.add_argument("--friction", metavar="MODEL", help="none, viscous or viscous+coulomb")

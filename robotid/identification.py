@@ -1,21 +1,30 @@
 """identify(): from a model and logs to parameters and how far they can be trusted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping, base_mapping
 from robotid.data import Log
-from robotid.estimators import OLS, WLS, Consistent, Estimate, Estimator
-from robotid.exceptions import DataError, SettingsError
-from robotid.factors import compress, merge
+from robotid.estimator_settings import (
+    ESTIMATORS,
+    RECURSIVE,
+    EstimatorSettings,
+    Prior,
+    consistent_fit,
+    make_estimator,
+)
+from robotid.estimators import WLS, Estimate
+from robotid.exceptions import DataError
+from robotid.factors import Factors, compress, merge
 from robotid.lumping import held_parameters
 from robotid.metrics import Metrics
 from robotid.model import RobotModel
 from robotid.parameters import pseudo_inertia
 from robotid.prior import prior_spread
+from robotid.problem import Problem, concatenate
 from robotid.regressor import build_problem, random_regressor
 from robotid.signals import SignalSettings
 from robotid.validation import Evaluation, Recording, evaluate, pool, prepare, shares_rows
@@ -23,32 +32,8 @@ from robotid.verdict import Verdict, judge
 
 __all__ = ["ESTIMATORS", "EstimatorSettings", "Identification", "identify", "structural_mapping"]
 
-ESTIMATORS = ("ols", "wls", "consistent")
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
-
-
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """Which estimator, and its own settings.
-
-    Attributes:
-        name: "ols", "wls" or "consistent".
-        margin: Of "consistent": smallest eigenvalue of a body's pseudo-inertia relative to its
-            prior size [-].
-        prior_weight: Of "consistent": weight of the URDF's values [-].
-    """
-
-    name: str = "consistent"
-    margin: float = 1e-4
-    prior_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.name not in ESTIMATORS:
-            raise SettingsError(f"estimator is {self.name!r}, wanted one of {list(ESTIMATORS)}")
-        for key in ("margin", "prior_weight"):
-            if not getattr(self, key) > 0:
-                raise SettingsError(f"{key} is {getattr(self, key)}, wanted a positive number")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,17 +154,13 @@ def identify(
     fitted = [prepare(model, log, settings) for log in logs]
     kept = [prepare(model, log, settings) for log in validation]
     mapping = structural_mapping(model)
-    factors = merge(
-        [
-            compress(mapping.reduce(build_problem(model, r.trajectory, r.mask.astype(float))))
-            for r in fitted
-        ]
-    )
+    factors = merge([compress(_problem(model, mapping, recording)) for recording in fitted])
     share = min(_independent_share(recording) for recording in fitted)
     prior = model.standard_parameters()
     spread = prior_spread(model, [recording.trajectory for recording in fitted])
     wls = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    estimate = _estimator(choice, model, mapping, prior, spread, share).fit(factors)
+    before = Prior(prior, spread, share, wls.sigma)
+    estimate = _run(choice, model, mapping, before, fitted, factors, wls)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     wls_standard = mapping.to_standard(wls.theta, prior, spread)
@@ -224,27 +205,51 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
     )
 
 
-def _estimator(
+def _run(
     choice: EstimatorSettings,
     model: RobotModel,
     mapping: BaseMapping,
-    prior: Array,
-    spread: Array,
-    share: float,
-) -> Estimator:
-    if choice.name == "ols":
-        return OLS(independent_share=share)
-    if choice.name == "wls":
-        return WLS(independent_share=share)
-    return Consistent(
-        layout=model.layout,
-        K=mapping.K,
-        prior=prior,
-        prior_std=spread,
-        held=held_parameters(model),
-        margin=choice.margin,
-        prior_weight=choice.prior_weight,
-        independent_share=share,
+    prior: Prior,
+    recordings: Sequence[Recording],
+    factors: Factors,
+    wls: Estimate,
+) -> Estimate:
+    """Return the estimate: batch estimators read the factors, recursive ones the samples."""
+    estimator = make_estimator(choice, model, mapping, prior)
+    if choice.name not in RECURSIVE:
+        return estimator.fit(factors)
+    problems = [_problem(model, mapping, r, choice.needs_mass) for r in recordings]
+    estimate = estimator.fit(concatenate(problems))
+    if choice.name in ("prx", "gradient"):
+        estimate = _with_spread(estimate, wls)
+    if not choice.physical:
+        return estimate
+    return consistent_fit(choice, model, mapping, prior).project(estimate)
+
+
+def _problem(
+    model: RobotModel, mapping: BaseMapping, recording: Recording, with_mass: bool = False
+) -> Problem:
+    weight = recording.mask.astype(float)
+    return mapping.reduce(build_problem(model, recording.trajectory, weight, with_mass=with_mass))
+
+
+def _with_spread(estimate: Estimate, wls: Estimate) -> Estimate:
+    """Return a gradient method's estimate with the covariance that the factors know.
+
+    It ends beside the minimum of least squares: its mean square error is the covariance of that
+    minimum plus the square of the distance to it, which is measured.
+    """
+    distance = estimate.theta - wls.theta
+    covariance = wls.covariance + np.outer(distance, distance)
+    reason = "standard errors are those of wls plus the distance to it"
+    return replace(
+        estimate,
+        covariance=covariance,
+        rank=wls.rank,
+        condition=wls.condition,
+        undetermined=wls.undetermined,
+        message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
     )
 
 

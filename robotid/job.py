@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from robotid.data import Log
+from robotid.estimator_settings import EstimatorSettings
 from robotid.exceptions import SettingsError
-from robotid.identification import EstimatorSettings
 from robotid.log_files import read_log
 from robotid.model import GRAVITY, RobotModel
 from robotid.parameters import DRIVE_TERMS, Coupling
@@ -47,7 +47,21 @@ _TABLE: dict[str, Any] = {
     "columns": dict,
     "units": {"time": str, "angle": str},
     "coupling": [{"name": str, "ratios": dict}],
-    "estimator": {"name": str, "margin": _NUMBER, "prior_weight": _NUMBER},
+    "estimator": {
+        "name": str,
+        "margin": _NUMBER,
+        "prior_weight": _NUMBER,
+        "forgetting": _NUMBER,
+        "walk": _NUMBER,
+        "gate": (*_NUMBER, bool),
+        "step": str,
+        "metric": str,
+        "average": bool,
+        "passes": int,
+        "seed": int,
+        "step_size": _NUMBER,
+        "physical": bool,
+    },
     "output": {"dynamics": bool},
     "identification": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
     "validation": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
@@ -188,11 +202,7 @@ class Job:
                 if value is not None
             },
             "coupling": [{"name": c.name, "ratios": dict(c.ratios)} for c in self.couplings],
-            "estimator": {
-                "name": self.estimator.name,
-                "margin": self.estimator.margin,
-                "prior_weight": self.estimator.prior_weight,
-            },
+            "estimator": self.estimator.to_dict(),
             "output": {"dynamics": self.dynamics},
             "identification": [_entry_settings(entry) for entry in self.identification],
             "validation": [_entry_settings(entry) for entry in self.validation],

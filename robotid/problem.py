@@ -1,8 +1,8 @@
 """The linear problem W theta = tau as a stream of row blocks; W as a whole is never held."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, repeat
 from typing import TypeAlias
 
 import numpy as np
@@ -10,7 +10,9 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 
-__all__ = ["Block", "Problem", "Sample", "concatenate"]
+__all__ = ["Block", "Problem", "Sample", "concatenate", "shuffled"]
+
+_SHUFFLED = 8192  # samples held while they are shuffled: all of a short log, 30 MB of a long one
 
 #: Rows of k samples: W (k n, c), tau (k n,), weight (k n,); row of sample k, joint j: k n + j.
 Block: TypeAlias = tuple[Array, Array, Array]
@@ -42,12 +44,15 @@ class Problem:
         names: Names of the c columns.
         n_joints: Number n of rows per sample.
         support: Shape (n, c), bool: False where row j is zero for every motion.
+        mass_stream: Starts a fresh pass over the regressors of the mass matrix of each block's
+            samples, shape (k, n, n, c), or None if the problem has none.
     """
 
     stream: Callable[[], Iterator[Block]]
     names: tuple[str, ...]
     n_joints: int
     support: Array
+    mass_stream: Callable[[], Iterator[Array]] | None = None
 
     def __post_init__(self) -> None:
         wanted = (self.n_joints, len(self.names))
@@ -61,10 +66,12 @@ class Problem:
     def samples(self) -> Iterator[Sample]:
         """Yield the problem instant by instant, for recursive estimators."""
         n, c = self.n_joints, len(self.names)
-        for W, tau, weight in self.blocks():
+        masses = repeat(None) if self.mass_stream is None else self.mass_stream()
+        for (W, tau, weight), mass in zip(self.blocks(), masses, strict=False):
             rows = zip(W.reshape(-1, n, c), tau.reshape(-1, n), weight.reshape(-1, n), strict=True)
-            for Y, torque, row_weight in rows:
-                yield Sample(Y, torque, row_weight)
+            by_sample = repeat(None) if mass is None else mass
+            for (Y, torque, row_weight), M in zip(rows, by_sample, strict=False):
+                yield Sample(Y, torque, row_weight, M)
 
     def select(self, columns: Array) -> "Problem":
         """Return the problem with only the given columns.
@@ -80,11 +87,18 @@ class Problem:
             for W, tau, weight in self.blocks():
                 yield W[:, columns], tau, weight
 
+        masses = self.mass_stream
+
+        def mass_stream() -> Iterator[Array]:
+            for mass in masses() if masses is not None else ():
+                yield mass[..., columns]
+
         return replace(
             self,
             stream=stream,
             names=tuple(self.names[i] for i in columns),
             support=self.support[:, columns],
+            mass_stream=None if masses is None else mass_stream,
         )
 
 
@@ -109,8 +123,31 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
                 f"problems differ in their columns: {len(first.names)} of {first.n_joints} "
                 f"joints and {len(other.names)} of {other.n_joints} joints"
             )
+    masses = [p.mass_stream for p in problems if p.mass_stream is not None]
+    has_mass = len(masses) == len(problems)
     return replace(
         first,
         stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
         support=np.any([problem.support for problem in problems], axis=0),
+        mass_stream=(lambda: chain.from_iterable(m() for m in masses)) if has_mass else None,
     )
+
+
+def shuffled(samples: Iterable[Sample], rng: np.random.Generator) -> Iterator[Sample]:
+    """Yield samples in random order, of a long stream by drawing from a buffer of 8192.
+
+    Args:
+        samples: The samples.
+        rng: Source of the order.
+
+    Yields:
+        Each sample once.
+    """
+    buffer: list[Sample] = []
+    for sample in samples:
+        buffer.append(sample)
+        if len(buffer) > _SHUFFLED:
+            k = int(rng.integers(len(buffer)))
+            buffer[k], buffer[-1] = buffer[-1], buffer[k]
+            yield buffer.pop()
+    yield from (buffer[k] for k in rng.permutation(len(buffer)))

@@ -14,7 +14,7 @@ from robotid.exceptions import DataError
 from robotid.model import RobotModel
 from robotid.problem import Block, Problem
 
-__all__ = ["build_problem", "joint_torque_regressor", "random_regressor"]
+__all__ = ["build_problem", "joint_torque_regressor", "mass_regressor", "random_regressor"]
 
 _BLOCK = 512  # samples per block: fits in the cache with 100 columns
 
@@ -49,8 +49,40 @@ def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> A
     ).reshape(len(q) * model.n_rows, -1)
 
 
+def mass_regressor(model: RobotModel, q: Array) -> Array:
+    """Return the regressor of the mass matrix: D(q, pi) = mass_regressor @ pi, drives included.
+
+    Its column j is W(q, 0, e_j) - W(q, 0, 0), in which gravity and offsets cancel.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+
+    Returns:
+        Regressors, shape (N, n_rows, n_rows, p).
+
+    Raises:
+        DataError: If q does not fit the model.
+
+    References:
+        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+    """
+    N, n = len(q), model.n_rows
+    still = np.zeros((N, n))
+    at_rest = joint_torque_regressor(model, q, still, still).reshape(N, n, -1)
+    D = np.empty((N, n, n, at_rest.shape[2]))
+    for j in range(n):
+        unit = still + np.eye(n)[j]
+        D[:, :, j] = joint_torque_regressor(model, q, still, unit).reshape(N, n, -1) - at_rest
+    return D
+
+
 def build_problem(
-    model: RobotModel, trajectory: Trajectory, weight: Array | None = None
+    model: RobotModel,
+    trajectory: Trajectory,
+    weight: Array | None = None,
+    *,
+    with_mass: bool = False,
 ) -> Problem:
     """Return the identification problem W pi = tau of a trajectory.
 
@@ -58,6 +90,7 @@ def build_problem(
         model: The robot; the trajectory's joints must be its joints, in its order.
         trajectory: N samples of q, v, a, tau.
         weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
+        with_mass: Whether each sample also carries the regressor of its mass matrix.
 
     Returns:
         A stream of row blocks with p columns.
@@ -83,7 +116,12 @@ def build_problem(
             )
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
-    return Problem(stream, model.layout.names, model.n_rows, model.support())
+    def mass_stream() -> Iterator[Array]:
+        for start in range(0, shape[0], _BLOCK):
+            yield mass_regressor(model, trajectory.q[start : start + _BLOCK])
+
+    masses = mass_stream if with_mass else None
+    return Problem(stream, model.layout.names, model.n_rows, model.support(), masses)
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:

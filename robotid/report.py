@@ -46,6 +46,10 @@ _SECTIONS = {
 _ESTIMATORS = {
     "ols": "ordinary least squares (ols)",
     "wls": "weighted least squares, rows weighted by the noise of their joint (wls)",
+    "rls": "recursive least squares, sample by sample (rls)",
+    "kalman": "a Kalman filter over the samples (kalman)",
+    "prx": "steps along the gradient PRX, sample by sample (prx)",
+    "gradient": "normalised gradient steps, sample by sample (gradient)",
     "consistent": "weighted least squares that keeps every body physically possible and leaves "
     "the URDF's value where the data say nothing (consistent)",
 }

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
+from robotid.estimator_settings import KEYS
 from robotid.identification import Identification
 from robotid.parameters import pseudo_inertia
 from robotid.report_page import Cell, code, number, percent, table, text
@@ -164,9 +165,8 @@ def settings_tables(found: Identification) -> str:
     model = found.model
     gravity = ", ".join(f"{g:g}" for g in np.asarray(model.pin_model.gravity.linear).tolist())
     pairs = {"estimator": found.estimator.name}
-    if found.estimator.name == "consistent":
-        pairs["margin"] = f"{found.estimator.margin:g}"
-        pairs["prior weight"] = f"{found.estimator.prior_weight:g}"
+    for key in KEYS[found.estimator.name]:
+        pairs[key.replace("_", " ")] = str(getattr(found.estimator, key))
     pairs["solver"] = f"{found.estimate.message} ({found.estimate.n_iter} iterations)"
     pairs["drive terms"] = ", ".join(model.layout.terms) or "none"
     pairs["gravity [m/s²]"] = gravity

@@ -19,7 +19,7 @@ FLOORS = {
     1: "parameters data problem planar_2r kinematics metrics xml_splice examples tables",
     2: "factors units model signals base_parameters verdict",
     3: "log_files estimators regressor simulation lumping prior",
-    4: "excitation validation sidecar",
+    4: "excitation validation sidecar estimator_settings",
     5: "identification",
     6: "urdf job visualization report_plots",
     7: "report_page result inspection",
@@ -40,7 +40,19 @@ INSIDE_FUNCTIONS = {
     "clarabel": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
-ESTIMATOR_FLOORS = {"estimator": 0, "least_squares": 1, "physical": 2, "__init__": 3}
+ESTIMATOR_FLOORS = {
+    name: floor
+    for floor, names in enumerate(
+        (
+            "estimator",
+            "least_squares recursive",
+            "physical rls kalman descent",
+            "prx gradient",
+            "__init__",
+        )
+    )
+    for name in names.split()
+}
 
 
 def modules():

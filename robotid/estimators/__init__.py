@@ -1,7 +1,30 @@
 """Estimators: Problem or Factors -> Estimate. No physics engine below this folder."""
 
+from robotid.estimators.descent import DescentState
 from robotid.estimators.estimator import Estimate, Estimator
+from robotid.estimators.gradient import NormalisedGradient
+from robotid.estimators.kalman import Kalman, KalmanState
 from robotid.estimators.least_squares import OLS, WLS
 from robotid.estimators.physical import Consistent
+from robotid.estimators.prx import PRX
+from robotid.estimators.recursive import RecursiveEstimator, fold, load_state, save_state
+from robotid.estimators.rls import RLS, RLSState
 
-__all__ = ["OLS", "WLS", "Consistent", "Estimate", "Estimator"]
+__all__ = [
+    "OLS",
+    "PRX",
+    "RLS",
+    "WLS",
+    "Consistent",
+    "DescentState",
+    "Estimate",
+    "Estimator",
+    "Kalman",
+    "KalmanState",
+    "NormalisedGradient",
+    "RLSState",
+    "RecursiveEstimator",
+    "fold",
+    "load_state",
+    "save_state",
+]

@@ -10,7 +10,7 @@ from robotid.exceptions import DataError
 from robotid.factors import Factors, compress
 from robotid.problem import Problem
 
-__all__ = ["Estimate", "Estimator", "as_factors"]
+__all__ = ["Estimate", "Estimator", "as_factors", "require_rows"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +79,23 @@ def as_factors(data: Problem | Factors) -> Factors:
         DataError: If there are fewer rows than parameters: a perfect fit would mean nothing.
     """
     factors = compress(data) if isinstance(data, Problem) else data
-    rows, columns = int(factors.rows.sum()), len(factors.names)
+    require_rows(int(factors.rows.sum()), len(factors.names), len(factors.rows))
+    return factors
+
+
+def require_rows(rows: int, columns: int, n_joints: int) -> None:
+    """Refuse fewer rows than parameters: a perfect fit would mean nothing.
+
+    Args:
+        rows: Number of rows used.
+        columns: Number of parameters.
+        n_joints: Rows per sample.
+
+    Raises:
+        DataError: If there are fewer rows than parameters.
+    """
     if rows < columns:
         raise DataError(
             f"{rows} torque rows for {columns} parameters: too few rows to fit; record at least "
-            f"{-(-10 * columns // len(factors.rows))} samples, or loosen min_velocity and trim"
+            f"{-(-10 * columns // n_joints)} samples, or loosen min_velocity and trim"
         )
-    return factors

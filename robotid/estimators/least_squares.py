@@ -10,7 +10,7 @@ from robotid.exceptions import NotConvergedError, RankDeficientError
 from robotid.factors import Factors
 from robotid.problem import Problem
 
-__all__ = ["OLS", "WLS"]
+__all__ = ["OLS", "WLS", "Solution", "solve_factor"]
 
 _RANK = 1e-7  # singular values below this share of the largest, of unit columns, count as 0
 _SILENT = 1e-6  # columns smaller than this share of the largest carry no information
@@ -54,7 +54,7 @@ class OLS(Estimator):
             RankDeficientError: If the data leave parameters open and there is no prior.
         """
         factors = as_factors(data)
-        solution = _solve(factors, np.ones(len(factors.rows)), self.prior)
+        solution = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
         sigma = _noise(factors, solution.theta, _effective_parameters(factors, solution, None))
         A = factors.R[:, :, :-1]
         bread = solution.covariance  # (W^T W)^+
@@ -100,7 +100,7 @@ class WLS(Estimator):
         factors = as_factors(data)
         sigma = OLS(prior=self.prior).fit(factors).sigma
         for iteration in range(1, _MAX_ITERATIONS + 1):
-            solution = _solve(factors, sigma, self.prior)
+            solution = solve_factor(factors, sigma, self.prior)
             spent = _effective_parameters(factors, solution, sigma)
             updated = _noise(factors, solution.theta, spent)
             change = np.max(np.abs(updated - sigma) / sigma)
@@ -118,17 +118,40 @@ class WLS(Estimator):
 
 
 @dataclass(frozen=True)
-class _Solution:
+class Solution:
+    """The minimiser of a weighted problem, and what its factor says of it.
+
+    Attributes:
+        theta: Parameters, shape (c,).
+        covariance: (W^T S^-1 W)^+, shape (c, c).
+        open_directions: Shape (c, c - rank), orthonormal in the scaled columns.
+        rank: Number of directions that the data determine.
+        condition: Condition number over them, columns scaled to unit norm.
+        undetermined: Names of the parameters that the data leave open.
+    """
+
     theta: Array
-    covariance: Array  # (W^T S^-1 W)^+
-    open_directions: Array  # (c, c - rank), orthonormal in the scaled columns
+    covariance: Array
+    open_directions: Array
     rank: int
     condition: float
     undetermined: tuple[str, ...]
 
 
-def _solve(factors: Factors, sigma: Array, prior: Array | None) -> _Solution:
-    """Solve the weighted problem; directions that the data leave open keep the prior."""
+def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solution:
+    """Solve the weighted problem; directions that the data leave open keep the prior.
+
+    Args:
+        factors: The factors.
+        sigma: Noise level per joint, shape (n,) [N m or N].
+        prior: Parameters kept where the data say nothing, shape (c,); None: refuse such data.
+
+    Returns:
+        The solution.
+
+    Raises:
+        RankDeficientError: If the data leave parameters open and there is no prior.
+    """
     R = factors.weighted(sigma)
     c = len(factors.names)
     A, d = R[:, :c], R[:, c]
@@ -146,10 +169,10 @@ def _solve(factors: Factors, sigma: Array, prior: Array | None) -> _Solution:
     step = V @ ((U[:, :rank].T @ (d - A @ start)) / s[:rank])
     basis = V / s[:rank] / scale[:, None]
     condition = float(s[0] / s[rank - 1]) if rank else float("inf")
-    return _Solution(start + step / scale, basis @ basis.T, V0, rank, condition, undetermined)
+    return Solution(start + step / scale, basis @ basis.T, V0, rank, condition, undetermined)
 
 
-def _effective_parameters(factors: Factors, solution: _Solution, sigma: Array | None) -> Array:
+def _effective_parameters(factors: Factors, solution: Solution, sigma: Array | None) -> Array:
     """Return how many parameters the rows of each joint determine: the trace of their leverage."""
     A = factors.R[:, :, :-1]
     weight = np.ones(len(A)) if sigma is None else 1.0 / sigma**2
@@ -169,7 +192,7 @@ def _noise(factors: Factors, theta: Array, spent: Array) -> Array:
 
 def _estimate(
     factors: Factors,
-    solution: _Solution,
+    solution: Solution,
     covariance: Array,
     sigma: Array,
     n_iter: int,

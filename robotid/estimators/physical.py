@@ -4,7 +4,7 @@ Every body gets a positive definite pseudo-inertia, every drive armature and fri
 sign; where the data say nothing the parameters stay near their prior.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -96,15 +96,9 @@ class Consistent(Estimator):
         factors = as_factors(data)
         wls = WLS(prior=self.K @ self.prior, independent_share=self.independent_share).fit(factors)
         R = factors.weighted(wls.sigma / np.sqrt(self.independent_share))
-        # in units of the prior's spread, x = pi / prior_std, the data rows stand over prior rows
-        root = np.sqrt(self.prior_weight)
-        A = np.vstack([R[:, :-1] @ self.K * self.prior_std, root * np.eye(len(self.prior))])
-        d = np.concatenate([R[:, -1], root * self.prior / self.prior_std])
-        triangle = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][: len(self.prior) + 1]
-        x, n_iter, message = self._solve(triangle[:-1, :-1], triangle[:-1, -1])
-        covariance = self.prior_std[:, None] * _inverse_gram(triangle[:-1, :-1]) * self.prior_std
+        theta, covariance, n_iter, message = self._minimise(R)
         return Estimate(
-            theta=x * self.prior_std,
+            theta=theta,
             covariance=covariance,
             names=self.layout.names,
             sigma=wls.sigma,
@@ -115,6 +109,56 @@ class Consistent(Estimator):
             n_iter=n_iter,
             message=message,
         )
+
+    def project(self, estimate: Estimate) -> Estimate:
+        """Return the possible standard parameters nearest to an estimate of the base parameters.
+
+        Nearest in the metric of its covariance C, the prior beside it, with the constraints of
+        :meth:`fit`: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight
+        |(pi - prior) / prior_std|^2.
+
+        Args:
+            estimate: Base parameters, as a recursive estimator has them at any moment. Those of
+                infinite variance count as unknown.
+
+        Returns:
+            The estimate over the p standard parameters.
+
+        Raises:
+            DataError: If no base parameter has a finite variance, or C is not positive definite.
+            NotConvergedError: If the cone solver does not solve it.
+        """
+        known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
+        if not len(known):
+            raise DataError(
+                "an estimate without a covariance cannot be projected: it has no metric; use 'rls' "
+                "or 'kalman', which have one"
+            )
+        rows = _information_rows(estimate, known)  # (k, b + 1)
+        theta, covariance, n_iter, message = self._minimise(rows)
+        return replace(
+            estimate,
+            theta=theta,
+            covariance=covariance,
+            names=self.layout.names,
+            undetermined=self._undetermined(covariance, estimate.names),
+            n_iter=estimate.n_iter + n_iter,
+            message=f"{estimate.message}; made physically possible, {message}",
+        )
+
+    def _minimise(self, rows: Array) -> tuple[Array, Array, int, str]:
+        """Minimise |rows [K pi; -1]|^2 and the prior over the cone, rows (k, b + 1).
+
+        Returns pi, its covariance without the constraints, iterations and what the solver said.
+        """
+        # in units of the prior's spread, x = pi / prior_std, the data rows stand over prior rows
+        root = np.sqrt(self.prior_weight)
+        A = np.vstack([rows[:, :-1] @ self.K * self.prior_std, root * np.eye(len(self.prior))])
+        d = np.concatenate([rows[:, -1], root * self.prior / self.prior_std])
+        triangle = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][: len(self.prior) + 1]
+        x, n_iter, message = self._solve(triangle[:-1, :-1], triangle[:-1, -1])
+        covariance = self.prior_std[:, None] * _inverse_gram(triangle[:-1, :-1]) * self.prior_std
+        return x * self.prior_std, covariance, n_iter, message
 
     def _undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the base parameters about which the data say next to nothing."""
@@ -210,6 +254,24 @@ class Consistent(Estimator):
         diagonal = np.column_stack([1 / radius] * 3 + [np.ones_like(mass)])
         shrink: Array = np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
         return shrink
+
+
+def _information_rows(estimate: Estimate, known: Array) -> Array:
+    """Return rows [L^-1 (beta -> known), L^-1 beta] with L L^T the covariance of what is known."""
+    C = estimate.covariance[np.ix_(known, known)]
+    scale = np.sqrt(np.diag(C))
+    try:
+        L = scale[:, None] * np.linalg.cholesky(C / np.outer(scale, scale))
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            "the covariance of the estimate is not positive definite, so it has no metric to "
+            "project in; give the estimator more samples or a prior"
+        ) from error
+    chosen = np.zeros((len(known), len(estimate.theta) + 1))
+    chosen[np.arange(len(known)), known] = 1.0
+    chosen[:, -1] = estimate.theta[known]
+    rows: Array = scipy.linalg.solve_triangular(L, chosen, lower=True)
+    return rows
 
 
 def _svec(S: Array) -> Array:

@@ -1,0 +1,217 @@
+"""Which estimator is wanted, with its own settings; and the estimator made of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.base_parameters import BaseMapping
+from robotid.estimators import (
+    OLS,
+    PRX,
+    RLS,
+    WLS,
+    Consistent,
+    Estimator,
+    Kalman,
+    NormalisedGradient,
+)
+from robotid.exceptions import SettingsError
+from robotid.lumping import held_parameters
+from robotid.model import RobotModel
+
+__all__ = [
+    "ESTIMATORS",
+    "KEYS",
+    "RECURSIVE",
+    "EstimatorSettings",
+    "Prior",
+    "consistent_fit",
+    "make_estimator",
+]
+
+_PROJECTION = ("margin", "prior_weight")
+#: The keys that each estimator has, beside its name.
+KEYS: Mapping[str, tuple[str, ...]] = {
+    "ols": (),
+    "wls": (),
+    "consistent": _PROJECTION,
+    "rls": ("forgetting", "physical", *_PROJECTION),
+    "kalman": ("walk", "gate", "physical", *_PROJECTION),
+    "prx": ("step", "metric", "average", "passes", "seed", "physical", *_PROJECTION),
+    "gradient": ("step_size", "average", "passes", "seed", "physical", *_PROJECTION),
+}
+ESTIMATORS = tuple(KEYS)
+RECURSIVE = ("rls", "kalman", "prx", "gradient")
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """Which estimator, and its own settings. A setting of another estimator is refused.
+
+    Attributes:
+        name: "ols", "wls", "consistent", "rls", "kalman", "prx" or "gradient".
+        margin: Of "consistent" and ``physical``: smallest eigenvalue of a body's pseudo-inertia
+            relative to its prior size [-].
+        prior_weight: Of "consistent" and ``physical``: weight of the URDF's values [-].
+        forgetting: Of "rls": weight of a sample relative to the next one [-].
+        walk: Of "kalman": random walk per sample, as a share of the prior's spread [-].
+        gate: Of "kalman": probability with which a good row passes; False for no gate.
+        step: Of "prx": "exact" or "printed".
+        metric: Of "prx", step "exact": "noise", "mass" or "rows".
+        average: Of "prx" and "gradient": whether the iterates are averaged.
+        passes: Of "prx" and "gradient": largest number of passes over the logs.
+        seed: Of "prx" and "gradient": seed of the order of the samples; negative: that of time.
+        step_size: Of "gradient": relaxation, above 0 and below 2 [-].
+        physical: Of the recursive ones: whether the last estimate is made physically possible.
+    """
+
+    name: str = "consistent"
+    margin: float = 1e-4
+    prior_weight: float = 1.0
+    forgetting: float = 1.0
+    walk: float = 0.0
+    gate: float | bool = 1 - 1e-7
+    step: str = "exact"
+    metric: str = "noise"
+    average: bool = True
+    passes: int = 4
+    seed: int = 0
+    step_size: float = 1.0
+    physical: bool = False
+
+    def __post_init__(self) -> None:
+        if self.name not in KEYS:
+            raise SettingsError(f"estimator is {self.name!r}, wanted one of {list(ESTIMATORS)}")
+        own = KEYS[self.name]
+        for field in fields(self)[1:]:
+            if field.name not in own and getattr(self, field.name) != field.default:
+                raise SettingsError(
+                    f"estimator {self.name!r} has no setting {field.name!r}; it has {list(own)}"
+                )
+        for key in ("margin", "prior_weight", "passes"):
+            if not getattr(self, key) > 0:
+                raise SettingsError(f"{key} is {getattr(self, key)}, wanted a positive number")
+        _check_range("forgetting", self.forgetting, 0 < self.forgetting <= 1, "0 < x <= 1")
+        _check_range("walk", self.walk, self.walk >= 0, "x >= 0")
+        _check_range("step_size", self.step_size, 0 < self.step_size < 2, "0 < x < 2")
+        is_gate = self.gate is False or (self.gate is not True and 0.5 <= self.gate < 1)
+        _check_range("gate", self.gate, is_gate, "0.5 <= x < 1, or false")
+        _check_choice("step", self.step, ("exact", "printed"))
+        _check_choice("metric", self.metric, ("noise", "mass", "rows"))
+
+    @property
+    def needs_mass(self) -> bool:
+        """Whether each sample must carry the regressor of the mass matrix."""
+        return self.name == "prx" and (self.step == "printed" or self.metric == "mass")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the name and the estimator's own settings, in the shape of the job file."""
+        return {"name": self.name, **{key: getattr(self, key) for key in KEYS[self.name]}}
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before the data.
+
+    Attributes:
+        pi: Standard parameters of the URDF, shape (p,).
+        spread: How far they may plausibly be wrong, shape (p,).
+        share: Share of the rows that count as independent [-].
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+    """
+
+    pi: Array
+    spread: Array
+    share: float
+    sigma: Array
+
+
+def make_estimator(
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+) -> Estimator:
+    """Return the estimator that settings describe.
+
+    Args:
+        settings: The settings.
+        model: The robot.
+        mapping: Standard to base parameters.
+        prior: What is known before the data.
+
+    Returns:
+        The estimator.
+    """
+    if settings.name == "ols":
+        return OLS(independent_share=prior.share)
+    if settings.name == "wls":
+        return WLS(independent_share=prior.share)
+    if settings.name in RECURSIVE:
+        return _recursive(settings, mapping, prior)
+    return consistent_fit(settings, model, mapping, prior)
+
+
+def consistent_fit(
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+) -> Consistent:
+    """Return the physically consistent estimator, which also projects.
+
+    Args:
+        settings: The settings.
+        model: The robot.
+        mapping: Standard to base parameters.
+        prior: What is known before the data.
+
+    Returns:
+        The estimator.
+    """
+    return Consistent(
+        layout=model.layout,
+        K=mapping.K,
+        prior=prior.pi,
+        prior_std=prior.spread,
+        held=held_parameters(model),
+        margin=settings.margin,
+        prior_weight=settings.prior_weight,
+        independent_share=prior.share,
+    )
+
+
+def _recursive(settings: EstimatorSettings, mapping: BaseMapping, prior: Prior) -> Estimator:
+    beta, sigma = mapping.to_base(prior.pi), prior.sigma
+    KS = mapping.K * prior.spread
+    C = KS @ KS.T  # (b, b), of the base parameters before the data
+    if settings.name == "rls":
+        # without forgetting nothing of the prior enters: batch least squares
+        is_held = settings.forgetting < 1
+        std = np.sqrt(np.diag(C)) if is_held else None
+        return RLS(sigma, settings.forgetting, beta, std, prior.share)
+    if settings.name == "kalman":
+        gate = None if settings.gate is False else float(settings.gate)
+        return Kalman(sigma, beta, C, settings.walk, gate, prior.share)
+    rng = np.random.default_rng(settings.seed) if settings.seed >= 0 else None
+    passes, average = settings.passes, settings.average
+    if settings.name == "prx":
+        return PRX(
+            sigma,
+            beta,
+            step=settings.step,
+            metric=settings.metric,
+            average=average,
+            passes=passes,
+            rng=rng,
+        )
+    return NormalisedGradient(
+        sigma, beta, step_size=settings.step_size, average=average, passes=passes, rng=rng
+    )
+
+
+def _check_range(key: str, value: object, is_right: bool, wanted: str) -> None:
+    if not is_right:
+        raise SettingsError(f"{key} is {value}, wanted {wanted}")
+
+
+def _check_choice(key: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise SettingsError(f"{key} is {value!r}, wanted one of {list(known)}")
