@@ -16,11 +16,11 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem planar_2r kinematics metrics xml_splice examples",
-    2: "factors log_files model signals base_parameters verdict",
-    3: "estimators regressor simulation lumping prior",
-    4: "excitation validation",
-    5: "identification",
+    1: "parameters data problem program proximity kinematics metrics xml_splice examples",
+    2: "factors log_files model signals base_parameters verdict planar_2r procedure",
+    3: "estimators regressor plant lumping prior",
+    4: "excitation validation simulation dynamics",
+    5: "identification closed_loop",
     6: "urdf job visualization report_plots",
     7: "report_page result inspection",
     8: "report_tables",
@@ -31,7 +31,9 @@ FLOORS = {
     13: "__main__",
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
-PINOCCHIO = {"model", "regressor", "simulation", "visualization", "lumping", "prior"}
+PINOCCHIO = {
+    "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior"
+}  # fmt: skip
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
