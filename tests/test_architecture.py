@@ -21,10 +21,10 @@ FLOORS = {
     3: "estimators regressor plant lumping prior",
     4: "excitation validation simulation dynamics",
     5: "identification closed_loop",
-    6: "urdf job visualization report_plots",
-    7: "report_page result inspection",
-    8: "report_tables",
-    9: "report",
+    6: "urdf job visualization report_plots paper_simulation paper_trajectories",
+    7: "report_page result inspection paper_errata",
+    8: "report_tables paper_plots paper_page",
+    9: "report paper",
     10: "workflow",
     11: "demo",
     12: "cli",
@@ -38,7 +38,7 @@ INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
     "pyarrow": {"data", "log_files"},
-    "matplotlib": {"report", "report_plots"},
+    "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
     "clarabel": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
