@@ -50,6 +50,12 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", default="robotid-demo", metavar="DIR", help="folder to write to")
     demo.set_defaults(run=_demo)
 
+    paper = commands.add_parser("paper", help="the paper's simulation: figures, tables, numbers")
+    paper.add_argument("--out", default="robotid-paper", metavar="DIR", help="folder to write to")
+    paper.add_argument("--json", action="store_true", help="print paper.json")
+    paper.add_argument("--quick", action="store_true", help="few iterations and motions: a try-out")
+    paper.set_defaults(run=_paper)
+
     inspect = commands.add_parser("inspect", help="joints, parameters and faults of a URDF")
     inspect.add_argument("urdf", metavar="URDF")
     inspect.add_argument("--free-flyer", action="store_true", help="the base floats")
@@ -105,6 +111,27 @@ def _demo(options: argparse.Namespace) -> None:
     within = sum(abs(error) < 3 * identification.base_error)
     print(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
     _print_files(options.out, [*result["outputs"].values(), "result.json", "replay.html"])
+
+
+def _paper(options: argparse.Namespace) -> None:
+    from robotid.paper import run_paper
+    from robotid.paper_simulation import PaperSettings
+
+    few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
+    progress = _overwrite if sys.stderr.isatty() else None
+    result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
+    if progress is not None:
+        _overwrite("")
+    if options.json:
+        print(json.dumps(result, allow_nan=False))
+        return
+    _print_paper(result)
+    print(f"\nwritten to {options.out}: paper.html, paper.json, figures as PNG and SVG")
+
+
+def _overwrite(line: str) -> None:
+    """Show a line of progress in place of the one before."""
+    print(f"\r{line:72}", end="" if line else "\r", file=sys.stderr, flush=True)
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -226,6 +253,20 @@ def _print_result(result: dict[str, Any]) -> None:
     for warning in result["warnings"]:
         print(f"\n{warning['code']}: {warning['message']}")
     _print_verdict(result["verdict"])
+
+
+def _print_paper(result: dict[str, Any]) -> None:
+    columns = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
+    print("relative error of the parameters; the last three columns at the end")
+    print("  model       start   after 1   at end   " + "  ".join(columns.values()) + "   NA")
+    for name, model in result["models"].items():
+        errors = model["relative_error"]
+        ends = [result[case][name]["relative_error"][-1] for case in columns]
+        cells = [errors[0], errors[1], errors[-1], *ends]
+        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
+    print("\nrandom motions that converged to 1e-3")
+    for name, found in result["trajectories"].items():
+        print(f"  {name:10} {found['converged']} of {found['runs']}")
 
 
 def _print_table(per_joint: dict[str, Any], wls: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.program import ProgramMotion
 
 __all__ = [
     "PAPER_LINKS",
@@ -133,13 +134,13 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
     """Return the regressor G(q, v, a), with which G P = u.
 
     Args:
-        q: Joint angles, shape (2,) [rad].
-        v: Joint velocities, shape (2,) [rad/s].
-        a: Joint accelerations, shape (2,) [rad/s^2].
+        q: Joint angles, shape (..., 2) [rad].
+        v: Joint velocities, shape (..., 2) [rad/s].
+        a: Joint accelerations, shape (..., 2) [rad/s^2].
         form: Which of the three regressors.
 
     Returns:
-        Regressor, shape (2, c) [1/s^2].
+        Regressor, shape (..., 2, c) [1/s^2].
 
     Raises:
         DataError: If q, v or a does not have two entries.
@@ -149,16 +150,18 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
         Tzvetkova, (13) and the matrix G that stands before (27).
     """
     _check_form(form)
-    (_, q2), (v1, v2), (a1, a2) = _vector("q", q, 2), _vector("v", v, 2), _vector("a", a, 2)
+    (_, q2), (v1, v2), (a1, a2) = _pair("q", q), _pair("v", v), _pair("a", a)
     c2, s2 = np.cos(q2), np.sin(q2)
     a12, v12 = 2 * a1 + a2, v2**2 + 2 * v1 * v2
     row1 = [a1, a1 + a2, c2 * a12 - 2 * s2 * v1 * v2, -s2 * v2**2, -s2 * a12 - c2 * v12]
     row2 = [0.0, a1 + a2, c2 * a1, s2 * v1**2, -s2 * a1 + c2 * v1**2]
-    G = np.array([row1, row2])  # (2, 5)
     if form == "printed":
-        G[:, 3] = G[::-1, 3].copy()  # erratum 2
+        row1[3], row2[3] = row2[3], row1[3]  # erratum 2
     if form == "corrected":
-        G = np.column_stack([G[:, :2], G[:, 2] + G[:, 3], G[:, 4]])  # (2, 4)
+        row1[2:4], row2[2:4] = [row1[2] + row1[3]], [row2[2] + row2[3]]
+    G = np.empty((*np.shape(row1[2]), 2, len(row1)))
+    for column, (upper, lower) in enumerate(zip(row1, row2, strict=True)):
+        G[..., 0, column], G[..., 1, column] = upper, lower
     return G
 
 
@@ -251,14 +254,7 @@ def program_motion(
     References:
         Tzvetkova, (28).
     """
-    A = _vector("amplitude", amplitude, 2)
-    if not 0 < duration < np.inf:
-        raise SettingsError(f"duration is {duration}, wanted a positive number")
-    s = np.clip(np.asarray(t, dtype=float) / duration, 0.0, 1.0)[..., None]  # t / T
-    q = A * (6 * s**5 - 15 * s**4 + 10 * s**3)
-    v = A * (30 * s**4 - 60 * s**3 + 30 * s**2) / duration
-    a = A * (120 * s**3 - 180 * s**2 + 60 * s) / duration**2
-    return q, v, a
+    return ProgramMotion(_vector("amplitude", amplitude, 2), duration).evaluate(t)
 
 
 def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:
@@ -298,3 +294,10 @@ def _vector(name: str, values: Array, size: int) -> Array:
     if array.shape != (size,):
         raise DataError(f"{name} has shape {array.shape}, wanted ({size},)")
     return array
+
+
+def _pair(name: str, values: Array) -> tuple[Array, Array]:
+    array = np.asarray(values, dtype=float)
+    if array.shape[-1:] != (2,):
+        raise DataError(f"{name} has shape {array.shape}, wanted (2,)")
+    return array[..., 0], array[..., 1]

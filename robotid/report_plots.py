@@ -12,18 +12,21 @@ from numpy.typing import NDArray
 from robotid._typing import Array
 from robotid.validation import Evaluation
 
-__all__ = ["plot_body", "plot_torque", "stretches", "thin"]
+__all__ = ["INK", "STYLE", "plot_body", "plot_torque", "stretches", "svg_element", "thin"]
 
 # Matplotlib writes each of these colours into the SVG; there it becomes one of the page's own
-_INK, _PREDICTED, _RESIDUAL = "#010101", "#020202", "#030303"
+#: Colour of text and axes; in a page it becomes the colour of the page's text.
+INK = "#010101"
+_PREDICTED, _RESIDUAL = "#020202", "#030303"
 _PAGE_COLOURS = {
-    _INK: "currentColor",
+    INK: "currentColor",
     _PREDICTED: "var(--predicted)",
     _RESIDUAL: "var(--residual)",
 }
-_RC: dict[Any, Any] = {
-    "axes.edgecolor": _INK,
-    "axes.labelcolor": _INK,
+#: Matplotlib's settings for every plot.
+STYLE: dict[Any, Any] = {
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
     "axes.labelsize": 8.5,
     "axes.linewidth": 0.6,
     "axes.spines.right": False,
@@ -31,15 +34,15 @@ _RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 8.5,
     "grid.alpha": 0.15,
-    "grid.color": _INK,
+    "grid.color": INK,
     "legend.frameon": False,
     "path.simplify_threshold": 0.25,
     "svg.fonttype": "none",
     "svg.hashsalt": "robotid",
-    "text.color": _INK,
+    "text.color": INK,
     "text.parse_math": False,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
 }
 
 
@@ -70,13 +73,13 @@ def plot_torque(
     prediction = evaluation.torques["estimate"][:, row]
     used: NDArray[np.bool_] = evaluation.recording.mask[:, row].astype(bool)
     whole, kept = stretches(trajectory.segment), stretches(trajectory.segment, used)
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 3.3))
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(5, 2))
-        upper.plot(*thin(t, tau, whole, points), color=_INK, alpha=0.6, lw=1.3, label="measured")
+        upper.plot(*thin(t, tau, whole, points), color=INK, alpha=0.6, lw=1.3, label="measured")
         upper.plot(*thin(t, prediction, kept, points), color=_PREDICTED, lw=1.0, label="predicted")
         lower.plot(*thin(t, tau - prediction, kept, points), color=_RESIDUAL, lw=0.8)
-        lower.axhline(0.0, color=_INK, lw=0.5)
+        lower.axhline(0.0, color=INK, lw=0.5)
         for axes in (upper, lower):
             _shade(axes, t, stretches(trajectory.segment, ~used))
             axes.grid(visible=True)
@@ -87,7 +90,7 @@ def plot_torque(
         upper.legend(loc="lower left", bbox_to_anchor=(0.0, 0.98), ncols=2, borderpad=0)
         figure.align_ylabels()
         figure.subplots_adjust(left=0.11, right=0.99, top=0.92, bottom=0.13, hspace=0.12)
-        return _svg(figure, title, key)
+        return svg_element(figure, title, key)
 
 
 def plot_body(
@@ -120,10 +123,10 @@ def plot_body(
     y = np.arange(len(terms))
     scale = np.where(spread > 0, spread, 1.0)
     bars = np.where(np.isfinite(error), 2 * error, 0.0)
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 2.7))
         axes = figure.subplots()
-        axes.plot(prior / scale, y - 0.18, "o", mfc="none", mec=_INK, ms=4.5, label="URDF")
+        axes.plot(prior / scale, y - 0.18, "o", mfc="none", mec=INK, ms=4.5, label="URDF")
         axes.errorbar(
             value / scale,
             y + 0.18,
@@ -141,7 +144,7 @@ def plot_body(
         axes.grid(visible=True, axis="x")
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.98), ncols=2, borderpad=0)
         figure.subplots_adjust(left=0.11, right=0.99, top=0.91, bottom=0.16)
-        return _svg(figure, title, key)
+        return svg_element(figure, title, key)
 
 
 def stretches(segment: NDArray[Any], used: NDArray[np.bool_] | None = None) -> list[slice]:
@@ -188,6 +191,35 @@ def thin(t: Array, y: Array, parts: Sequence[slice], points: int) -> tuple[Array
     return np.concatenate(times[:-1]), np.concatenate(values[:-1])
 
 
+def svg_element(figure: Any, title: str, key: str) -> str:  # noqa: ANN401
+    """Return a figure as an element that can stand in a page beside others.
+
+    Args:
+        figure: A figure of Matplotlib, drawn in ``STYLE``.
+        title: What it shows, for those who cannot see it.
+        key: A word that no other plot on the page has.
+
+    Returns:
+        An ``<svg>`` element.
+    """
+    stream = StringIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
+    svg: str = stream.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
+    # ids are unique in a page, not only in a figure
+    svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", svg)
+    svg = re.sub(r'\bd="[^"]*"', _rounded, svg)
+    for colour, variable in _PAGE_COLOURS.items():
+        svg = svg.replace(colour, variable)
+    label = f'<title id="{key}-title">{escape(title)}</title>'
+    head, rest = svg.split(">", 1)
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    return f'{head} role="img" aria-labelledby="{key}-title">{label}{rest}'
+
+
 def _extremes(y: Array, width: int) -> NDArray[np.int_]:
     """Return the rows of the smallest and largest value of each ``width`` rows, and the ends."""
     padded = np.pad(y, (0, -len(y) % width), mode="edge").reshape(-1, width)
@@ -209,28 +241,8 @@ def _shade(axes: Any, t: Array, parts: Sequence[slice]) -> None:  # noqa: ANN401
             spans.append([start, end])
     bars = [(start, max(end - start, pixel / 2)) for start, end in spans]
     axes.broken_barh(
-        bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=_INK, alpha=0.09, lw=0
+        bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=INK, alpha=0.09, lw=0
     )
-
-
-def _svg(figure: Any, title: str, key: str) -> str:  # noqa: ANN401
-    """Return a figure as an element that can stand in a page beside others."""
-    stream = StringIO()
-    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
-    svg: str = stream.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
-    # ids are unique in a page, not only in a figure
-    svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", svg)
-    svg = re.sub(r'\bd="[^"]*"', _rounded, svg)
-    for colour, variable in _PAGE_COLOURS.items():
-        svg = svg.replace(colour, variable)
-    label = f'<title id="{key}-title">{escape(title)}</title>'
-    head, rest = svg.split(">", 1)
-    head = re.sub(r' (width|height)="[^"]*"', "", head)
-    return f'{head} role="img" aria-labelledby="{key}-title">{label}{rest}'
 
 
 def _rounded(path: re.Match[str]) -> str:

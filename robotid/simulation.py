@@ -10,10 +10,10 @@ from robotid._typing import Array
 from robotid.data import Log
 from robotid.exceptions import DataError
 from robotid.model import RobotModel
+from robotid.plant import RobotPlant
 
 __all__ = ["Motion", "Noise", "another_robot", "simulate"]
 
-_SIGN_SPEED = 2e-3  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
 _BANDWIDTH = 20.0  # [rad/s] of the tracking controller
 _SUBSTEPS = 2  # Runge-Kutta steps per sample
 
@@ -71,9 +71,7 @@ def simulate(
     Raises:
         DataError: If the base floats, or the simulation diverges.
     """
-    if model.free_flyer:
-        raise DataError("a robot with a floating base cannot be simulated without contacts")
-    plant = _Plant(model, pi)
+    plant = _TrackedPlant(model, pi)
     t = np.arange(round(duration * rate) + 1) / rate
     h = 1.0 / rate / _SUBSTEPS
     q_r, v_r, a_r = motion.evaluate(h / 2 * np.arange(2 * _SUBSTEPS * (len(t) - 1) + 1))
@@ -127,31 +125,21 @@ def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
     return pi
 
 
-class _Plant:
+class _TrackedPlant:
     """The true robot and its controller."""
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
         self.model = model
         self.n = len(model.joints)
-        self.G = model.velocity_map
+        self.plant = RobotPlant(model, pi)
         self.believed = model.pin_model
-        self.true = model.with_parameters(pi).pin_model
-        self.data = self.true.createData()
         self.believed_data = self.believed.createData()
-        self.drives = _drives(model, pi)
-        self.inertia = np.maximum(np.diag(self._mass_matrix(np.zeros(self.n))), 0.02)
-
-    def _mass_matrix(self, q: Array) -> Array:
-        M = pin.crba(self.true, self.data, self.model.configurations(q[None])[0])
-        M = np.triu(M) + np.triu(M, 1).T
-        armature = sum(Ia * np.outer(r, r) for r, Ia, _, _, _ in self.drives)
-        mass: Array = self.G.T @ M @ self.G + armature
-        return mass
+        self.inertia = np.maximum(np.diag(self.plant.mass_matrix(np.zeros(self.n))), 0.02)
 
     def torque(self, state: Array, q_r: Array, v_r: Array, a_r: Array) -> Array:
         """Return the controller's torque."""
         q, v = state[: self.n], state[self.n :]
-        G, w = self.G, _BANDWIDTH
+        G, w = self.model.velocity_map, _BANDWIDTH
         configuration = self.model.configurations(q_r[None])[0]
         forward = pin.rnea(self.believed, self.believed_data, configuration, G @ v_r, G @ a_r)
         command: Array = G.T @ forward + self.inertia * (w**2 * (q_r - q) + 2 * w * (v_r - v))
@@ -160,14 +148,7 @@ class _Plant:
     def derivative(self, state: Array, u: Array) -> Array:
         """Return the rate of change of the state (q, v) under a torque."""
         q, v = state[: self.n], state[self.n :]
-        M = self._mass_matrix(q)
-        bias = self.G.T @ pin.nonLinearEffects(
-            self.true, self.data, self.model.configurations(q[None])[0], self.G @ v
-        )
-        for r, _, Fv, Fc, offset in self.drives:
-            speed = r @ v
-            bias = bias + r * (Fv * speed + Fc * np.tanh(speed / _SIGN_SPEED) + offset)
-        return np.concatenate([v, np.linalg.solve(M, u - bias)])
+        return np.concatenate([v, self.plant.acceleration(q, v, u)])
 
     def advance(self, x: Array, q_r: Array, v_r: Array, a_r: Array, h: float) -> Array:
         """Return the state one Runge-Kutta step later; references at its start, middle, end."""
@@ -181,17 +162,3 @@ class _Plant:
         k4 = slope(x + h * k3, 2)
         advanced: Array = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return advanced
-
-
-def _drives(model: RobotModel, pi: Array) -> list[tuple[Array, float, float, float, float]]:
-    """Return ratios over the joints, armature, viscous, Coulomb and offset of each drive."""
-    value = dict(zip(model.layout.names, pi.tolist(), strict=True))
-    ratios = {joint: {joint: 1.0} for joint in model.joints}
-    ratios.update({c.name: dict(c.ratios) for c in model.layout.couplings})
-    drives = []
-    for owner, by_joint in ratios.items():
-        r = np.array([by_joint.get(joint, 0.0) for joint in model.joints])
-        terms = (value.get(f"{owner}.{term}", 0.0) for term in ("armature", "viscous", "coulomb"))
-        Ia, Fv, Fc = terms
-        drives.append((r, Ia, Fv, Fc, value.get(f"{owner}.offset", 0.0)))
-    return drives

@@ -16,27 +16,29 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem planar_2r kinematics metrics xml_splice examples tables",
-    2: "factors units model signals base_parameters verdict",
-    3: "log_files estimators regressor simulation lumping prior",
-    4: "excitation validation sidecar estimator_settings",
-    5: "identification",
-    6: "urdf job visualization report_plots",
-    7: "report_page result inspection",
-    8: "report_tables",
-    9: "report",
+    1: "parameters data problem program proximity kinematics metrics xml_splice examples tables",
+    2: "factors units model signals base_parameters verdict planar_2r procedure",
+    3: "log_files estimators regressor plant lumping prior",
+    4: "excitation validation sidecar estimator_settings simulation dynamics",
+    5: "identification closed_loop",
+    6: "urdf job visualization report_plots paper_simulation paper_trajectories",
+    7: "report_page result inspection paper_errata",
+    8: "report_tables paper_plots paper_page",
+    9: "report paper",
     10: "workflow",
     11: "demo",
     12: "cli",
     13: "__main__",
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
-PINOCCHIO = {"model", "regressor", "simulation", "visualization", "lumping", "prior"}
+PINOCCHIO = {
+    "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior"
+}  # fmt: skip
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
     "pyarrow": {"tables"},
-    "matplotlib": {"report", "report_plots"},
+    "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
     "clarabel": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
