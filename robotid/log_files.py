@@ -6,20 +6,19 @@ Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `d
 
 import csv
 import difflib
-import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TextIO
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.data import PER_SECOND, Log, LogUnits, check_units, repeated, suggestion
-from robotid.exceptions import DataError, MissingDependencyError, SettingsError
+from robotid.exceptions import DataError, SettingsError
+from robotid.table_files import is_csv, load_pyarrow, write_table
 
 __all__ = ["read_log", "write_log"]
 
@@ -67,16 +66,16 @@ def read_log(
         MissingDependencyError: If a Parquet file is read without pyarrow.
     """
     source = Path(path)
-    is_csv = _is_csv(source)
+    reads_csv = is_csv(source)
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
     if not source.is_file():
         raise DataError(f"there is no log file {str(source)!r}")
-    names = _csv_header(source)[0] if is_csv else _parquet_names(source)
+    names = _csv_header(source)[0] if reads_csv else _parquet_names(source)
     finder = _Finder(source.name, names, columns or {}, tuple(joints), gains or {})
     found = finder.find_all()  # names of columns by kind
     wanted = [name for kind in found.values() for name in kind]
-    table = _read_csv(source, wanted) if is_csv else _read_parquet(source, wanted)
+    table = _read_csv(source, wanted) if reads_csv else _read_parquet(source, wanted)
     values = {kind: np.stack([table[name] for name in found[kind]], axis=1) for kind in found}
     if units.angle == "deg":
         radians = [1.0 if joint in prismatic else np.pi / 180 for joint in joints]
@@ -112,14 +111,7 @@ def write_log(log: Log, path: str | Path) -> None:
         MissingDependencyError: If Parquet is written without pyarrow.
         OSError: If the folder cannot be written to.
     """
-    target = Path(path)
-    write = _write_csv if _is_csv(target) else _write_parquet
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        write(_to_table(log), partial)
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_table(_to_table(log), path)
 
 
 @dataclass(frozen=True)
@@ -253,14 +245,6 @@ def _to_table(log: Log) -> dict[str, Array]:
     return table
 
 
-def _is_csv(path: Path) -> bool:
-    """Return whether a file is CSV rather than Parquet, by its suffix."""
-    suffix = path.suffix.lower()
-    if suffix not in (".csv", ".parquet"):
-        raise DataError(f"{path.name}: logs are .csv or .parquet files, not {suffix!r}; convert it")
-    return suffix == ".csv"
-
-
 @contextmanager
 def _open_csv(path: Path) -> Iterator[TextIO]:
     """Open a text file, whether or not it starts with a byte order mark."""
@@ -345,30 +329,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _write_csv(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as CSV; the shortest decimals that give the same bits."""
-    rows = np.column_stack(list(table.values()))
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table)
-        writer.writerows(row.tolist() for row in rows)
-
-
-def _pyarrow(purpose: str) -> ModuleType:
-    """Return pyarrow, with its parquet loaded."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingDependencyError(purpose, "pyarrow", "parquet") from error
-    package: ModuleType = pyarrow
-    return package
-
-
 @contextmanager
 def _open_parquet(path: Path) -> Iterator[Any]:
     """Open a Parquet file; what is wrong with it is told in our words."""
-    pa = _pyarrow("reading Parquet")
+    pa = load_pyarrow("reading Parquet")
     try:
         with pa.parquet.ParquetFile(path) as file:
             yield file
@@ -384,7 +348,7 @@ def _parquet_names(path: Path) -> list[str]:
 
 def _read_parquet(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
     """Return the wanted columns of a Parquet file; null becomes NaN."""
-    types = _pyarrow("reading Parquet").types
+    types = load_pyarrow("reading Parquet").types
     with _open_parquet(path) as file:
         for name in wanted:
             kind = file.schema_arrow.field(name).type
@@ -392,9 +356,3 @@ def _read_parquet(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
                 raise DataError(f"{path.name}: {name} holds {kind}, wanted numbers; convert it")
         table = file.read(columns=list(wanted))
     return {name: table.column(name).to_numpy().astype(np.float64, copy=False) for name in wanted}
-
-
-def _write_parquet(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as Parquet."""
-    pa = _pyarrow("writing Parquet")
-    pa.parquet.write_table(pa.table(dict(table)), path)

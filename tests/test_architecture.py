@@ -16,14 +16,14 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem planar_2r kinematics metrics xml_splice examples",
-    2: "factors log_files model signals base_parameters verdict",
+    1: "parameters data problem planar_2r kinematics metrics xml_splice examples table_files innovations online_settings",
+    2: "factors log_files model signals live_signals base_parameters verdict",
     3: "estimators regressor simulation lumping prior",
     4: "excitation validation estimator_settings",
     5: "identification",
-    6: "urdf job visualization report_plots",
+    6: "online urdf job visualization report_plots",
     7: "report_page result inspection",
-    8: "report_tables",
+    8: "report_tables tracking",
     9: "report",
     10: "workflow",
     11: "demo",
@@ -35,7 +35,7 @@ PINOCCHIO = {"model", "regressor", "simulation", "visualization", "lumping", "pr
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
-    "pyarrow": {"data", "log_files"},
+    "pyarrow": {"data", "table_files"},
     "matplotlib": {"report", "report_plots"},
     "clarabel": {"estimators"},
 }
