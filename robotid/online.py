@@ -133,11 +133,13 @@ class OnlineIdentifier:
                 self._skipped += 1
                 if self._skipped % self._every == 0:
                     self._take(instant, t)
+            self._now = t
         elif len(rest) == 3:
             v, a, tau = rest
             self._check(t, q, v, a, tau)
             self.delay = 0.0
             self._take((t, np.asarray(q), np.asarray(v), np.asarray(a), np.asarray(tau)), t)
+            self._now = t
         else:
             raise DataError(
                 f"update takes (t, q, tau) or (t, q, v, a, tau), found {2 + len(rest)} values"
@@ -221,7 +223,6 @@ class OnlineIdentifier:
 
     def _take(self, instant: Instant, now: float) -> None:
         """Give one instant to the estimator; before the warm-up is over, keep it."""
-        self._now = now
         if self._kalman is not None:
             self._step(instant, now)
             return

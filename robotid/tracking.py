@@ -80,7 +80,7 @@ def track(model: RobotModel, log: Log, settings: OnlineSettings) -> Track:
     readings: list[Reading] = []
     for k in range(len(log.t)):
         identifier.update(float(log.t[k]), log.q[k], log.tau[k])
-        is_due = not times or log.t[k] >= times[-1] + 1.0 / _ROWS
+        is_due = not times or log.t[k] > times[-1] + 0.999 / _ROWS
         if identifier.is_ready and (is_due or k == len(log.t) - 1):
             times.append(float(log.t[k]))
             readings.append(identifier.reading)
