@@ -138,6 +138,19 @@ class InstantRegressor:
             Y[:, layout.n_inertial :] = _drive_columns(model, v[None], a[None])[0]
         return Y[:, self._columns]
 
+    def mass(self, q: Array) -> Array:
+        """Return the regressor of the mass matrix; see :func:`mass_regressor`.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+
+        Returns:
+            Regressor, shape (n, n, c).
+        """
+        still, unit = np.zeros(len(q)), np.eye(len(q))
+        at_rest = self(q, still, still)
+        return np.stack([self(q, still, a) - at_rest for a in unit], axis=1)
+
 
 def build_problem(
     model: RobotModel,
