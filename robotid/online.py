@@ -1,7 +1,7 @@
 """Identification while the robot moves: sample in, estimate at any moment out."""
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import overload
 
 import numpy as np
@@ -14,57 +14,17 @@ from robotid.identification import structural_mapping
 from robotid.innovations import ChangeDetector, Innovations, Payload, load_spread, payload_of
 from robotid.live_signals import Instant, LiveSignals
 from robotid.model import RobotModel
-from robotid.online_settings import OnlineSettings
+from robotid.online_settings import Change, OnlineSettings, Reading
 from robotid.prior import prior_spread
 from robotid.problem import Sample
 from robotid.regressor import InstantRegressor
 
-__all__ = ["Change", "OnlineIdentifier", "Reading"]
+__all__ = ["OnlineIdentifier"]
 
 _OVERSAMPLED = 12.0  # filtered samples per period of the cut-off that reach the estimator
 _KEPT_EVERY = 0.1  # [s] between the states that a change may go back to
 _KEPT = 30  # ... and how many of them there are
 _REOPENED = 0.1  # share of its prior spread that everything may have changed by
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What is known at one moment.
-
-    Attributes:
-        t: The moment that it refers to: the newest sample's, less the delay [s].
-        theta: Base parameters, shape (b,).
-        std_error: Their standard errors, shape (b,).
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        excitation: Share of the parameters' prior variance that the motion so far has removed, mean
-            over the parameters, 0 to 1.
-        converged: Whether the parameters' uncertainty adds less than half a noise level to the
-            torque that they predict.
-    """
-
-    t: float
-    theta: Array
-    std_error: Array
-    sigma: Array
-    excitation: float
-    converged: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """A step change of the parameters.
-
-    Attributes:
-        flagged: When it was flagged, on the clock of the samples [s].
-        onset: When it happened, by the evidence [s].
-        theta: Base parameters before it, shape (b,).
-        covariance: Their covariance, shape (b, b).
-    """
-
-    flagged: float
-    onset: float
-    theta: Array
-    covariance: Array
 
 
 class OnlineIdentifier:
@@ -101,9 +61,7 @@ class OnlineIdentifier:
         self._signals = LiveSignals(n, s.rate, s.cutoff, s.order, turns)
         self.delay = self._signals.delay
         self._every = max(1, int(s.rate / (_OVERSAMPLED * s.cutoff)))
-        self._dt = self._every / s.rate  # [s] between two steps of the estimator
-        # rows behind the filter are not independent
-        self._share = min(1.0, 2.0 * s.cutoff * self._dt)
+        self._pace()
         self._regressor = InstantRegressor(model, self.mapping.independent)
         self._skipped, self._t, self._now = 0, -np.inf, -np.inf
         self._early: list[Instant] = []
@@ -137,7 +95,9 @@ class OnlineIdentifier:
         elif len(rest) == 3:
             v, a, tau = rest
             self._check(t, q, v, a, tau)
-            self.delay = 0.0
+            if self.delay:  # nothing is filtered here, and nothing left out
+                self.delay, self._every = 0.0, 1
+                self._pace()
             self._take((t, np.asarray(q), np.asarray(v), np.asarray(a), np.asarray(tau)), t)
             self._now = t
         else:
@@ -211,6 +171,11 @@ class OnlineIdentifier:
                 f"the {self.settings.warmup:g} s of the warm-up"
             )
         return self._kalman
+
+    def _pace(self) -> None:
+        self._dt = self._every / self.settings.rate  # [s] between two steps of the estimator
+        # rows behind a filter are not independent
+        self._share = min(1.0, 2.0 * self.settings.cutoff * self._dt)
 
     def _check(self, t: float, *arrays: Array) -> None:
         n = len(self.model.joints)

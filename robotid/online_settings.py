@@ -1,10 +1,11 @@
-"""How an online identification runs."""
+"""How an online identification runs, and what it tells."""
 
 from dataclasses import dataclass
 
+from robotid._typing import Array
 from robotid.exceptions import SettingsError
 
-__all__ = ["OnlineSettings"]
+__all__ = ["Change", "OnlineSettings", "Reading"]
 
 
 @dataclass(frozen=True)
@@ -44,3 +45,43 @@ class OnlineSettings:
         for key in ("min_velocity", "walk", "model_error"):
             if not getattr(self, key) >= 0:
                 raise SettingsError(f"{key} is {getattr(self, key)}, wanted 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What is known at one moment.
+
+    Attributes:
+        t: The moment that it refers to: the newest sample's, less the delay [s].
+        theta: Base parameters, shape (b,).
+        std_error: Their standard errors, shape (b,).
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        excitation: Share of the parameters' prior variance that the motion so far has removed, mean
+            over the parameters, 0 to 1.
+        converged: Whether the parameters' uncertainty adds less than half a noise level to the
+            torque that they predict.
+    """
+
+    t: float
+    theta: Array
+    std_error: Array
+    sigma: Array
+    excitation: float
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A step change of the parameters.
+
+    Attributes:
+        flagged: When it was flagged, on the clock of the samples [s].
+        onset: When it happened, by the evidence [s].
+        theta: Base parameters before it, shape (b,).
+        covariance: Their covariance, shape (b, b).
+    """
+
+    flagged: float
+    onset: float
+    theta: Array
+    covariance: Array

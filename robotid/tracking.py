@@ -12,8 +12,8 @@ from robotid.data import Log
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.job import Job
 from robotid.model import RobotModel
-from robotid.online import OnlineIdentifier, Reading
-from robotid.online_settings import OnlineSettings
+from robotid.online import OnlineIdentifier
+from robotid.online_settings import OnlineSettings, Reading
 from robotid.result import file_sha256, write_json
 from robotid.table_files import load_pyarrow, write_table
 

@@ -74,13 +74,15 @@ def test_without_a_change_none_is_flagged_and_it_converges(panda):
 def test_smooth_motion_can_be_given_as_it_is(ur5, rng):
     noise = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
     log = exact_log(ur5, truth(ur5), rng, samples=2000, rate=50.0, noise=0.1 * noise)
-    identifier = OnlineIdentifier(ur5, OnlineSettings(rate=50.0, cutoff=12.5))
+    # a cut-off of 2 Hz would leave two of three filtered samples out; these are all taken
+    identifier = OnlineIdentifier(ur5, OnlineSettings(rate=50.0, cutoff=2.0))
     for k in range(len(log.t)):
         identifier.update(log.t[k], log.q[k], log.v[k], log.a[k], log.tau[k])
     reading = identifier.reading
     assert identifier.delay == 0.0
     assert reading.t == log.t[-1]
     assert identifier.changes == ()
+    assert identifier.estimate.n_iter == len(log.t)
     error = np.abs(reading.theta - identifier.mapping.to_base(truth(ur5))) / reading.std_error
     assert np.sqrt(np.mean(error**2)) < 1.5
     np.testing.assert_allclose(reading.sigma, 0.1 * noise, rtol=0.3)
