@@ -72,6 +72,14 @@ def _parser() -> argparse.ArgumentParser:
     _add_job_flags(identify)
     identify.set_defaults(run=_identify)
 
+    track = commands.add_parser("track", help="run over a log as if live: history, step changes")
+    track.add_argument("source", metavar="URDF")
+    track.add_argument("logs", nargs=1, metavar="LOG")
+    track.add_argument("--out", default="robotid-track", metavar="DIR", help="folder to write to")
+    track.add_argument("--json", action="store_true", help="print track.json")
+    _add_log_flags(track.add_argument_group("the log"))
+    track.set_defaults(run=_track, validate=[], estimator=None)
+
     validate = commands.add_parser("validate", help="measure a result's prediction on other logs")
     validate.add_argument("result", metavar="RESULT.json")
     validate.add_argument("logs", nargs="+", metavar="LOG")
@@ -83,14 +91,15 @@ def _parser() -> argparse.ArgumentParser:
 def _add_job_flags(parser: argparse.ArgumentParser) -> None:
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
     flags.add_argument("--validate", nargs="+", default=[], metavar="LOG", help="logs kept apart")
+    names = "consistent (default), wls, ols, rls, kalman, prx or gradient"
+    flags.add_argument("--estimator", metavar="NAME", help=names)
+    _add_log_flags(flags)
+
+
+def _add_log_flags(flags: "argparse._ArgumentGroup") -> None:
     flags.add_argument("--joints", metavar="A,B,...", help="joints to identify, in order")
     flags.add_argument("--lock", action="append", default=[], metavar="JOINT=POSITION")
     flags.add_argument("--gain", action="append", default=[], metavar="JOINT=N_M_PER_A")
-    flags.add_argument(
-        "--estimator",
-        metavar="NAME",
-        help="consistent (default), wls, ols, rls, kalman, prx or gradient",
-    )
     flags.add_argument("--rate", type=float, metavar="HZ", help="grid to resample to")
     flags.add_argument("--cutoff", metavar="HZ", help="of the low-pass filter, or false")
     flags.add_argument("--friction", metavar="MODEL", help="none, viscous or viscous+coulomb")
@@ -157,6 +166,30 @@ def _identify(options: argparse.Namespace) -> None:
         return
     _print_result(result)
     _print_files(options.out, [*result["outputs"].values(), "result.json"])
+
+
+def _track(options: argparse.Namespace) -> None:
+    from robotid.tracking import run_track
+
+    found = run_track(_job(options), options.out)
+    if options.json:
+        print(json.dumps(found, allow_nan=False))
+        return
+    converged = found["converged_at"]
+    when = "not converged" if converged is None else f"converged at {converged:.2f} s"
+    print(
+        f"{found['robot']}: {found['samples']} samples, estimate {1e3 * found['delay']:.0f} ms "
+        f"behind, {when}, excitation {found['excitation']:.2f}"
+    )
+    for change in found["changes"]:
+        load = change["payload"]
+        print(
+            f"step change at {change['onset']:.2f} s, flagged at {change['flagged']:.2f} s; as a "
+            f"load on {load['body']}: {load['mass']:.2f} +- {load['std_error']:.2f} kg"
+        )
+    for entry in found["base_parameters"]:
+        print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
+    _print_files(options.out, [found["history"], "track.json"])
 
 
 def _validate(options: argparse.Namespace) -> None:

@@ -14,7 +14,13 @@ from robotid.exceptions import DataError
 from robotid.model import RobotModel
 from robotid.problem import Block, Problem
 
-__all__ = ["build_problem", "joint_torque_regressor", "mass_regressor", "random_regressor"]
+__all__ = [
+    "InstantRegressor",
+    "build_problem",
+    "joint_torque_regressor",
+    "mass_regressor",
+    "random_regressor",
+]
 
 _BLOCK = 512  # samples per block: fits in the cache with 100 columns
 
@@ -75,6 +81,75 @@ def mass_regressor(model: RobotModel, q: Array) -> Array:
         unit = still + np.eye(n)[j]
         D[:, :, j] = joint_torque_regressor(model, q, still, unit).reshape(N, n, -1) - at_rest
     return D
+
+
+class InstantRegressor:
+    """The regressor of one instant at a time, without setting anything up anew.
+
+    Args:
+        model: The robot, with a fixed base.
+        columns: Indices of the standard parameters wanted, shape (c,).
+
+    Raises:
+        DataError: If the base floats.
+    """
+
+    def __init__(self, model: RobotModel, columns: Array) -> None:
+        if model.free_flyer:
+            raise DataError("a robot with a floating base has no row regressor of joints alone")
+        self._model, self._data = model, model.pin_model.createData()
+        self._columns = np.asarray(columns)
+        G = model.velocity_map
+        self._map = None if np.array_equal(G, np.eye(len(G))) else G
+        self._is_plain = self._map is None and not model.position_offset.any()
+        self._is_plain &= model.pin_model.nq == model.pin_model.nv
+        layout = model.layout
+        self._Y = np.zeros((model.n_rows, len(layout.names)))
+        # place of each drive term of each joint, couplings aside: they follow behind
+        count = len(layout.terms)
+        joints = np.arange(len(layout.joints))
+        self._places = [layout.n_inertial + joints * count + k for k in range(count)]
+
+    def __call__(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the regressor of one instant.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+            v: Velocities, shape (n,) [rad/s, m/s].
+            a: Accelerations, shape (n,) [rad/s^2, m/s^2].
+
+        Returns:
+            Regressor, shape (n, c); the same as that of :func:`joint_torque_regressor`.
+        """
+        model, layout, Y = self._model, self._model.layout, self._Y
+        x = q if self._is_plain else model.configurations(q[None])[0]
+        if self._map is None:
+            inertial = pin.computeJointTorqueRegressor(model.pin_model, self._data, x, v, a)
+        else:
+            G = self._map
+            inertial = G.T @ pin.computeJointTorqueRegressor(
+                model.pin_model, self._data, x, G @ v, G @ a
+            )
+        Y[:, : layout.n_inertial] = inertial
+        rows = np.arange(len(v))
+        for term, place in zip(layout.terms, self._places, strict=True):
+            Y[rows, place] = _drive_term(term, v, a)
+        if layout.couplings:
+            Y[:, layout.n_inertial :] = _drive_columns(model, v[None], a[None])[0]
+        return Y[:, self._columns]
+
+    def mass(self, q: Array) -> Array:
+        """Return the regressor of the mass matrix; see :func:`mass_regressor`.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+
+        Returns:
+            Regressor, shape (n, n, c).
+        """
+        still, unit = np.zeros(len(q)), np.eye(len(q))
+        at_rest = self(q, still, still)
+        return np.stack([self(q, still, a) - at_rest for a in unit], axis=1)
 
 
 def build_problem(

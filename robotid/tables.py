@@ -14,7 +14,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 
-__all__ = ["column_names", "read_columns", "write_columns"]
+__all__ = ["column_names", "load_pyarrow", "read_columns", "write_columns"]
 
 
 def column_names(path: Path) -> list[str]:
@@ -177,8 +177,18 @@ def _write_csv(table: Mapping[str, Array], path: Path) -> None:
         writer.writerows(row.tolist() for row in rows)
 
 
-def _pyarrow(purpose: str) -> ModuleType:
-    """Return pyarrow, with its parquet loaded."""
+def load_pyarrow(purpose: str) -> ModuleType:
+    """Return pyarrow, with its parquet loaded.
+
+    Args:
+        purpose: What it is needed for, as "reading Parquet".
+
+    Returns:
+        The package.
+
+    Raises:
+        MissingDependencyError: If it is not installed.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -191,7 +201,7 @@ def _pyarrow(purpose: str) -> ModuleType:
 @contextmanager
 def _open_parquet(path: Path) -> Iterator[Any]:
     """Open a Parquet file; what is wrong with it is told in our words."""
-    pa = _pyarrow("reading Parquet")
+    pa = load_pyarrow("reading Parquet")
     try:
         with pa.parquet.ParquetFile(path) as file:
             yield file
@@ -207,7 +217,7 @@ def _parquet_names(path: Path) -> list[str]:
 
 def _read_parquet(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
     """Return the wanted columns of a Parquet file; null becomes NaN."""
-    types = _pyarrow("reading Parquet").types
+    types = load_pyarrow("reading Parquet").types
     with _open_parquet(path) as file:
         for name in wanted:
             kind = file.schema_arrow.field(name).type
@@ -219,5 +229,5 @@ def _read_parquet(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
 
 def _write_parquet(table: Mapping[str, Array], path: Path) -> None:
     """Write columns as Parquet."""
-    pa = _pyarrow("writing Parquet")
+    pa = load_pyarrow("writing Parquet")
     pa.parquet.write_table(pa.table(dict(table)), path)

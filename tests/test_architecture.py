@@ -16,14 +16,15 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem program proximity kinematics metrics xml_splice examples tables",
-    2: "factors units model signals base_parameters verdict planar_2r procedure",
+    1: "parameters data problem program proximity kinematics metrics xml_splice examples tables "
+    "innovations online_settings",
+    2: "factors units model signals live_signals base_parameters verdict planar_2r procedure",
     3: "log_files estimators regressor plant lumping prior",
     4: "excitation validation sidecar estimator_settings simulation dynamics",
     5: "identification closed_loop",
-    6: "urdf job visualization report_plots paper_simulation paper_trajectories",
+    6: "online urdf job visualization report_plots paper_simulation paper_trajectories",
     7: "report_page result inspection paper_errata",
-    8: "report_tables paper_plots paper_page",
+    8: "report_tables paper_plots paper_page tracking",
     9: "report paper",
     10: "workflow",
     11: "demo",

@@ -7,7 +7,15 @@ from robotid.examples import example_urdf
 from robotid.exceptions import DataError
 from robotid.model import RobotModel
 from robotid.parameters import Coupling
-from robotid.regressor import build_problem, joint_torque_regressor, random_regressor
+from robotid.problem import Sample, concatenate, shuffled
+from robotid.regressor import (
+    InstantRegressor,
+    build_problem,
+    joint_torque_regressor,
+    mass_regressor,
+    random_regressor,
+)
+from robotid.simulation import another_robot
 
 ROBOTS = ["ur5_robot.urdf", "double_pendulum_continuous.urdf", "kinova.urdf", "tiago_no_hand.urdf",
           "borinot_flying_arm_2.urdf", "finger_edu.urdf"]  # fmt: skip
@@ -125,3 +133,63 @@ def test_a_trajectory_of_other_joints_is_refused(ur5, panda, rng):
         build_problem(ur5, trajectory(ur5, rng), np.ones(3))
     with pytest.raises(DataError, match=r"v and a have shapes"):
         joint_torque_regressor(ur5, np.zeros((2, 6)), np.zeros((2, 5)), np.zeros((2, 6)))
+
+
+@pytest.mark.parametrize("robot", ["ur5", "panda"])
+def test_the_regressor_of_one_instant_is_that_of_many(robot, request, rng):
+    model = request.getfixturevalue(robot)
+    n, p = len(model.joints), len(model.layout.names)
+    q, v, a = rng.uniform(-1, 1, (3, 5, n))
+    columns = np.arange(0, p, 2)
+    instant = InstantRegressor(model, columns)
+    expected = joint_torque_regressor(model, q, v, a).reshape(5, n, p)[..., columns]
+    for k in range(5):
+        np.testing.assert_allclose(instant(q[k], v[k], a[k]), expected[k], atol=1e-14)
+    D = mass_regressor(model, q)[..., columns]
+    np.testing.assert_allclose(instant.mass(q[2]), D[2], atol=1e-14)
+
+
+def test_the_regressor_of_one_instant_knows_couplings_order_and_mimic(rng):
+    names = ["wrist_3_joint", "elbow_joint", "wrist_2_joint"]
+    coupling = Coupling("motor", (("wrist_3_joint", 1.0), ("wrist_2_joint", -0.5)))
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=names, couplings=[coupling])
+    q, v, a = rng.uniform(-1, 1, (3, 1, 3))
+    everything = np.arange(len(model.layout.names))
+    instant = InstantRegressor(model, everything)
+    expected = joint_torque_regressor(model, q, v, a)
+    np.testing.assert_allclose(instant(q[0], v[0], a[0]), expected, atol=1e-14)
+
+
+def test_the_mass_regressor_gives_the_mass_matrix_with_armature(ur5, rng):
+    pi = another_robot(ur5, rng)
+    q = rng.uniform(-1, 1, (4, 6))
+    D = mass_regressor(ur5, q) @ pi
+    other = ur5.with_parameters(pi).pin_model
+    armature = [pi[ur5.layout.names.index(f"{j}.armature")] for j in ur5.joints]
+    for k in range(4):
+        M = pin.crba(other, other.createData(), q[k])
+        M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)
+        np.testing.assert_allclose(D[k], M, atol=1e-12 * np.abs(M).max())
+
+
+def test_a_problem_carries_the_mass_regressor_through_selection_and_concatenation(ur5, rng):
+    q, v, a = rng.uniform(-1, 1, (3, 7, 6))
+    t = np.arange(7.0)
+    trajectory = Trajectory(t, q, v, a, a, ur5.joints, None, np.zeros(7, dtype=int))
+    problem = build_problem(ur5, trajectory, with_mass=True)
+    chosen = concatenate([problem.select(np.array([3, 5]))] * 2)
+    samples = list(chosen.samples())
+    assert len(samples) == 14
+    D = mass_regressor(ur5, q)[..., [3, 5]]
+    np.testing.assert_array_equal(samples[8].mass_regressor, D[1])
+    plain = build_problem(ur5, trajectory)
+    assert next(concatenate([problem, plain]).samples()).mass_regressor is None
+    assert next(plain.select(np.array([3])).samples()).mass_regressor is None
+
+
+def test_samples_are_shuffled_without_loss(rng):
+    one = np.ones((1, 1))
+    samples = [Sample(one, np.array([float(k)]), one[0]) for k in range(20_000)]
+    found = [int(s.tau[0]) for s in shuffled(samples, rng)]
+    assert sorted(found) == list(range(20_000))
+    assert np.mean(np.abs(np.array(found) - np.arange(20_000))) > 1000

@@ -6,6 +6,7 @@ e = Psi P^ - tau, the paper's sign.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from robotid.problem import Problem, Sample, shuffled
 
 __all__ = [
     "DescentState",
+    "Rows",
     "advance",
     "column_scale",
     "descent_estimate",
@@ -24,6 +26,11 @@ __all__ = [
     "run_passes",
     "start_state",
 ]
+
+#: Rows of a sample: all, or the indices of those of positive weight.
+Rows: TypeAlias = slice | Array
+#: Change of x from Psi (k, c), e (k,) and the rows, all in units of their noise.
+Step: TypeAlias = Callable[[Array, Array, Rows], Array]
 
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), so that the start fades as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
@@ -105,7 +112,7 @@ def advance(
     sample: Sample,
     sigma: Array,
     scale: Array | None,
-    step: Callable[[Array, Array, Array], Array],
+    step: Step,
     *,
     average: bool,
     eps2: float,
@@ -135,7 +142,8 @@ def advance(
     steps = state.steps + 1
     if np.vdot(Psi, Psi) <= eps2:
         return replace(state, steps=steps, skipped=state.skipped + 1)
-    used = np.flatnonzero(sample.weight)
+    # all rows at once is the usual case, and a slice is cheap
+    used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
     x = state.x - step(Psi, Psi @ state.x - tau, used)
     mean = state.mean + (x - state.mean) * (_AVERAGE / (steps + _AVERAGE - 1)) if average else x
     # how good the estimate was for this sample, before the sample changed it

@@ -7,6 +7,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators.descent import (
     DescentState,
+    Rows,
     advance,
     column_scale,
     descent_estimate,
@@ -92,7 +93,7 @@ class NormalisedGradient(RecursiveEstimator[DescentState]):
             DataError: If the sample is not finite or of another shape; the state stays valid.
         """
 
-        def step(Psi: Array, e: Array, used: Array) -> Array:
+        def step(Psi: Array, e: Array, used: Rows) -> Array:
             change: Array = self.step_size / (self.regularisation + np.vdot(Psi, Psi)) * (e @ Psi)
             return change
 

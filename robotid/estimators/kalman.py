@@ -1,6 +1,6 @@
 """Kalman filter whose parameters walk at random."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
@@ -45,9 +45,11 @@ class KalmanState:
 class Kalman(RecursiveEstimator[KalmanState]):
     """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
 
-    The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K S K^T, multiplied
-    out so that each product has only n columns. A row whose innovation is improbable is turned
-    away and counted; a joint that is turned away 50 times in a row is believed again.
+    The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
+    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. It is as forgiving of an
+    inexact K, symmetric to the last bit, and its products have only n columns. A row whose
+    innovation is improbable is turned away and counted; a joint that is turned away 50 times in a
+    row is believed again.
 
     Attributes:
         sigma: Noise level of each joint, shape (n,) [N m or N].
@@ -129,23 +131,27 @@ class Kalman(RecursiveEstimator[KalmanState]):
         Y, e = rows[:, :c], rows[:, c] - rows[:, :c] @ state.theta  # (k, c), (k,)
         P = self._walked(state.P)
         PY = P @ Y.T  # (c, k)
-        S = Y @ PY  # (k, k), of the prediction
-        kept = self._passes(e, np.diag(S), state.in_a_row[used])
+        T = Y @ PY  # (k, k), covariance of the prediction, then of the innovation
+        kept = self._passes(e, np.diag(T), state.in_a_row[used])
         if not kept.all():
-            Y, e, PY, S = Y[kept], e[kept], PY[:, kept], S[np.ix_(kept, kept)]
-        seen = _count(state, used, kept)
-        if not kept.any():
-            return replace(seen, P=P)
-        K = np.linalg.solve(S + np.eye(len(S)), PY.T).T  # (c, k)
-        theta = state.theta + K @ e
-        residual = e - S @ np.linalg.solve(S + np.eye(len(S)), e)
-        half = P - K @ PY.T  # (1 - K Y) P
-        P = half - (half @ Y.T) @ K.T + K @ K.T
-        P = (P + P.T) / 2
+            Y, e, PY, T = Y[kept], e[kept], PY[:, kept], T[np.ix_(kept, kept)]
+        T.flat[:: len(T) + 1] += 1.0
+        solved = np.linalg.solve(T, np.column_stack([PY.T, e])) if len(T) else np.zeros((0, c + 1))
+        K, residual = solved[:, :c].T, solved[:, c]  # (c, k), (k,): tau - Y theta afterwards
+        A = K @ (PY - K @ T / 2).T
+        rows, gated, in_a_row = _count(state, used, kept)
         products = state.products.copy()
         taken = used[kept]
         products[taken] += scale[taken] ** 2 / sample.weight[taken] * e * residual
-        return replace(seen, theta=theta, P=P, products=products)
+        return KalmanState(
+            state.theta + K @ e,
+            P - (A + A.T),  # symmetric to the last bit
+            products,
+            rows,
+            gated,
+            in_a_row,
+            state.steps + 1,
+        )
 
     def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
         """Return the estimate that a state holds; see :meth:`RecursiveEstimator.estimate`.
@@ -219,10 +225,13 @@ class Kalman(RecursiveEstimator[KalmanState]):
         return passes
 
 
-def _count(state: KalmanState, used: Array, kept: Array) -> KalmanState:
-    """Return the state with its rows counted: taken, or turned away."""
-    rows, gated, in_a_row = state.rows.copy(), state.gated.copy(), state.in_a_row.copy()
+def _count(state: KalmanState, used: Array, kept: Array) -> tuple[Array, Array, Array]:
+    """Return the rows taken, turned away, and turned away since the last one taken."""
+    rows = state.rows.copy()
     rows[used] += kept
+    if kept.all() and not state.in_a_row.any():
+        return rows, state.gated, state.in_a_row
+    gated, in_a_row = state.gated.copy(), state.in_a_row.copy()
     gated[used] += ~kept
     in_a_row[used] = np.where(kept, 0, in_a_row[used] + 1)
-    return replace(state, rows=rows, gated=gated, in_a_row=in_a_row, steps=state.steps + 1)
+    return rows, gated, in_a_row

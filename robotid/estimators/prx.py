@@ -7,6 +7,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators.descent import (
     DescentState,
+    Rows,
     advance,
     column_scale,
     descent_estimate,
@@ -114,7 +115,7 @@ class PRX(RecursiveEstimator[DescentState]):
                 the state stays valid.
         """
 
-        def step(Psi: Array, e: Array, used: Array) -> Array:
+        def step(Psi: Array, e: Array, used: Rows) -> Array:
             if self.step == "printed" or self.metric == "mass":
                 return self._massive_step(state, sample, used)
             if self.metric == "noise":
@@ -167,7 +168,7 @@ class PRX(RecursiveEstimator[DescentState]):
         )
         return replace(estimator.estimate(state, problem.names), converged=converged)
 
-    def _massive_step(self, state: DescentState, sample: Sample, used: Array) -> Array:
+    def _massive_step(self, state: DescentState, sample: Sample, used: Rows) -> Array:
         """Return the step with eta = D^-1 e (20), rows as the paper has them."""
         Psi = sample.Y[used] if self.scale is None else sample.Y[used] / self.scale
         values, vectors = self._inertia(state, sample)

@@ -1,6 +1,7 @@
 """The interface of recursive estimators: a state, one sample at a time."""
 
 import json
+import math
 import os
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -132,7 +133,7 @@ def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
     if not sample.weight.all():
         rows = rows[sample.weight != 0]
     # one sum is the cheapest test: it is finite unless an entry is not
-    if not np.isfinite(rows.sum()):
+    if not math.isfinite(rows.sum()):
         raise DataError(
             "the sample is not finite, so it was refused; the state before it is still valid"
         )
