@@ -170,10 +170,10 @@ def _reason(case: str, errors: Array) -> str:
     if case == "on_program":
         return "slow: every run follows the same curve, which excites the parameters too little"
     return (
-        "A disturbance v enters eta = D^-1 (Psi P~ + v), and the step (24) does not shrink with "
-        "it: the estimate does not settle but stays within a band about the truth as wide as the "
-        "disturbance relative to the torque. Small samples weigh as much as large ones, since "
-        "the step is normalised by |Psi|^2; a larger eps2 leaves them out."
+        "A disturbance v enters the deviation, η = D⁻¹(ΨP̃ + v), and the step (24) does not shrink "
+        "with it: the estimate does not settle but stays in a band about the truth, as wide as v "
+        "is large. Small samples weigh as much as large ones, since the step is divided by |Ψ|²; "
+        "a larger ε₂ leaves them out."
     )
 
 
@@ -203,6 +203,7 @@ def _write(target: Path, content: Mapping[str, Any], figures: Mapping[str, Any])
         with matplotlib.rc_context(STYLE):
             for name, figure in figures.items():
                 figure.savefig(beside / f"{name}.png", dpi=150, facecolor="white")
+                figure.set_layout_engine("none")  # it is laid out now
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
                 shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")

@@ -107,7 +107,7 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
     return [Erratum(*text, *sizes) for text, *sizes in zip(texts, *largest, strict=True)]
 
 
-def energy_drift(*, duration: float = 10.0, dt: float = 2e-3) -> EnergyDrift:
+def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
     """Return the energy of each model in free motion, which a rigid arm keeps.
 
     Args:

@@ -24,7 +24,11 @@ __all__ = [
 
 # readable on white and on black
 _COLOURS = ("#0b7fd1", "#d4622a", "#23985f", "#b08400", "#b5539c")
+_STYLES = ("-", "--", ":")  # of models whose curves lie on each other
 _SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
+_WIDTH = 9.3  # [inch] of every figure
+_FONT = 8.5  # [pt]
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def figure_3(joint: int) -> Any:  # noqa: ANN401
@@ -62,19 +66,22 @@ def figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
     References:
         Tzvetkova, (21).
     """
-    figure, row = _figure(len(studies), height=3.0, share=True)
-    for axes, study in zip(row, studies, strict=True):
+    figure, rows = _grid(2, len(studies), height=4.4, share=True)
+    for upper, lower, study in zip(*rows, studies, strict=True):
         kept = study.history.torques
-        torques: Sequence[Array] = [] if kept is None else list(kept)
+        torques: Sequence[Array] = [] if kept is None else list(kept[:, :, 0, joint])
         for number, colour in zip(_SHOWN, _COLOURS, strict=True):
             if number <= len(torques):
-                u = torques[number - 1][:, 0, joint]
+                u = torques[number - 1]
                 t = np.arange(len(u)) * DURATION / len(u)
-                axes.plot(t, u, color=colour, lw=1.0, label=f"iteration {number}")
-        axes.plot(*_control(study, joint), "--", color=INK, lw=1.2, label="program control")
-        axes.set(xlabel="time [s]", title=study.name)
-    row[0].set_ylabel(f"torque u{joint + 1} [N m]")
-    _legend(figure, row[0])
+                upper.plot(t, u, color=colour, lw=1.0, label=f"iteration {number}")
+                lower.plot(t, u - torques[-1], color=colour, lw=1.0)
+        upper.plot(*_control(study, joint), "--", color=INK, lw=1.2, label="program control")
+        upper.set_title(study.name, fontsize=_FONT)
+        lower.set_xlabel("time [s]")
+    rows[0][0].set_ylabel(f"torque u{joint + 1} [N m]")
+    rows[1][0].set_ylabel("less the last iteration [N m]")
+    _legend(figure, rows[0][0])
     return figure
 
 
@@ -96,7 +103,8 @@ def figure_5(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
         for i, name in enumerate(study.dynamics.names):
             axes.plot(study.history.estimates[:, 0, i], color=colour[name], lw=1.3, label=name)
             axes.axhline(study.P[i], color=colour[name], lw=0.8, ls=":")
-        axes.set(xlabel="iteration", title=study.name)
+        axes.set_xlabel("iteration")
+        axes.set_title(study.name, fontsize=_FONT)
     row[0].set_ylabel("estimate [kg m²]; dotted: true")
     _legend(figure, row[0])
     return figure
@@ -115,13 +123,16 @@ def convergence_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
         Tzvetkova, (23).
     """
     figure, (left, right) = _figure(2, height=3.2)
-    for study, colour in zip(studies, _COLOURS, strict=False):
+    for study, colour, style in zip(studies, _COLOURS, _STYLES, strict=False):
         numbers = np.arange(1, len(study.history.prx) + 1)
-        left.semilogy(numbers, study.history.prx[:, 0], color=colour, lw=1.3, label=study.name)
-        right.semilogy(study.errors(), color=colour, lw=1.3)
-        right.semilogy(study.errors("on_program"), "--", color=colour, lw=1.0)
+        prx = study.history.prx[:, 0]
+        left.semilogy(numbers, prx, style, color=colour, lw=1.6, label=study.name)
+        right.semilogy(study.errors(), style, color=colour, lw=1.6)
+        right.semilogy(study.errors("on_program"), style, color=colour, lw=0.8)
     left.set(xlabel="iteration", ylabel="largest entry of PRX [N m/s²]")
-    right.set(xlabel="iteration", ylabel="|P̂ − P| / |P|; dashed: start on program")
+    right.set(xlabel="iteration", ylabel="|P̂ − P| / |P|; thin: start on program")
+    for axes in (left, right):
+        _label_decades(axes)
     _legend(figure, left)
     return figure
 
@@ -142,7 +153,9 @@ def disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
         for (case, label), colour in zip(shown.items(), _COLOURS, strict=False):
             if case in CASES:
                 axes.semilogy(study.errors(case), color=colour, lw=1.1, label=label)
-        axes.set(xlabel="iteration", title=study.name)
+        axes.set_xlabel("iteration")
+        axes.set_title(study.name, fontsize=_FONT)
+        _label_decades(axes)
     row[0].set_ylabel("|P̂ − P| / |P|")
     _legend(figure, row[0])
     return figure
@@ -162,7 +175,8 @@ def trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
         most, count = len(found.errors) - 1, len(found.guess)
         axes.hist(found.iterations, bins=np.linspace(0, most, 31), color=colour)
         left = count - len(found.iterations)
-        axes.set(xlabel="iterations to 10⁻³", title=f"{name}: {count - left} of {count} converged")
+        axes.set_xlabel("iterations to 10⁻³")
+        axes.set_title(f"{name}: {count - left} of {count} converged", fontsize=_FONT)
     row[0].set_ylabel("random motions")
     return figure
 
@@ -191,17 +205,39 @@ def _control(study: ModelStudy, joint: int) -> tuple[Any, Any]:
 
 def _figure(columns: int, *, height: float, share: bool = False) -> tuple[Any, Any]:
     """Return a figure and its axes side by side."""
+    figure, rows = _grid(1, columns, height=height, share=share)
+    return figure, rows[0]
+
+
+def _grid(lines: int, columns: int, *, height: float, share: bool = False) -> tuple[Any, Any]:
+    """Return a figure and its axes, line by line; the axes of a line may share their scale."""
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(3.1 * max(columns, 2), height), layout="constrained")
-        row = figure.subplots(1, columns, squeeze=False, sharey=share)[0]
-        for axes in row:
+        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        sharey: Any = "row" if share else False
+        rows = figure.subplots(lines, columns, squeeze=False, sharey=sharey)
+        for axes in rows.flat:
             axes.grid(visible=True)
-        return figure, row
+        return figure, rows
 
 
 def _legend(figure: Any, axes: Any) -> None:  # noqa: ANN401
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), frameon=False)
+    place = {"loc": "outside upper left", "ncols": len(labels)}
+    figure.legend(handles, labels, frameon=False, fontsize=_FONT, labelcolor=INK, **place)
+
+
+def _label_decades(axes: Any) -> None:  # noqa: ANN401
+    """Write the decades as 10⁻³: Matplotlib's own labels need its mathematics, which is off."""
+    axes.yaxis.set_major_formatter(_power)
+    axes.yaxis.set_minor_formatter(_nothing)
+
+
+def _power(value: float, _: int) -> str:
+    return "10" + str(round(np.log10(value))).translate(_RAISED)
+
+
+def _nothing(_value: float, _position: int) -> str:
+    return ""
