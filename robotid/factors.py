@@ -16,7 +16,7 @@ import scipy.linalg.lapack
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.lapack import fold
+from robotid.lapack import Triangle
 from robotid.problem import Problem, RowSource
 
 __all__ = ["Factors", "compress", "merge"]
@@ -105,17 +105,18 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """
     n, c = problem.n_joints, len(problem.names)
     active = [np.append(np.flatnonzero(problem.support[j]), c) for j in range(n)]
-    R = [np.zeros((len(columns), len(columns)), order="F") for columns in active]
+    triangles = [Triangle(len(columns)) for columns in active]
     if problem.sources:
         rows = np.sum([source.rows for source in problem.sources], axis=0)
-        _fold_sources(R, active, problem, threads)
+        _fold_sources(triangles, active, problem, threads)
     else:
-        rows = _fold_blocks(R, active, problem)
-    if not all(np.isfinite(R_j).all() for R_j in R):  # what is not finite stays so in R
+        rows = _fold_blocks(triangles, active, problem)
+    # what is not finite in a row is not finite in R
+    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
         raise DataError("the problem holds a row that is not finite; check the trajectory")
     dense = np.zeros((n, c + 1, c + 1))
     for j, columns in enumerate(active):
-        dense[j][np.ix_(columns, columns)] = R[j]
+        dense[j][np.ix_(columns, columns)] = triangles[j].R
     return Factors(dense, rows, problem.names)
 
 
@@ -145,7 +146,7 @@ def merge(factors: Sequence[Factors]) -> Factors:
     return Factors(R, np.sum([f.rows for f in factors], axis=0), first.names)
 
 
-def _fold_blocks(R: Sequence[Array], active: Sequence[Array], problem: Problem) -> Array:
+def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem) -> Array:
     """Fold whole blocks into the factors; return the number of rows per joint."""
     n = problem.n_joints
     rows = np.zeros(n, dtype=int)
@@ -159,12 +160,15 @@ def _fold_blocks(R: Sequence[Array], active: Sequence[Array], problem: Problem) 
             scaled[:, :-1] = by_joint[used, j][:, columns[:-1]]
             scaled[:, -1] = torque[used, j]
             scaled *= root[used, j, None]
-            fold(R[j], scaled)
+            triangles[j].fold(scaled)
     return rows
 
 
 def _fold_sources(
-    R: Sequence[Array], active: Sequence[Array], problem: Problem, threads: int | None
+    triangles: Sequence[Triangle],
+    active: Sequence[Array],
+    problem: Problem,
+    threads: int | None,
 ) -> None:
     """Fold the rows of each source into the factors, part by part."""
     c = len(problem.names)
@@ -174,10 +178,10 @@ def _fold_sources(
             for columns, own in zip(active, source.columns, strict=True)
         ]
         for part in _parts(source, threads):
-            for R_j, place, part_j in zip(R, places, part, strict=True):
-                rows = np.zeros((len(place), len(R_j)), order="F")
-                rows[:, place] = part_j
-                fold(R_j, rows)
+            for triangle, place, R_j in zip(triangles, places, part, strict=True):
+                rows = np.zeros((len(place), len(triangle.R)), order="F")
+                rows[:, place] = R_j
+                triangle.fold(rows)
 
 
 def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
@@ -192,11 +196,11 @@ def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
 
 
 def _fold_part(source: RowSource, start: int) -> list[Array]:
-    R = [np.zeros((len(own) + 1, len(own) + 1), order="F") for own in source.columns]
+    triangles = [Triangle(len(own) + 1) for own in source.columns]
     for block in source.blocks(start, min(start + _PART, source.samples)):
-        for R_j, rows in zip(R, block, strict=True):
-            fold(R_j, rows)
-    return R
+        for triangle, rows in zip(triangles, block, strict=True):
+            triangle.fold(rows)
+    return [triangle.R for triangle in triangles]
 
 
 def _cores() -> int:

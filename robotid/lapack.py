@@ -15,42 +15,64 @@ import scipy.linalg.lapack
 
 from robotid._typing import Array
 
-__all__ = ["fold"]
+__all__ = ["Triangle"]
 
 _PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns
 
 
-def fold(R: Array, rows: Array) -> None:
-    """Replace R by the triangular factor of [R; rows].
+class Triangle:
+    """A triangular factor that takes in rows.
 
-    Both arguments are written to: they are work space, and this is the innermost loop.
+    It is changed in place, against the house's habit: it is the innermost loop.
 
-    Args:
-        R: Upper triangular factor, shape (c, c), column-major; overwritten.
-        rows: Rows to fold in, shape (m, c), column-major with any distance between columns;
-            destroyed.
-
-    References:
-        LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
+    Attributes:
+        R: Upper triangular factor of all rows so far, shape (c, c), column-major.
     """
-    m, c = rows.shape
-    if m == 0:
-        return
-    panel = min(_PANEL, c)
-    call = _dtpqrt()
-    if call is None:
-        R[:] = scipy.linalg.lapack.dtpqrt(0, panel, R, rows)[0]
-        return
-    scratch = np.empty(2 * panel * c)
-    address = scratch.ctypes.data
-    # m, n, l, nb, lda, ldb, ldt, info
-    sizes = np.array([m, c, 0, panel, c, max(m, rows.strides[1] // 8), panel, 0], dtype=np.intc)
-    at, step = sizes.ctypes.data, sizes.itemsize
-    call(
-        at, at + step, at + 2 * step, at + 3 * step,
-        R.ctypes.data, at + 4 * step, rows.ctypes.data, at + 5 * step,
-        address, at + 6 * step, address + 8 * panel * c, at + 7 * step,
-    )  # fmt: skip
+
+    def __init__(self, columns: int) -> None:
+        """Begin with no rows.
+
+        Args:
+            columns: Number c of columns.
+        """
+        self.R = np.zeros((columns, columns), order="F")
+        self._panel = min(_PANEL, columns)
+        self._scratch = np.empty(2 * self._panel * columns)
+        # m, n, l, nb, lda, ldb, ldt, info
+        self._sizes = np.array(
+            [0, columns, 0, self._panel, columns, 0, self._panel, 0], dtype=np.intc
+        )
+        self._addresses = self._list_addresses()
+
+    def fold(self, rows: Array) -> None:
+        """Replace R by the triangular factor of [R; rows].
+
+        Args:
+            rows: Rows to fold in, shape (m, c), column-major with any distance between columns;
+                destroyed.
+
+        References:
+            LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
+        """
+        if len(rows) == 0:
+            return
+        call = _dtpqrt()
+        if call is None:
+            self.R[:] = scipy.linalg.lapack.dtpqrt(0, self._panel, self.R, rows)[0]
+            return
+        self._sizes[0] = len(rows)
+        self._sizes[5] = max(len(rows), rows.strides[1] // rows.itemsize)
+        self._addresses[6] = rows.ctypes.data
+        call(*self._addresses)
+
+    def _list_addresses(self) -> list[int]:
+        """Return where m, n, l, nb, A, lda, B, ldb, T, ldt, work and info are."""
+        sizes, scratch = self._sizes.ctypes.data, self._scratch.ctypes.data
+        m, n, pentagon, nb, lda, ldb, ldt, info = range(
+            sizes, sizes + self._sizes.nbytes, self._sizes.itemsize
+        )
+        T, work = scratch, scratch + self._scratch.nbytes // 2
+        return [m, n, pentagon, nb, self.R.ctypes.data, lda, 0, ldb, T, ldt, work, info]
 
 
 @cache

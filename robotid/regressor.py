@@ -18,6 +18,8 @@ from robotid.rows import BLOCK, TrajectoryRows, choose_engine
 
 __all__ = ["build_problem", "joint_torque_regressor", "random_regressor"]
 
+_BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
+
 
 def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
     """Return the regressor Y with tau = Y pi at each of N instants.
@@ -87,9 +89,11 @@ def build_problem(
     if weights.shape != shape:
         raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
 
+    length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
+
     def stream() -> Iterator[Block]:
-        for start in range(0, shape[0], BLOCK):
-            part = slice(start, start + BLOCK)
+        for start in range(0, shape[0], length):
+            part = slice(start, start + length)
             W = joint_torque_regressor(
                 model, trajectory.q[part], trajectory.v[part], trajectory.a[part]
             )

@@ -11,7 +11,15 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.columns import RowPlan, plan_rows
-from robotid.compiled import LONG_ENOUGH, CompiledWriter, Tree, flatten, is_installed, why_not
+from robotid.compiled import (
+    LONG_ENOUGH,
+    CompiledWriter,
+    Tree,
+    flatten,
+    is_installed,
+    why_not,
+    work_per_sample,
+)
 from robotid.data import Trajectory
 from robotid.exceptions import MissingDependencyError
 from robotid.model import RobotModel
@@ -54,8 +62,9 @@ def _engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
         return "Pinocchio"
     if not is_installed():
         return "Pinocchio (robotid[fast] is not installed)"
-    if compiled is None and samples < LONG_ENOUGH:
-        return f"Pinocchio (fewer than {LONG_ENOUGH} samples do not pay the compiled path's start)"
+    enough = -(-LONG_ENOUGH // work_per_sample(model))
+    if compiled is None and samples < enough:
+        return f"Pinocchio (fewer than {enough} samples do not pay the start of the compiled path)"
     reason = why_not(model)
     return COMPILED if reason is None else f"Pinocchio ({reason})"
 
@@ -159,12 +168,12 @@ class _PinocchioWriter:
         G, nv = model.velocity_map, model.pin_model.nv
         self._model, self._plan, self._out = model, plan, out
         self._data = model.pin_model.createData()
-        # transposed, as Pinocchio has it in memory
-        self._raw = np.empty((out.shape[1], 10 * (model.pin_model.njoints - 1), nv))
+        size = 10 * (model.pin_model.njoints - 1)
+        self._raw = np.empty((out.shape[1], nv, size))
         self._map = None if np.array_equal(G, np.eye(nv)) else G
         # tau = G^T tau_pinocchio: row j gathers those of Pinocchio's rows that it drives
         self._sources = [
-            [(G[r, j], nv * plan.inertial[j] + r) for r in np.flatnonzero(G[:, j])]
+            [(G[r, j], size * r + plan.inertial[j]) for r in np.flatnonzero(G[:, j])]
             for j in range(model.n_rows)
         ]
 
@@ -195,11 +204,12 @@ class _PinocchioWriter:
             self._raw, np.ascontiguousarray(self._model.configurations(q)), v, a, strict=False
         )
         for raw_k, q_k, v_k, a_k in instants:
-            raw_k[:] = regressor(model, data, q_k, v_k, a_k).T
+            raw_k[:] = regressor(model, data, q_k, v_k, a_k)
         raw = self._raw[: len(q)].reshape(len(q), -1)
         for places, sources in zip(self._plan.places, self._sources, strict=True):
-            total = sum(ratio * raw[:, index] for ratio, index in sources)
-            self._out[places, : len(q)] = np.transpose(total)
+            for k, (ratio, index) in enumerate(sources):
+                part = raw[:, index].T if ratio == 1.0 else ratio * raw[:, index].T
+                self._out[places, : len(q)] = (self._out[places, : len(q)] + part) if k else part
 
 
 def _block_length(columns: int) -> int:
