@@ -5,17 +5,23 @@ triangular factor R_j of each joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j 
 Factors of two logs merge into the factor of both.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg.lapack
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.problem import Problem
+from robotid.lapack import Triangle
+from robotid.problem import Problem, RowSource
 
 __all__ = ["Factors", "compress", "merge"]
+
+_PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,35 +82,41 @@ class Factors:
         return squares
 
 
-def compress(problem: Problem) -> Factors:
+def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """Fold a problem into its factors, block by block.
 
+    Long problems are cut into parts of a fixed number of samples, whose factors are merged in
+    order: the result does not depend on the number of threads.
+
     Args:
-        problem: The rows; each is scaled by the square root of its weight, and left out where the
-            weight is 0.
+        problem: The rows; each is scaled by the square root of its weight, so that a weight of 0
+            leaves it out.
+        threads: Number of threads, at least 1; None: one per core where the problem's rows come
+            faster that way, otherwise one.
 
     Returns:
         The factors.
 
     Raises:
         DataError: If a row is not finite.
+
+    References:
+        Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
     """
     n, c = problem.n_joints, len(problem.names)
     active = [np.append(np.flatnonzero(problem.support[j]), c) for j in range(n)]
-    R = [np.zeros((len(columns), len(columns))) for columns in active]
-    rows = np.zeros(n, dtype=int)
-    for W, tau, weight in problem.blocks():
-        augmented = np.column_stack([W, tau]) * np.sqrt(weight)[:, None]  # (k n, c + 1)
-        if not np.isfinite(augmented).all():
-            raise DataError("the problem holds a row that is not finite; check the trajectory")
-        by_joint = augmented.reshape(-1, n, c + 1)
-        used = weight.reshape(-1, n) > 0
-        rows += used.sum(axis=0)
-        for j, columns in enumerate(active):
-            R[j] = _triangle(np.vstack([R[j], by_joint[used[:, j], j][:, columns]]))
+    triangles = [Triangle(len(columns)) for columns in active]
+    if problem.sources:
+        rows = np.sum([source.rows for source in problem.sources], axis=0)
+        _fold_sources(triangles, active, problem, threads)
+    else:
+        rows = _fold_blocks(triangles, active, problem)
+    # what is not finite in a row is not finite in R
+    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
+        raise DataError("the problem holds a row that is not finite; check the trajectory")
     dense = np.zeros((n, c + 1, c + 1))
     for j, columns in enumerate(active):
-        dense[j][np.ix_(columns, columns)] = R[j]
+        dense[j][np.ix_(columns, columns)] = triangles[j].R
     return Factors(dense, rows, problem.names)
 
 
@@ -132,6 +144,70 @@ def merge(factors: Sequence[Factors]) -> Factors:
     stacked = np.concatenate([f.R for f in factors], axis=1)
     R = np.array([_triangle(stack) for stack in stacked])
     return Factors(R, np.sum([f.rows for f in factors], axis=0), first.names)
+
+
+def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem) -> Array:
+    """Fold whole blocks into the factors; return the number of rows per joint."""
+    n = problem.n_joints
+    rows = np.zeros(n, dtype=int)
+    for W, tau, weight in problem.blocks():
+        by_joint, torque = W.reshape(-1, n, W.shape[1]), tau.reshape(-1, n)
+        root = np.sqrt(weight).reshape(-1, n)
+        rows += (root > 0).sum(axis=0)
+        for j, columns in enumerate(active):
+            used = np.flatnonzero(root[:, j] != 0)  # not a number counts as used: it shows in R
+            scaled = np.empty((len(used), len(columns)), order="F")
+            scaled[:, :-1] = by_joint[used, j][:, columns[:-1]]
+            scaled[:, -1] = torque[used, j]
+            scaled *= root[used, j, None]
+            triangles[j].fold(scaled)
+    return rows
+
+
+def _fold_sources(
+    triangles: Sequence[Triangle],
+    active: Sequence[Array],
+    problem: Problem,
+    threads: int | None,
+) -> None:
+    """Fold the rows of each source into the factors, part by part."""
+    c = len(problem.names)
+    for source in problem.sources:
+        places = [
+            np.searchsorted(columns, np.append(own, c))
+            for columns, own in zip(active, source.columns, strict=True)
+        ]
+        for part in _parts(source, threads):
+            for triangle, place, R_j in zip(triangles, places, part, strict=True):
+                rows = np.zeros((len(place), len(triangle.R)), order="F")
+                rows[:, place] = R_j
+                triangle.fold(rows)
+
+
+def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
+    """Yield the factors of each part of a source in order."""
+    starts = range(0, source.samples, _PART)
+    workers = (_cores() if source.is_parallel else 1) if threads is None else threads
+    if min(workers, len(starts)) <= 1:
+        yield from (_fold_part(source, start) for start in starts)
+        return
+    with ThreadPoolExecutor(min(workers, len(starts))) as pool:
+        yield from pool.map(partial(_fold_part, source), starts)
+
+
+def _fold_part(source: RowSource, start: int) -> list[Array]:
+    triangles = [Triangle(len(own) + 1) for own in source.columns]
+    for block in source.blocks(start, min(start + _PART, source.samples)):
+        for triangle, rows in zip(triangles, block, strict=True):
+            triangle.fold(rows)
+    return [triangle.R for triangle in triangles]
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _triangle(rows: Array) -> Array:

@@ -1,5 +1,6 @@
 """The linear problem W theta = tau as a stream of row blocks; W as a whole is never held."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, repeat
@@ -10,7 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 
-__all__ = ["Block", "Problem", "Sample", "concatenate", "shuffled"]
+__all__ = ["Block", "Problem", "RowSource", "Sample", "concatenate", "shuffled"]
 
 _SHUFFLED = 8192  # samples held while they are shuffled: all of a short log, 30 MB of a long one
 
@@ -35,6 +36,54 @@ class Sample:
     mass_regressor: Array | None = None
 
 
+class RowSource(ABC):
+    """A problem's rows joint by joint, without the columns that are zero or not wanted."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """Number N of samples."""
+
+    @property
+    @abstractmethod
+    def columns(self) -> tuple[Array, ...]:
+        """The columns that row j has here, n arrays of shape (c_j,), ascending."""
+
+    @property
+    @abstractmethod
+    def rows(self) -> Array:
+        """Number of rows with a positive weight per joint, shape (n,), int."""
+
+    @property
+    @abstractmethod
+    def is_parallel(self) -> bool:
+        """Whether several threads read it faster than one."""
+
+    @abstractmethod
+    def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
+        """Yield the rows of samples start to stop, a few hundred samples at a time.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+
+        Yields:
+            Per joint j the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major. They
+            belong to the caller until the next ones are asked for.
+        """
+
+    @abstractmethod
+    def select(self, columns: Array) -> "RowSource":
+        """Return the same rows with fewer columns.
+
+        Args:
+            columns: Indices of the columns kept, shape (b,), of those of the whole problem.
+
+        Returns:
+            Its column k is column ``columns[k]`` of this one.
+        """
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """The rows of W theta = tau, read in blocks as often as wanted.
@@ -46,6 +95,7 @@ class Problem:
         support: Shape (n, c), bool: False where row j is zero for every motion.
         mass_stream: Starts a fresh pass over the regressors of the mass matrix of each block's
             samples, shape (k, n, n, c), or None if the problem has none.
+        sources: The same rows joint by joint, in order; empty if they are only to be had in blocks.
     """
 
     stream: Callable[[], Iterator[Block]]
@@ -53,6 +103,7 @@ class Problem:
     n_joints: int
     support: Array
     mass_stream: Callable[[], Iterator[Array]] | None = None
+    sources: tuple[RowSource, ...] = ()
 
     def __post_init__(self) -> None:
         wanted = (self.n_joints, len(self.names))
@@ -99,6 +150,7 @@ class Problem:
             names=tuple(self.names[i] for i in columns),
             support=self.support[:, columns],
             mass_stream=None if masses is None else mass_stream,
+            sources=tuple(source.select(columns) for source in self.sources),
         )
 
 
@@ -130,6 +182,9 @@ def concatenate(problems: Sequence[Problem]) -> Problem:
         stream=lambda: chain.from_iterable(problem.blocks() for problem in problems),
         support=np.any([problem.support for problem in problems], axis=0),
         mass_stream=(lambda: chain.from_iterable(m() for m in masses)) if has_mass else None,
+        sources=tuple(chain.from_iterable(problem.sources for problem in problems))
+        if all(problem.sources for problem in problems)
+        else (),
     )
 
 

@@ -9,10 +9,12 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.columns import drive_columns
 from robotid.data import Trajectory
 from robotid.exceptions import DataError
 from robotid.model import RobotModel
 from robotid.problem import Block, Problem
+from robotid.rows import BLOCK, TrajectoryRows, choose_engine
 
 __all__ = [
     "InstantRegressor",
@@ -22,7 +24,7 @@ __all__ = [
     "random_regressor",
 ]
 
-_BLOCK = 512  # samples per block: fits in the cache with 100 columns
+_BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
 def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
@@ -50,9 +52,10 @@ def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> A
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
         raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
-    return np.concatenate(
-        [_inertial_columns(model, q, v, a), _drive_columns(model, v, a)], axis=2
-    ).reshape(len(q) * model.n_rows, -1)
+    Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
+    _write_inertial(model, q, v, a, Y[:, :, : model.layout.n_inertial])
+    _write_drives(model, v, a, Y[:, :, model.layout.n_inertial :])
+    return Y.reshape(len(q) * model.n_rows, -1)
 
 
 def mass_regressor(model: RobotModel, q: Array) -> Array:
@@ -131,11 +134,11 @@ class InstantRegressor:
                 model.pin_model, self._data, x, G @ v, G @ a
             )
         Y[:, : layout.n_inertial] = inertial
-        rows = np.arange(len(v))
+        rows, value = np.arange(len(v)), {"armature": a, "viscous": v, "offset": np.ones(1)}
         for term, place in zip(layout.terms, self._places, strict=True):
-            Y[rows, place] = _drive_term(term, v, a)
+            Y[rows, place] = np.sign(v) if term == "coulomb" else value[term]
         if layout.couplings:
-            Y[:, layout.n_inertial :] = _drive_columns(model, v[None], a[None])[0]
+            _write_drives(model, v[None], a[None], Y[None, :, layout.n_inertial :])
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
@@ -158,20 +161,28 @@ def build_problem(
     weight: Array | None = None,
     *,
     with_mass: bool = False,
+    compiled: bool | None = None,
 ) -> Problem:
     """Return the identification problem W pi = tau of a trajectory.
+
+    Its blocks come from Pinocchio. Its rows joint by joint, which the factors are made of, come
+    from Pinocchio too, or from the compiled path, equal to 1e-12;
+    ``problem.sources[0].engine`` and the log "robotid" say from which, and why.
 
     Args:
         model: The robot; the trajectory's joints must be its joints, in its order.
         trajectory: N samples of q, v, a, tau.
         weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
         with_mass: Whether each sample also carries the regressor of its mass matrix.
+        compiled: Whether to use the compiled path where it supports the robot; None: where it is
+            installed and the trajectory is long enough to pay its start.
 
     Returns:
         A stream of row blocks with p columns.
 
     Raises:
         DataError: If joints or shapes do not fit the model.
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
     if trajectory.joints != model.joints:
         raise DataError(
@@ -179,24 +190,30 @@ def build_problem(
             f"{list(model.joints)}; read the log with joints=model.joints"
         )
     shape = (len(trajectory.t), model.n_rows)
-    weights = np.ones(shape) if weight is None else weight
+    weights = np.broadcast_to(1.0, shape) if weight is None else weight
     if weights.shape != shape:
         raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
 
+    length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
+
     def stream() -> Iterator[Block]:
-        for start in range(0, shape[0], _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for start in range(0, shape[0], length):
+            part = slice(start, start + length)
             W = joint_torque_regressor(
                 model, trajectory.q[part], trajectory.v[part], trajectory.a[part]
             )
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     def mass_stream() -> Iterator[Array]:
-        for start in range(0, shape[0], _BLOCK):
-            yield mass_regressor(model, trajectory.q[start : start + _BLOCK])
+        for start in range(0, shape[0], length):
+            yield mass_regressor(model, trajectory.q[start : start + length])
 
+    support = model.support()
+    kept = np.arange(len(model.layout.names))
+    engine = choose_engine(model, shape[0], compiled)
+    source = TrajectoryRows(model, trajectory, weights, support, kept, engine)
     masses = mass_stream if with_mass else None
-    return Problem(stream, model.layout.names, model.n_rows, model.support(), masses)
+    return Problem(stream, model.layout.names, model.n_rows, support, masses, (source,))
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
@@ -229,48 +246,26 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     return joint_torque_regressor(model, q, v, a)
 
 
-def _inertial_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
-    """Return Pinocchio's joint-torque regressor at each instant, shape (N, n_rows, 10 bodies)."""
+def _write_drives(model: RobotModel, v: Array, a: Array, out: Array) -> None:
+    """Write the columns of armature, viscous, coulomb, offset, shape (N, n_rows, drive)."""
+    out[:] = 0.0
+    for k, drive in enumerate(drive_columns(model.layout, model.n_rows)):
+        values = drive.values(v, a)
+        for row, ratio in drive.ratios.items():
+            out[:, row, k] = ratio * values
+
+
+def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array) -> None:
+    """Write Pinocchio's joint-torque regressor at each instant, shape (N, n_rows, 10 bodies)."""
     pin_model, G = model.pin_model, model.velocity_map
-    data = pin_model.createData()
-    configurations = np.ascontiguousarray(model.configurations(q))
-    velocities, accelerations = v @ G.T, a @ G.T  # (N, nv)
-    Y = np.empty((len(q), pin_model.nv, model.layout.n_inertial))
-    instants = zip(Y, configurations, velocities, accelerations, strict=True)
-    for out, q_k, v_k, a_k in instants:
-        out[:] = pin.computeJointTorqueRegressor(pin_model, data, q_k, v_k, a_k)
-    if np.array_equal(G, np.eye(len(G))):
-        return Y
-    projected: Array = G.T @ Y  # tau = G^T tau_pinocchio
-    return projected
-
-
-def _drive_columns(model: RobotModel, v: Array, a: Array) -> Array:
-    """Return the columns of armature, viscous, coulomb, offset, shape (N, n_rows, drive)."""
-    layout = model.layout
-    first = model.n_rows - len(layout.joints)
-    columns = np.zeros((len(v), model.n_rows, len(layout.drive_names)))
-    column = 0
-    for j in range(first, model.n_rows):
-        for term in layout.terms:
-            columns[:, j, column] = _drive_term(term, v[:, j], a[:, j])
-            column += 1
-    for coupling in layout.couplings:
-        rows = [first + layout.joints.index(joint) for joint, _ in coupling.ratios]
-        ratios = np.array([ratio for _, ratio in coupling.ratios])
-        w, dw = v[:, rows] @ ratios, a[:, rows] @ ratios  # speed of the drive
-        for term in layout.coupling_terms:
-            columns[:, rows, column] = ratios * _drive_term(term, w, dw)[:, None]
-            column += 1
-    return columns
-
-
-def _drive_term(term: str, v: Array, a: Array) -> Array:
-    if term == "armature":
-        return a
-    if term == "viscous":
-        return v
-    return np.sign(v) if term == "coulomb" else np.ones_like(v)
+    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
+    is_plain = np.array_equal(G, np.eye(len(G)))
+    if not is_plain:
+        v, a = v @ G.T, a @ G.T  # (N, nv)
+    instants = zip(out, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
+    for Y, q_k, v_k, a_k in instants:
+        Y_k = regressor(pin_model, data, q_k, v_k, a_k)
+        Y[:] = Y_k if is_plain else G.T @ Y_k  # tau = G^T tau_pinocchio
 
 
 def _random_quaternions(samples: int, rng: np.random.Generator) -> Array:

@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
+import scipy.linalg
 
+from robotid import lapack
 from robotid.exceptions import DataError
 from robotid.factors import compress, merge
 from robotid.problem import Problem, concatenate
@@ -103,6 +105,34 @@ def test_poor_excitation_keeps_its_digits(rng):
     )
     R = compress(exact).R[0]
     np.testing.assert_allclose(np.linalg.solve(R[:2, :2], R[:2, 2]), [1.0, 2.0], rtol=1e-7)
+
+
+def test_many_blocks_keep_the_digits_of_one_full_qr_on_poor_excitation(rng):
+    # singular values from 1 to 1e-5, over 100 blocks
+    samples, c = 6400, 12
+    Q = np.linalg.qr(rng.standard_normal((samples, c)))[0]
+    A = Q * np.logspace(0, -5, c) @ np.linalg.qr(rng.standard_normal((c, c)))[0]
+    theta = rng.standard_normal(c)
+    tau = A @ theta
+    blocks = [(A[k : k + 64], tau[k : k + 64], np.ones(64)) for k in range(0, samples, 64)]
+    problem = Problem(lambda: iter(blocks), tuple("abcdefghijkl"), 1, np.ones((1, c), dtype=bool))
+    R = compress(problem).R[0]
+    size = np.linalg.norm(theta)
+    by_qr = scipy.linalg.solve_triangular(R[:c, :c], R[:c, c])
+    by_gram = np.linalg.solve(A.T @ A, A.T @ tau)
+    assert np.linalg.norm(by_qr - theta) < 5e-12 * size
+    assert np.linalg.norm(by_gram - theta) > 1e-8 * size  # why there are no Gram matrices
+
+
+def test_scipys_wrapper_gives_the_same_factors(rng, monkeypatch):
+    problem = make(rng, weight=rng.choice([0.0, 1.0], 900))[0]
+    R = compress(problem).R
+    monkeypatch.setattr(lapack, "_dtpqrt", lambda: None)
+    np.testing.assert_allclose(compress(problem).R, R, atol=1e-13)
+
+
+def test_lapack_is_called_by_address():
+    assert lapack._dtpqrt() is not None
 
 
 def test_a_row_that_is_not_finite_is_refused(rng):
