@@ -16,12 +16,13 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem planar_2r kinematics metrics xml_splice examples tables",
-    2: "factors units model signals base_parameters verdict",
-    3: "log_files estimators regressor simulation lumping prior",
-    4: "excitation validation sidecar",
-    5: "identification",
-    6: "urdf job visualization report_plots",
+    1: "parameters data problem planar_2r kinematics metrics xml_splice examples log_source",
+    2: "factors units model signals base_parameters verdict "
+    "array_tables csv_files parquet_files bags",
+    3: "array_files estimators regressor simulation lumping prior",
+    4: "excitation validation sidecar tables",
+    5: "identification log_files",
+    6: "conversion urdf job visualization report_plots",
     7: "report_page result inspection",
     8: "report_tables",
     9: "report",
@@ -35,7 +36,9 @@ PINOCCHIO = {"model", "regressor", "simulation", "visualization", "lumping", "pr
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
-    "pyarrow": {"tables"},
+    "pyarrow": {"parquet_files"},
+    "rosbags": {"bags"},
+    "h5py": {"array_files"},
     "matplotlib": {"report", "report_plots"},
     "clarabel": {"estimators"},
 }
@@ -103,7 +106,7 @@ def test_no_estimator_knows_the_physics_engine():
 
 @pytest.mark.parametrize("statement", ["import robotid", "from robotid import *"])
 def test_importing_the_package_is_light(statement):
-    heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel"]
+    heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "rosbags", "h5py"]
     found = f"[m for m in {heavy} if m in sys.modules]"
     code = f"{statement}\nimport sys, json\nprint(json.dumps({found}))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
