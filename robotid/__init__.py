@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from robotid.identification import EstimatorSettings, Identification, identify
     from robotid.job import read_job
     from robotid.log_files import read_log, write_log
+    from robotid.log_source import LogSource
     from robotid.model import RobotModel
     from robotid.parameters import Coupling
     from robotid.report import write_report
@@ -32,6 +33,7 @@ __all__ = [
     "EstimatorSettings",
     "Identification",
     "Log",
+    "LogSource",
     "LogUnits",
     "ModelError",
     "RobotIdError",
@@ -55,6 +57,7 @@ _HOMES = {
     "identification": ["EstimatorSettings", "Identification", "identify"],
     "job": ["read_job"],
     "log_files": ["read_log", "write_log"],
+    "log_source": ["LogSource"],
     "model": ["RobotModel"],
     "parameters": ["Coupling"],
     "report": ["write_report"],

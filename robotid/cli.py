@@ -85,6 +85,16 @@ def _parser() -> argparse.ArgumentParser:
     validate.add_argument("logs", nargs="+", metavar="LOG")
     validate.add_argument("--json", action="store_true", help="print one JSON object")
     validate.set_defaults(run=_validate)
+
+    convert = commands.add_parser(
+        "convert", help="write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names"
+    )
+    convert.add_argument("log", metavar="IN", help="a log of any format, or a bag's folder")
+    convert.add_argument("out", metavar="OUT", help="file to write; its suffix says the format")
+    convert.add_argument("--joints", metavar="A,B,...", help="joints to write; default: all")
+    _add_source_flags(convert)
+    convert.add_argument("--json", action="store_true", help="print one JSON object")
+    convert.set_defaults(run=_convert)
     return parser
 
 
@@ -108,6 +118,13 @@ def _add_log_flags(flags: "argparse._ArgumentGroup") -> None:
     )
     flags.add_argument("--time-unit", metavar="UNIT", help="s, ms, us or ns")
     flags.add_argument("--angle-unit", metavar="UNIT", help="rad or deg")
+    _add_source_flags(flags)
+
+
+def _add_source_flags(flags: "argparse._ActionsContainer") -> None:
+    flags.add_argument("--topic", metavar="NAME", help="topic of a bag, or group of a file")
+    flags.add_argument("--effort", metavar="MEANING", help="torque (default) or current")
+    flags.add_argument("--stamp", metavar="CLOCK", help="of a bag: header (default) or log")
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -206,6 +223,29 @@ def _validate(options: argparse.Namespace) -> None:
     _print_verdict(found["verdict"])
 
 
+def _convert(options: argparse.Namespace) -> None:
+    from dataclasses import asdict
+
+    from robotid.conversion import convert
+    from robotid.log_source import LogSource
+
+    joints = options.joints.split(",") if options.joints else None
+    source = LogSource(**_source_settings(options))
+    done = convert(options.log, options.out, joints=joints, source=source)
+    if options.json:
+        print(json.dumps(asdict(done)))
+        return
+    print(f"{done.path}: {done.samples} samples of {len(done.joints)} joints")
+    print(f"  columns {', '.join(done.columns)}")
+    if done.ignored:
+        print(f"  not of a joint, left out: {', '.join(done.ignored)}")
+
+
+def _source_settings(options: argparse.Namespace) -> dict[str, Any]:
+    given = {name: getattr(options, name) for name in ("topic", "effort", "stamp")}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def _job(options: argparse.Namespace) -> "Job":
     from robotid.job import job_from_settings, read_job
 
@@ -240,6 +280,7 @@ def _job(options: argparse.Namespace) -> "Job":
         table["signals"]["cutoff"] = _cutoff(options.cutoff)
     if options.dynamics:
         table["output"] = {"dynamics": True}
+    table["log"] = _source_settings(options)
     units = {"time": options.time_unit, "angle": options.angle_unit}
     table["units"] = {key: value for key, value in units.items() if value}
     return job_from_settings(table, "command line", Path())
@@ -247,7 +288,7 @@ def _job(options: argparse.Namespace) -> "Job":
 
 _JOB_FLAGS = (
     "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
-    "time_unit", "angle_unit", "dynamics",
+    "time_unit", "angle_unit", "dynamics", "topic", "effort", "stamp",
 )  # fmt: skip
 
 

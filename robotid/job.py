@@ -12,6 +12,7 @@ from robotid.data import Log
 from robotid.estimator_settings import EstimatorSettings
 from robotid.exceptions import SettingsError
 from robotid.log_files import read_log
+from robotid.log_source import LogSource
 from robotid.model import GRAVITY, RobotModel
 from robotid.parameters import DRIVE_TERMS, Coupling
 from robotid.signals import SignalSettings
@@ -45,6 +46,7 @@ _TABLE: dict[str, Any] = {
     "model": {"armature": bool, "friction": str, "offset": bool},
     "torque": {"gains": dict},
     "columns": dict,
+    "log": {"topic": str, "joints": dict, "effort": str, "stamp": str},
     "units": {"time": str, "angle": str},
     "coupling": [{"name": str, "ratios": dict}],
     "estimator": {
@@ -99,6 +101,7 @@ class Job:
         gains: Torque per current of joints logged as current [N m/A or N/A].
         couplings: Drives that turn with several joints.
         columns: Column names in the logs that differ from the standard ones.
+        source: Which topic of the logs, names of joints in them, meaning of effort.
         units: Units of the logs, if not SI.
         estimator: The estimator and its settings.
         dynamics: Whether the written URDF's ``<dynamics>`` also get the identified friction.
@@ -117,6 +120,7 @@ class Job:
     gains: Mapping[str, float] = field(default_factory=dict)
     couplings: tuple[Coupling, ...] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
+    source: LogSource = field(default_factory=LogSource)
     units: LogUnits = field(default_factory=LogUnits)
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     dynamics: bool = False
@@ -165,6 +169,7 @@ class Job:
             end=entry.end,
             units=self.units,
             prismatic=tuple(model.layout.prismatic),
+            source=self.source,
         )
 
     def to_settings(self) -> dict[str, Any]:
@@ -196,6 +201,12 @@ class Job:
             },
             "torque": {"gains": dict(self.gains)},
             "columns": dict(self.columns),
+            "log": {
+                **({"topic": self.source.topic} if self.source.topic is not None else {}),
+                "joints": dict(self.source.joints),
+                "effort": self.source.effort,
+                "stamp": self.source.stamp,
+            },
             "units": {
                 key: value
                 for key, value in (("time", self.units.time), ("angle", self.units.angle))
@@ -282,6 +293,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
                 for c in table.get("coupling", [])
             ),
             columns=table.get("columns", {}),
+            source=LogSource(**table.get("log", {})),
             units=LogUnits(**table.get("units", {})),
             estimator=EstimatorSettings(**table.get("estimator", {})),
             dynamics=table.get("output", {}).get("dynamics", False),

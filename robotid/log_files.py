@@ -1,4 +1,4 @@
-"""Log files: CSV and Parquet, one row per sample and one column per quantity and joint.
+"""Log files of every format: one row per sample and one column per quantity and joint.
 
 Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
 `ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Aliases are read, too.
@@ -14,20 +14,15 @@ import numpy as np
 from robotid._typing import Array
 from robotid.data import Log, repeated, suggestion
 from robotid.exceptions import DataError, SettingsError
-from robotid.tables import column_names, read_columns, write_columns
+from robotid.log_source import LogSource, prefixes
+from robotid.tables import open_table, write_columns
 from robotid.units import PER_SECOND, LogUnits, check_units
 
 __all__ = ["read_log", "write_log"]
 
-_PREFIXES = {
-    "q": ("q_", "position_"),
-    "dq": ("dq_", "velocity_", "qd_"),
-    "ddq": ("ddq_", "acceleration_", "qdd_"),
-    "tau": ("tau_", "effort_", "torque_"),
-    "current": ("current_", "i_"),
-}
 _NOUNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque or current"}
 _SI = LogUnits()
+_WHOLE = LogSource()
 
 
 def read_log(
@@ -40,11 +35,13 @@ def read_log(
     end: float | None = None,
     units: LogUnits = _SI,
     prismatic: Collection[str] = (),
+    source: LogSource = _WHOLE,
 ) -> Log:
     """Return the log in a file.
 
     Args:
-        path: A .csv or .parquet file.
+        path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, or the folder of
+            a ROS 2 bag.
         joints: Names of the joints wanted, in the order wanted.
         gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
             current with a gain is preferred to a torque column.
@@ -53,22 +50,26 @@ def read_log(
         end: Last time stamp kept [s].
         units: Units of the file, if not SI.
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
+        source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
 
     Returns:
         The log in SI units; its notes tell what was ignored.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
-        SettingsError: If gains or columns name what is not read.
-        MissingDependencyError: If a Parquet file is read without pyarrow.
+        SettingsError: If gains, columns or the source name what is not read.
+        MissingDependencyError: If a package that reads the file is not installed.
     """
-    source = Path(path)
+    file = Path(path)
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
-    finder = _Finder(source.name, column_names(source), columns or {}, tuple(joints), gains or {})
+    opened = open_table(file, source)
+    finder = _Finder(
+        file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, [*opened.notes]
+    )
     found = finder.find_all()  # names of columns by kind
     wanted = [name for kind in found.values() for name in kind]
-    table = read_columns(source, wanted)
+    table = opened.read(wanted)
     values = {kind: np.stack([table[name] for name in found[kind]], axis=1) for kind in found}
     if units.angle == "deg":
         radians = [1.0 if joint in prismatic else np.pi / 180 for joint in joints]
@@ -83,7 +84,7 @@ def read_log(
         a=values.get("ddq"),
         tau=values["tau"],
         joints=tuple(joints),
-        path=str(source),
+        path=str(file),
         notes=tuple(finder.notes),
     )
     check_units(log, units, prismatic)
@@ -97,11 +98,11 @@ def write_log(log: Log, path: str | Path) -> None:
 
     Args:
         log: The log.
-        path: A .csv or .parquet file; one that exists is replaced.
+        path: A .csv, .parquet, .npz, .h5, .hdf5 or .mat file; one that exists is replaced.
 
     Raises:
-        DataError: If the file name ends in neither.
-        MissingDependencyError: If Parquet is written without pyarrow.
+        DataError: If the file name ends otherwise, or the format cannot hold a name.
+        MissingDependencyError: If a package that writes the format is not installed.
         OSError: If the folder cannot be written to.
     """
     write_columns(_to_table(log), Path(path))
@@ -116,6 +117,7 @@ class _Finder:
     columns: Mapping[str, str]
     joints: tuple[str, ...]
     gains: Mapping[str, float]
+    source: LogSource
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
@@ -152,7 +154,13 @@ class _Finder:
                 )
             if not np.isfinite(gain) or gain == 0:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
-        known = ["time", *(f"{kind}_{joint}" for kind in _PREFIXES for joint in self.joints)]
+        for joint in self.source.joints:
+            if joint not in self.joints:
+                raise SettingsError(
+                    f"{self.where}: log.joints renames {joint!r}, which is not among the joints "
+                    f"read: {list(self.joints)}{suggestion(joint, self.joints)}"
+                )
+        known = ["time", *(f"{kind}_{joint}" for kind in prefixes() for joint in self.joints)]
         for standard, name in self.columns.items():
             if standard not in known:
                 raise SettingsError(
@@ -180,7 +188,12 @@ class _Finder:
 
     def _find_of(self, kind: str, joint: str) -> str | None:
         """Return the column of one quantity of one joint, or None."""
-        return self._find(f"{kind}_{joint}", [prefix + joint for prefix in _PREFIXES[kind]])
+        named = self.source.joints.get(joint, joint)
+        return self._find(f"{kind}_{joint}", [prefix + named for prefix in self._prefixes()[kind]])
+
+    def _prefixes(self) -> dict[str, tuple[str, ...]]:
+        """Return how columns start, by quantity."""
+        return prefixes(self.source.effort)
 
     def _find_torque(self, joint: str) -> str:
         """Return the column of a joint's torque, or of its current if that has a gain."""
@@ -215,20 +228,24 @@ class _Finder:
         """Refuse a file without a column, naming those of its kind and the nearest."""
         standard = f"{kind}_{joint}" if joint else kind
         noun = f"{_NOUNS[kind]} columns" if joint else "columns"
-        prefixes = (*_PREFIXES.get(kind, ("",)), *(_PREFIXES["current"] if kind == "tau" else ()))
+        known = self._prefixes()
+        starts = (*known.get(kind, ("",)), *(known["current"] if kind == "tau" else ()))
+        named = self.source.joints.get(joint, joint)
+        others = {self.source.joints.get(other, other) for other in self.joints}
         found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
         for name in self.names:
-            for prefix in [prefix for prefix in prefixes if name.startswith(prefix)]:
+            for prefix in [prefix for prefix in starts if name.startswith(prefix)]:
                 found.append(name)
-                if name[len(prefix) :] not in self.joints:
+                if name[len(prefix) :] not in others:
                     ends[name[len(prefix) :]] = name
-        nearest = difflib.get_close_matches(joint or kind, ends, n=1)
+        nearest = difflib.get_close_matches(named or kind, ends, n=1)
+        sought = f"{kind}_{named}" if joint else kind
         leave_out = (
             f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
         )
         near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
         raise DataError(
-            f"{self.where} has no column {standard!r}; {noun} found: {found}. {hint.format(near)}"
+            f"{self.where} has no column {sought!r}; {noun} found: {found}. {hint.format(near)}"
             f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}"
         )
 

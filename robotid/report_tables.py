@@ -1,6 +1,5 @@
 """The report's tables of parameters, settings and inputs."""
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from robotid.estimator_settings import KEYS
 from robotid.identification import Identification
 from robotid.parameters import pseudo_inertia
 from robotid.report_page import Cell, code, number, percent, table, text
+from robotid.result import file_sha256
 from robotid.validation import Recording
 
 __all__ = [
@@ -239,8 +239,6 @@ def _input_row(recording: Recording) -> list[Cell]:
 
 
 def _sha256(path: str) -> str:
-    source = Path(path)
-    if not path or not source.is_file():
+    if not path or not Path(path).exists():
         return "not read from a file"
-    with source.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return file_sha256(path)

@@ -131,15 +131,20 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
 
 
 def file_sha256(path: str | Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal.
+    """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
 
     Args:
-        path: The file.
+        path: The file, or the folder of a bag.
 
     Returns:
         64 hexadecimal digits.
     """
-    with open(path, "rb") as stream:
+    source = Path(path)
+    if source.is_dir():
+        files = sorted(file for file in source.iterdir() if file.is_file())
+        listing = "".join(f"{file_sha256(file)}  {file.name}\n" for file in files)  # as sha256sum
+        return hashlib.sha256(listing.encode()).hexdigest()
+    with source.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

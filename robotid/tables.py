@@ -1,56 +1,82 @@
-"""Tables in files: named columns of numbers as CSV or Parquet, whatever they mean."""
+"""Tables in files: named columns of numbers in any format that is known by its suffix."""
 
-import csv
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from itertools import chain, islice
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any, TextIO
-
-import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, MissingDependencyError
+from robotid.array_files import open_hdf5, open_mat, open_npz, write_hdf5, write_mat, write_npz
+from robotid.bags import open_bag
+from robotid.csv_files import open_csv, write_csv
+from robotid.exceptions import DataError
+from robotid.log_source import LogSource, Table
+from robotid.parquet_files import open_parquet, write_parquet
 
-__all__ = ["column_names", "load_pyarrow", "read_columns", "write_columns"]
+__all__ = ["open_table", "write_columns"]
 
 
-def column_names(path: Path) -> list[str]:
-    """Return the names of the columns of a file.
+@dataclass(frozen=True)
+class _Format:
+    """How one format is opened and, if it is, written."""
+
+    open: Callable[[Path, LogSource], Table]
+    write: Callable[[Mapping[str, Array], Path], None] | None = None
+
+
+def _without_topics(open_file: Callable[[Path], Table]) -> Callable[[Path, LogSource], Table]:
+    """Return the opener of a format that has one table; a topic that is stated is noted."""
+
+    def open_only(path: Path, source: LogSource) -> Table:
+        table = open_file(path)
+        if source.topic is None:
+            return table
+        note = f"the topic {source.topic!r} is not used: {path.suffix} files have none"
+        return Table(table.names, table.read, (note,))
+
+    return open_only
+
+
+_HDF5 = _Format(open_hdf5, write_hdf5)
+_BAG = _Format(open_bag)
+_FORMATS = {
+    ".csv": _Format(_without_topics(open_csv), write_csv),
+    ".parquet": _Format(_without_topics(open_parquet), write_parquet),
+    ".npz": _Format(open_npz, write_npz),
+    ".h5": _HDF5,
+    ".hdf5": _HDF5,
+    ".mat": _Format(open_mat, write_mat),
+    ".mcap": _BAG,
+    ".db3": _BAG,
+    ".bag": _BAG,
+}
+
+
+def open_table(path: Path, source: LogSource) -> Table:
+    """Return the table in a file.
 
     Args:
-        path: A .csv or .parquet file.
+        path: A file of a known suffix, or the folder of a ROS 2 bag.
+        source: Where in the file.
 
     Returns:
-        The names, in the file's order.
+        The table; what is wrong with a column is told when it is read.
 
     Raises:
-        DataError: If the file is missing or has no header.
-        MissingDependencyError: If it is Parquet and pyarrow is not installed.
+        DataError: If the file is missing, of another suffix or broken, or its table is not found.
+        MissingDependencyError: If a package that reads it is not installed.
     """
-    is_csv = _is_csv(path)
+    if path.is_dir():
+        return open_bag(path, source)
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        raise DataError(
+            f"{path.name}: logs are {_listed(list(_FORMATS))} files, or the folder of a ROS 2 bag, "
+            f"not {suffix!r}; convert it"
+        )
     if not path.is_file():
         raise DataError(f"there is no log file {str(path)!r}")
-    return _csv_header(path)[0] if is_csv else _parquet_names(path)
-
-
-def read_columns(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    """Return some columns of a file.
-
-    Args:
-        path: A .csv or .parquet file.
-        wanted: Names of the columns.
-
-    Returns:
-        Arrays of shape (N,) by name; a missing value is NaN.
-
-    Raises:
-        DataError: If a cell is no number, a row has another length, or there is no row.
-        MissingDependencyError: If it is Parquet and pyarrow is not installed.
-    """
-    return _read_csv(path, wanted) if _is_csv(path) else _read_parquet(path, wanted)
+    return _FORMATS[suffix].open(path, source)
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:
@@ -60,174 +86,27 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
 
     Args:
         table: Arrays of shape (N,) by name.
-        path: A .csv or .parquet file; one that exists is replaced.
+        path: A file whose suffix names a format that is written; one that exists is replaced.
 
     Raises:
-        DataError: If the file name ends in neither.
-        MissingDependencyError: If Parquet is written without pyarrow.
+        DataError: If the file name ends otherwise, or the format cannot hold a name.
+        MissingDependencyError: If a package that writes it is not installed.
         OSError: If the folder cannot be written to.
     """
-    write = _write_csv if _is_csv(path) else _write_parquet
+    written = {suffix: f.write for suffix, f in _FORMATS.items() if f.write is not None}
+    suffix = path.suffix.lower()
+    if suffix not in written:
+        raise DataError(
+            f"{path.name}: logs are written as {_listed(list(written))} files, not {suffix!r}"
+        )
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        write(table, partial)
+        written[suffix](table, partial)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _is_csv(path: Path) -> bool:
-    """Return whether a file is CSV rather than Parquet, by its suffix."""
-    suffix = path.suffix.lower()
-    if suffix not in (".csv", ".parquet"):
-        raise DataError(f"{path.name}: logs are .csv or .parquet files, not {suffix!r}; convert it")
-    return suffix == ".csv"
-
-
-@contextmanager
-def _open_csv(path: Path) -> Iterator[TextIO]:
-    """Open a text file, whether or not it starts with a byte order mark."""
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            yield file
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8") from error
-
-
-def _csv_header(path: Path) -> tuple[list[str], str]:
-    """Return the column names of a CSV file and what separates them."""
-    with _open_csv(path) as file:
-        line = file.readline()
-    if not line.strip():
-        raise DataError(f"{path.name} is empty; its first line must name the columns")
-    separator = max(",;\t", key=line.count)  # the comma, if there is none
-    cells = next(csv.reader([line.strip("\r\n").lstrip("# ")], delimiter=separator))
-    names = [cell.strip() for cell in cells]
-    if all(_is_number(name) for name in names):
-        raise DataError(f"{path.name} has no header; its first line must name the columns")
-    return names, separator
-
-
-def _read_csv(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    """Return the wanted columns of a CSV file."""
-    names, separator = _csv_header(path)
-    columns = [names.index(name) for name in wanted]
-    with _open_csv(path) as file:
-        file.readline()
-        rows = _whole_rows(file, len(names), separator, path.name)
-        first = list(islice(rows, 1))
-        if not first:
-            raise DataError(f"{path.name} has a header but no rows; record at least 2")
-        how: Any = {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
-        try:
-            values = np.loadtxt(chain(first, rows), usecols=columns, **how)
-        except (DataError, UnicodeDecodeError):
-            raise
-        except ValueError as error:
-            raise _bad_cell(path, names, columns, separator) from error
-    return dict(zip(wanted, values.T, strict=True))
-
-
-def _whole_rows(lines: TextIO, count: int, separator: str, where: str) -> Iterator[str]:
-    """Yield the lines that are not blank, and refuse those with too few or too many cells."""
-    for number, line in enumerate(lines, start=2):
-        if line.isspace():
-            continue
-        if line.count(separator) != count - 1:  # unless a separator stands in quotes
-            found = len(next(csv.reader([line], delimiter=separator)))
-            if found != count:
-                raise DataError(
-                    f"{where}: line {number} has {found} cells, the header has {count}; mend it"
-                )
-        yield line
-
-
-def _bad_cell(path: Path, names: list[str], columns: list[int], separator: str) -> DataError:
-    """Return the error that names the first cell that is not a number."""
-    with _open_csv(path) as file:
-        file.readline()
-        for row, line in enumerate(_whole_rows(file, len(names), separator, path.name)):
-            cells = next(csv.reader([line], delimiter=separator))
-            for i in columns:
-                if not _is_number(cells[i]):
-                    found = repr(cells[i]) if cells[i].strip() else "empty"
-                    hint = "; write decimals with a point" if "," in cells[i] else ""
-                    return DataError(
-                        f"{path.name}: {names[i]} is {found} at row {row}, wanted a number{hint}; "
-                        "remove the row or mend the recording"
-                    )
-    return DataError(f"{path.name} holds a cell that is not a plain decimal number")
-
-
-def _is_number(text: str) -> bool:
-    """Return whether a cell holds a number, NaN and infinity among them."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _write_csv(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as CSV; the shortest decimals that give the same bits."""
-    rows = np.column_stack(list(table.values()))
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table)
-        writer.writerows(row.tolist() for row in rows)
-
-
-def load_pyarrow(purpose: str) -> ModuleType:
-    """Return pyarrow, with its parquet loaded.
-
-    Args:
-        purpose: What it is needed for, as "reading Parquet".
-
-    Returns:
-        The package.
-
-    Raises:
-        MissingDependencyError: If it is not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingDependencyError(purpose, "pyarrow", "parquet") from error
-    package: ModuleType = pyarrow
-    return package
-
-
-@contextmanager
-def _open_parquet(path: Path) -> Iterator[Any]:
-    """Open a Parquet file; what is wrong with it is told in our words."""
-    pa = load_pyarrow("reading Parquet")
-    try:
-        with pa.parquet.ParquetFile(path) as file:
-            yield file
-    except (pa.ArrowInvalid, OSError) as error:
-        raise DataError(f"{path.name}: broken Parquet file ({error}); export it again") from error
-
-
-def _parquet_names(path: Path) -> list[str]:
-    """Return the column names of a Parquet file."""
-    with _open_parquet(path) as file:
-        return list(file.schema_arrow.names)
-
-
-def _read_parquet(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    """Return the wanted columns of a Parquet file; null becomes NaN."""
-    types = load_pyarrow("reading Parquet").types
-    with _open_parquet(path) as file:
-        for name in wanted:
-            kind = file.schema_arrow.field(name).type
-            if not (types.is_integer(kind) or types.is_floating(kind)):
-                raise DataError(f"{path.name}: {name} holds {kind}, wanted numbers; convert it")
-        table = file.read(columns=list(wanted))
-    return {name: table.column(name).to_numpy().astype(np.float64, copy=False) for name in wanted}
-
-
-def _write_parquet(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as Parquet."""
-    pa = load_pyarrow("writing Parquet")
-    pa.parquet.write_table(pa.table(dict(table)), path)
+def _listed(words: list[str]) -> str:
+    """Return words with commas, and "or" before the last."""
+    return f"{', '.join(words[:-1])} or {words[-1]}"

@@ -14,8 +14,9 @@ from robotid.job import Job
 from robotid.model import RobotModel
 from robotid.online import OnlineIdentifier
 from robotid.online_settings import OnlineSettings, Reading
+from robotid.parquet_files import load_pyarrow
 from robotid.result import file_sha256, write_json
-from robotid.tables import load_pyarrow, write_columns
+from robotid.tables import write_columns
 
 __all__ = ["Track", "run_track", "track"]
 

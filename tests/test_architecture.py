@@ -16,14 +16,14 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem program proximity kinematics metrics xml_splice examples tables "
-    "innovations online_settings lanes lapack",
+    1: "parameters data problem program proximity kinematics metrics xml_splice examples "
+    "innovations online_settings lanes lapack log_source",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
-    "compiled columns",
-    3: "log_files estimators plant lumping prior rows",
-    4: "regressor excitation",
-    5: "validation sidecar estimator_settings simulation dynamics",
-    6: "identification closed_loop",
+    "compiled columns array_tables csv_files parquet_files bags",
+    3: "array_files estimators plant lumping prior rows",
+    4: "regressor excitation tables",
+    5: "validation sidecar estimator_settings simulation dynamics log_files",
+    6: "identification closed_loop conversion",
     7: "online urdf job visualization report_plots paper_simulation paper_trajectories",
     8: "report_page result inspection paper_errata",
     9: "report_tables paper_plots paper_page tracking",
@@ -43,7 +43,9 @@ NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
-    "pyarrow": {"tables"},
+    "pyarrow": {"parquet_files"},
+    "rosbags": {"bags"},
+    "h5py": {"array_files"},
     "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
     "clarabel": {"estimators"},
 }
@@ -127,7 +129,7 @@ def test_no_estimator_knows_the_physics_engine():
 
 @pytest.mark.parametrize("statement", ["import robotid", "from robotid import *"])
 def test_importing_the_package_is_light(statement):
-    heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "numba"]
+    heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "rosbags", "h5py"]
     found = f"[m for m in {heavy} if m in sys.modules]"
     code = f"{statement}\nimport sys, json\nprint(json.dumps({found}))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -4,6 +4,7 @@ import pytest
 
 from robotid.exceptions import SettingsError
 from robotid.job import job_from_settings, read_job
+from robotid.log_source import LogSource
 from robotid.parameters import Coupling
 
 FULL = """
@@ -29,6 +30,12 @@ offset = false
 
 [torque]
 gains = { a = 14.87 }
+
+[log]
+topic = "/arm"
+joints = { a = "M1" }
+effort = "current"
+stamp = "log"
 
 [units]
 time = "ms"
@@ -69,6 +76,7 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.terms == ("armature", "viscous")
     assert job.gains == {"a": 14.87}
     assert job.units.time == "ms"
+    assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
     assert job.estimator.name == "wls"
     assert job.dynamics is True
@@ -110,6 +118,10 @@ WRONG = {
     "no urdf": ('urdf = "robot.urdf"', "", "has no key 'urdf'"),
     "joints text": ('joints = ["a", "b"]', 'joints = "a"', "joints is 'a', wanted a list"),
     "unit": ('time = "ms"', 'time = "sec"', "time is 'sec', wanted one of"),
+    "effort": ('effort = "current"', 'effort = "force"', "log: effort is 'force', wanted one of"),
+    "stamp": ('stamp = "log"', 'stamp = "wall"', "log: stamp is 'wall', wanted one of"),
+    "joint's name": ('a = "M1"', "a = 1", "log: joints.a is 1, wanted a name"),
+    "misspelt topic": ("topic =", "topics =", "topics is not a known key; did you mean 'topic'?"),
     "no TOML": ("[signals]", "[signals", "is not valid TOML"),
 }  # fmt: skip
 

@@ -487,11 +487,17 @@ def make_wide_log(count):
 
 
 def test_other_suffixes_are_refused(tmp_path):
-    for path in (tmp_path / "run.mat", "run.mat"):
-        with refused("run.mat: logs are .csv or .parquet files, not '.mat'; convert it"):
+    known = ".csv, .parquet, .npz, .h5, .hdf5, .mat"
+    for path in (tmp_path / "run.xlsx", "run.xlsx"):
+        with refused(
+            f"run.xlsx: logs are {known}, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag, "
+            "not '.xlsx'; convert it"
+        ):
             read_log(path, ["a"])
-    with refused("run: logs are .csv or .parquet files, not ''; convert it"):
-        write_log(make_log(), tmp_path / "run")
+    written = known.replace(", .mat", " or .mat")
+    for name, suffix in (("run", ""), ("run.mcap", ".mcap")):
+        with refused(f"{name}: logs are written as {written} files, not {suffix!r}"):
+            write_log(make_log(), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -57,7 +57,7 @@ def test_the_command_line_quick_start_runs(folder, capsys):
 def test_the_job_file_of_the_readme_is_accepted(folder):
     text = re.search(r"```toml\n(.*?)```", README, re.DOTALL).group(1)
     commented = re.sub(
-        r"^# (joints|rate|\[\[coupling|name = \"motor|ratios)", r"\1", text, flags=re.M
+        r"^# (joints|rate|topic|\[\[coupling|name = \"motor|ratios)", r"\1", text, flags=re.M
     )
     for version in (text, commented):
         job = job_from_settings(tomllib.loads(version), "README.md", folder)

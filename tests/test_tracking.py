@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 from synthetic import payload_log
 
-from robotid import tables
+from robotid import parquet_files
 from robotid.cli import main
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.job import read_job
@@ -61,7 +61,7 @@ def test_without_pyarrow_the_history_is_csv(panda, log_file, tmp_path, monkeypat
         raise MissingDependencyError(purpose, "pyarrow", "parquet")
 
     monkeypatch.setattr("robotid.tracking.load_pyarrow", missing)
-    monkeypatch.setattr(tables, "load_pyarrow", missing)
+    monkeypatch.setattr(parquet_files, "load_pyarrow", missing)
     assert main(words(panda, tmp_path / "short.csv", str(tmp_path / "out"))) == 0
     lines = (tmp_path / "out" / "track.csv").read_text().splitlines()
     assert lines[0].startswith("time,panda_link1.Izz,panda_link1.Izz.std_error,")

@@ -1,0 +1,99 @@
+"""Where in a log file the signals are, and what each file format gives: named columns."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+
+__all__ = ["LogSource", "Table", "choose", "prefixes"]
+
+_PREFIXES = {
+    "q": ("q_", "position_"),
+    "dq": ("dq_", "velocity_", "qd_"),
+    "ddq": ("ddq_", "acceleration_", "qdd_"),
+    "tau": ("tau_", "effort_", "torque_"),
+    "current": ("current_", "i_"),
+}
+
+
+@dataclass(frozen=True)
+class LogSource:
+    """Where in a log file the signals are; the defaults fit files that leave no choice.
+
+    Attributes:
+        topic: The topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; None if
+            there is only one.
+        joints: Name in the file by joint, where they differ.
+        effort: What effort is: "torque" [N m or N], or "current" [A], which takes a gain.
+        stamp: The clock of a bag's rows: "header", the stamp in the message, or "log", the time
+            when it was recorded.
+    """
+
+    topic: str | None = None
+    joints: Mapping[str, str] = field(default_factory=dict)
+    effort: str = "torque"
+    stamp: str = "header"
+
+    def __post_init__(self) -> None:
+        for name, known in (("effort", ["torque", "current"]), ("stamp", ["header", "log"])):
+            value = getattr(self, name)
+            if value not in known:
+                raise SettingsError(f"log: {name} is {value!r}, wanted one of {known}")
+        for joint, name in self.joints.items():
+            if not isinstance(name, str):
+                raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of one file.
+
+    Attributes:
+        names: The columns, in the file's order.
+        read: Returns some of them by name, each of shape (N,); a missing value is NaN.
+        notes: What the reader should know.
+    """
+
+    names: list[str]
+    read: Callable[[Sequence[str]], dict[str, Array]]
+    notes: tuple[str, ...] = ()
+
+
+def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:
+    """Return how columns start, by quantity: the standard prefix first, then its aliases.
+
+    Args:
+        effort: What effort is: "torque" or "current".
+
+    Returns:
+        The prefixes of q, dq, ddq, tau and current.
+    """
+    if effort == "torque":
+        return dict(_PREFIXES)
+    torque = tuple(prefix for prefix in _PREFIXES["tau"] if prefix != "effort_")
+    return _PREFIXES | {"tau": torque, "current": (*_PREFIXES["current"], "effort_")}
+
+
+def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
+    """Return the only one of several places, or refuse to guess.
+
+    Args:
+        where: Name of the file, for errors.
+        found: The places that would do, at least one.
+        noun: What they are, as "topics of ...".
+        listing: What the file holds, for the error.
+
+    Returns:
+        The place.
+
+    Raises:
+        DataError: If there are several.
+    """
+    if len(found) == 1:
+        return found[0]
+    raise DataError(
+        f"{where} holds {len(found)} {noun}: {sorted(found)}; {listing}. State one: topic = "
+        f'"{sorted(found)[0]}" (job file table [log], CLI --topic, Python '
+        "source=LogSource(topic=...))"
+    )

@@ -1,0 +1,112 @@
+"""Writers of log files as robots write them: each format by its own library."""
+
+import hdf5storage
+import numpy as np
+import scipy.io
+from mcap_ros2.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Bag2Writer
+from rosbags.typesys import Stores, get_typestore
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+FIELDS = {"position": "q", "velocity": "v", "effort": "tau"}
+
+
+def messages_of(log):
+    """Yield (stamp [s], names, position, velocity, effort) of each row, names ever reordered."""
+    n = len(log.joints)
+    for k, t in enumerate(log.t):
+        order = np.roll(np.arange(n), k)
+        names = [log.joints[j] for j in order]
+        rows = [[] if (x := getattr(log, key)) is None else x[k, order] for key in FIELDS.values()]
+        yield t, names, *rows
+
+
+def to_ns(t):
+    return round(t * 1e9)
+
+
+def joint_state(types, stamp, names, position, velocity, effort):
+    """Return a message of rosbags; a header stamp in ns."""
+    time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    fields = {"stamp": time, "frame_id": ""}
+    if "seq" in dict(types.fielddefs["std_msgs/msg/Header"][1]):
+        fields["seq"] = 0
+    header = types.types["std_msgs/msg/Header"](**fields)
+    arrays = [np.asarray(x, dtype=np.float64) for x in (position, velocity, effort)]
+    return types.types[JOINT_STATE](header, list(names), *arrays)
+
+
+def write_bag2(path, topics, *, plugin=StoragePlugin.SQLITE3, delay=0.0, others=()):
+    """Write {topic: messages} as a folder; others are topics of text, one message each."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with Bag2Writer(path, version=9, storage_plugin=plugin) as bag:
+        for topic in others:
+            text = bag.add_connection(topic, "std_msgs/msg/String", typestore=types)
+            message = types.types["std_msgs/msg/String"]("hello")
+            bag.write(text, 5, types.serialize_cdr(message, "std_msgs/msg/String"))
+        for topic, messages in topics.items():
+            connection = bag.add_connection(topic, JOINT_STATE, typestore=types)
+            for message in messages:
+                state = joint_state(types, to_ns(message[0]), *message[1:])
+                raw = types.serialize_cdr(state, JOINT_STATE)
+                bag.write(connection, to_ns(message[0] + delay), raw)
+    return path
+
+
+def write_bag1(path, messages, topic="/joint_states"):
+    types = get_typestore(Stores.ROS1_NOETIC)
+    with Bag1Writer(path) as bag:
+        connection = bag.add_connection(topic, JOINT_STATE, typestore=types)
+        for message in messages:
+            state = joint_state(types, to_ns(message[0]), *message[1:])
+            raw = types.serialize_ros1(state, JOINT_STATE)
+            bag.write(connection, to_ns(message[0]), raw)
+    return path
+
+
+def write_mcap(path, messages, topic="/joint_states", delay=lambda k: 0.0):
+    """Write with the library of MCAP itself; delay of the time of recording by number [s]."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    definition, _ = types.generate_msgdef(JOINT_STATE, ros_version=2)
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        schema = writer.register_msgdef(JOINT_STATE, definition)
+        for k, (t, names, position, velocity, effort) in enumerate(messages):
+            sec, nanosec = divmod(to_ns(t), 10**9)
+            writer.write_message(
+                topic=topic,
+                schema=schema,
+                message={
+                    "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": ""},
+                    "name": names,
+                    "position": list(position),
+                    "velocity": list(velocity),
+                    "effort": list(effort),
+                },
+                log_time=to_ns(t + delay(k)),
+                publish_time=to_ns(t + delay(k)),
+            )
+        writer.finish()
+    return path
+
+
+def wide(log, text=str):
+    """Return the arrays as a user's script holds them: (N, n), and the names of the joints."""
+    names = {"time": log.t, "q": log.q, "dq": log.v, "ddq": log.a, "tau": log.tau}
+    arrays = {name: x for name, x in names.items() if x is not None}
+    return arrays | {"joints": np.array(log.joints, dtype=text)}
+
+
+def write_mat73(path, content):
+    """Write MATLAB v7.3."""
+    hdf5storage.savemat(
+        str(path), content, format="7.3", appendmat=False, store_python_metadata=False
+    )
+    return path
+
+
+def write_mat5(path, content):
+    scipy.io.savemat(path, content)
+    return path
