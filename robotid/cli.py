@@ -66,6 +66,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_job_flags(identify)
     identify.set_defaults(run=_identify)
 
+    doctor = commands.add_parser(
+        "doctor", help="what is wrong with logs: JOB.toml, or URDF LOG ..."
+    )
+    doctor.add_argument("source", metavar="JOB.toml | URDF")
+    doctor.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
+    doctor.add_argument("--json", action="store_true", help="print one JSON object")
+    _add_job_flags(doctor)
+    doctor.set_defaults(run=_doctor)
+
     validate = commands.add_parser("validate", help="measure a result's prediction on other logs")
     validate.add_argument("result", metavar="RESULT.json")
     validate.add_argument("logs", nargs="+", metavar="LOG")
@@ -84,6 +93,13 @@ def _add_job_flags(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--rate", type=float, metavar="HZ", help="grid to resample to")
     flags.add_argument("--cutoff", metavar="HZ", help="of the low-pass filter, or false")
     flags.add_argument("--friction", metavar="MODEL", help="none, viscous or viscous+coulomb")
+    flags.add_argument(
+        "--ignore",
+        action="append",
+        default=[],
+        metavar="CODE",
+        help="error of the doctor that must not stop the identification",
+    )
     flags.add_argument("--time-unit", metavar="UNIT", help="s, ms, us or ns")
     flags.add_argument("--angle-unit", metavar="UNIT", help="rad or deg")
 
@@ -125,6 +141,19 @@ def _identify(options: argparse.Namespace) -> None:
     _print_files(options.out, [*result["outputs"].values(), "result.json"])
 
 
+def _doctor(options: argparse.Namespace) -> None:
+    from robotid.doctor import examine, findings_to_dict
+
+    content = findings_to_dict(examine(_job(options)))
+    if options.json:
+        print(json.dumps(content, allow_nan=False))
+        return
+    for severity in ("error", "warning", "note"):
+        for finding in content["findings"]:
+            if finding["severity"] == severity:
+                print(f"{severity}: {finding['code']}: {finding['message']}")
+
+
 def _validate(options: argparse.Namespace) -> None:
     from robotid.workflow import validate_result
 
@@ -160,6 +189,7 @@ def _job(options: argparse.Namespace) -> "Job":
         "torque": {"gains": _pairs(options.gain, "--gain")},
         "signals": {},
         "units": {},
+        "doctor": {"ignore": options.ignore},
     }
     if options.joints:
         table["joints"] = options.joints.split(",")
@@ -178,7 +208,7 @@ def _job(options: argparse.Namespace) -> "Job":
 
 _JOB_FLAGS = (
     "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
-    "time_unit", "angle_unit",
+    "ignore", "time_unit", "angle_unit",
 )  # fmt: skip
 
 

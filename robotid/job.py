@@ -41,7 +41,10 @@ _TABLE: dict[str, Any] = {
         "trim": _NUMBER,
         "min_velocity": _NUMBER,
         "max_gap": _NUMBER,
+        "torque_delay": _NUMBER,
+        "velocity_delay": _NUMBER,
     },
+    "doctor": {"ignore": list},
     "model": {"armature": bool, "friction": str, "offset": bool},
     "torque": {"gains": dict},
     "columns": dict,
@@ -88,6 +91,7 @@ class Job:
         estimator: The estimator and its settings.
         identification: Logs to fit.
         validation: Logs kept apart.
+        ignore: Codes of the doctor's errors that do not stop the identification.
     """
 
     urdf: Path
@@ -105,6 +109,7 @@ class Job:
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     identification: tuple[LogEntry, ...] = ()
     validation: tuple[LogEntry, ...] = ()
+    ignore: tuple[str, ...] = ()
 
     def model(self) -> RobotModel:
         """Return the robot.
@@ -192,6 +197,7 @@ class Job:
             },
             "identification": [_entry_settings(entry) for entry in self.identification],
             "validation": [_entry_settings(entry) for entry in self.validation],
+            "doctor": {"ignore": list(self.ignore)},
         }
 
 
@@ -270,6 +276,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             columns=table.get("columns", {}),
             units=LogUnits(**table.get("units", {})),
             estimator=EstimatorSettings(**table.get("estimator", {})),
+            ignore=tuple(table.get("doctor", {}).get("ignore", ())),
             **entries,
         )
     except SettingsError as error:

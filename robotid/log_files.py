@@ -197,7 +197,8 @@ class _Finder:
         if current and not has_gain:
             raise DataError(
                 f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
-                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains)"
+                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains)",
+                code="missing_gain",
             )
         return tau or current or self._missing("tau", joint)
 
@@ -225,7 +226,8 @@ class _Finder:
         near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
         raise DataError(
             f"{self.where} has no column {standard!r}; {noun} found: {found}. {hint.format(near)}"
-            f"Rename it, or pass columns={{{standard!r}: {near}}}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}",
+            code="missing_column",
         )
 
 

@@ -154,7 +154,8 @@ def _bad_cell(path: Path, names: list[str], columns: list[int], separator: str) 
                     hint = "; write decimals with a point" if "," in cells[i] else ""
                     return DataError(
                         f"{path.name}: {names[i]} is {found} at row {row}, wanted a number{hint}; "
-                        "remove the row or mend the recording"
+                        "remove the row or mend the recording",
+                        code="not_a_number",
                     )
     return DataError(f"{path.name} holds a cell that is not a plain decimal number")
 

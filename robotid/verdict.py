@@ -1,7 +1,7 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from robotid.metrics import JointMetrics, Metrics
 
@@ -21,12 +21,14 @@ class Finding:
         severity: "note", "warning" or "error".
         where: What it is about: a link, a joint, a parameter or a file.
         message: What was found, what was wanted, what to do.
+        evidence: The figures it rests on, by name.
     """
 
     code: str
     severity: str
     where: str
     message: str
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

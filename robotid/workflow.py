@@ -11,6 +11,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.data import Log
+from robotid.doctor import diagnose, refuse
 from robotid.exceptions import ModelError
 from robotid.identification import Identification, identify
 from robotid.job import Job, LogEntry, job_from_settings
@@ -56,6 +57,9 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
     logs = [job.read(entry, model) for entry in job.identification]
     kept = [job.read(entry, model) for entry in job.validation]
     findings = [*_locked_findings(job, model), *_log_findings([*logs, *kept])]
+    diagnosis = diagnose(model, logs, kept, job.signals)
+    refuse(diagnosis, job.ignore)
+    findings += [finding for finding in diagnosis if finding.severity != "note"]
     identification = identify(
         model, logs, validation=kept, signals=job.signals, estimator=job.estimator
     )
