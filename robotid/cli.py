@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid import __version__
+from robotid.console import print_files, print_inspection, print_result, print_table, print_verdict
 from robotid.exceptions import RobotIdError, SettingsError
 
 if TYPE_CHECKING:
@@ -80,6 +81,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_log_flags(track.add_argument_group("the log"))
     track.set_defaults(run=_track, validate=[], estimator=None)
 
+    doctor = commands.add_parser(
+        "doctor", help="what is wrong with logs: JOB.toml, or URDF LOG ..."
+    )
+    doctor.add_argument("source", metavar="JOB.toml | URDF")
+    doctor.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
+    doctor.add_argument("--json", action="store_true", help="print one JSON object")
+    _add_job_flags(doctor)
+    doctor.set_defaults(run=_doctor)
+
     validate = commands.add_parser("validate", help="measure a result's prediction on other logs")
     validate.add_argument("result", metavar="RESULT.json")
     validate.add_argument("logs", nargs="+", metavar="LOG")
@@ -116,6 +126,13 @@ def _add_log_flags(flags: "argparse._ArgumentGroup") -> None:
     flags.add_argument(
         "--dynamics", action="store_true", help="write friction into the URDF's <dynamics> too"
     )
+    flags.add_argument(
+        "--ignore",
+        action="append",
+        default=[],
+        metavar="CODE",
+        help="error of the doctor that you know better",
+    )
     flags.add_argument("--time-unit", metavar="UNIT", help="s, ms, us or ns")
     flags.add_argument("--angle-unit", metavar="UNIT", help="rad or deg")
     _add_source_flags(flags)
@@ -132,11 +149,11 @@ def _demo(options: argparse.Namespace) -> None:
 
     print("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
     identification, result, truth = run_demo(options.out)
-    _print_result(result)
+    print_result(result)
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
     print(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
-    _print_files(options.out, [*result["outputs"].values(), "result.json", "replay.html"])
+    print_files(options.out, [*result["outputs"].values(), "result.json", "replay.html"])
 
 
 def _paper(options: argparse.Namespace) -> None:
@@ -169,7 +186,7 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(content, allow_nan=False))
     else:
-        _print_inspection(content)
+        print_inspection(content)
     if content["structure"] is None:
         raise ModelError(f"no model can be built from {options.urdf}; see the findings")
 
@@ -181,8 +198,8 @@ def _identify(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(result, allow_nan=False))
         return
-    _print_result(result)
-    _print_files(options.out, [*result["outputs"].values(), "result.json"])
+    print_result(result)
+    print_files(options.out, [*result["outputs"].values(), "result.json"])
 
 
 def _track(options: argparse.Namespace) -> None:
@@ -206,7 +223,20 @@ def _track(options: argparse.Namespace) -> None:
         )
     for entry in found["base_parameters"]:
         print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
-    _print_files(options.out, [found["history"], "track.json"])
+    print_files(options.out, [found["history"], "track.json"])
+
+
+def _doctor(options: argparse.Namespace) -> None:
+    from robotid.doctor import examine, findings_to_dict
+
+    content = findings_to_dict(examine(_job(options)))
+    if options.json:
+        print(json.dumps(content, allow_nan=False))
+        return
+    for severity in ("error", "warning", "note"):
+        for finding in content["findings"]:
+            if finding["severity"] == severity:
+                print(f"{severity}: {finding['code']}: {finding['message']}")
 
 
 def _validate(options: argparse.Namespace) -> None:
@@ -219,8 +249,8 @@ def _validate(options: argparse.Namespace) -> None:
     print(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
         print(f"\n{recording['log']}")
-        _print_table(recording["per_joint"], {})
-    _print_verdict(found["verdict"])
+        print_table(recording["per_joint"], {})
+    print_verdict(found["verdict"])
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -267,6 +297,7 @@ def _job(options: argparse.Namespace) -> "Job":
         "torque": {"gains": _pairs(options.gain, "--gain")},
         "signals": {},
         "units": {},
+        "doctor": {"ignore": options.ignore},
     }
     if options.joints:
         table["joints"] = options.joints.split(",")
@@ -288,7 +319,7 @@ def _job(options: argparse.Namespace) -> "Job":
 
 _JOB_FLAGS = (
     "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
-    "time_unit", "angle_unit", "dynamics", "topic", "effort", "stamp",
+    "time_unit", "angle_unit", "dynamics", "topic", "effort", "stamp", "ignore",
 )  # fmt: skip
 
 
@@ -310,25 +341,6 @@ def _cutoff(word: str) -> float | bool:
         raise SettingsError(f"--cutoff {word!r}: wanted a frequency [Hz] or false") from error
 
 
-def _print_result(result: dict[str, Any]) -> None:
-    structure = result["structure"]
-    print(
-        f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
-        f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
-        f"total mass {result['consistency']['total_mass']:.2f} kg"
-    )
-    print("\nfitted recordings")
-    _print_table(
-        result["identification"]["per_joint"], result["wls"]["identification"]["per_joint"]
-    )
-    for ours, wls in zip(result["validation"], result["wls"]["validation"], strict=True):
-        print(f"\nkept apart: {ours['log']}")
-        _print_table(ours["per_joint"], wls["per_joint"])
-    for warning in result["warnings"]:
-        print(f"\n{warning['code']}: {warning['message']}")
-    _print_verdict(result["verdict"])
-
-
 def _print_paper(result: dict[str, Any]) -> None:
     columns = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
     print("relative error of the parameters; the last three columns at the end")
@@ -341,47 +353,3 @@ def _print_paper(result: dict[str, Any]) -> None:
     print("\nrandom motions that converged to 1e-3")
     for name, found in result["trajectories"].items():
         print(f"  {name:10} {found['converged']} of {found['runs']}")
-
-
-def _print_table(per_joint: dict[str, Any], wls: dict[str, Any]) -> None:
-    width = max(len(joint) for joint in per_joint)
-    print(f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %")
-    for joint, m in per_joint.items():
-        other = wls.get(joint, {}).get("relative_error_pct")
-        urdf, gravity = (m.get(f"{key}_relative_error_pct") for key in ("urdf", "gravity_only"))
-        cells = [_cell(other), _cell(urdf), _cell(gravity, 9)]
-        rmse = f"{m['rmse']:.3g} {m['unit']}"
-        error = _cell(m["relative_error_pct"], 7)
-        flag = "" if m.get("better_than_constant", True) else "  worse than a constant"
-        print(f"  {joint:{width}}  {error}   {rmse:10}{cells[0]} {cells[1]}  {cells[2]}{flag}")
-
-
-def _cell(value: float | None, width: int = 7) -> str:
-    return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
-
-
-def _print_verdict(verdict: dict[str, Any]) -> None:
-    print(f"\nverdict: {verdict['status']}")
-    for reason in verdict["reasons"]:
-        print(f"  - {reason}")
-
-
-def _print_files(folder: str, names: Sequence[str]) -> None:
-    print(f"\nwritten to {folder}:")
-    for name in names:
-        print(f"  {Path(folder) / name}")
-
-
-def _print_inspection(content: dict[str, Any]) -> None:
-    print(f"{content['robot']}: joints {', '.join(content['joints'])}")
-    if content["structure"]:
-        s = content["structure"]
-        print(
-            f"{s['standard']} standard inertial parameters, {s['base_inertial']} base; with drives "
-            f"{s['base']}"
-        )
-        for group in content["base_groups"]:
-            print(f"  {group}")
-    for finding in content["findings"]:
-        where = finding.get("link") or finding.get("joint") or ""
-        print(f"{finding['severity']}: {finding['code']} {where}: {finding['message']}")

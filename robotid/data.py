@@ -215,7 +215,8 @@ def _require_finite(values: Array, t: Array, names: Sequence[str], where: str) -
     at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
     raise DataError(
         f"{where}: {names[column]} is {found} at row {row}{at}; remove the row or mend the "
-        "recording"
+        "recording",
+        code="not_finite",
     )
 
 
@@ -228,11 +229,13 @@ def _require_increasing(t: Array, where: str) -> None:
     if t[k] == t[k - 1]:
         raise DataError(
             f"{where}: t must increase, but t[{k}] = {_stamp(t[k])} s is a duplicate time stamp, "
-            f"the same as t[{k - 1}]; remove one of the two rows"
+            f"the same as t[{k - 1}]; remove one of the two rows",
+            code="duplicate_stamp",
         )
     raise DataError(
         f"{where}: t must increase, but t[{k}] = {_stamp(t[k])} s follows t[{k - 1}] = "
-        f"{_stamp(t[k - 1])} s; sort the rows, or mend the recording"
+        f"{_stamp(t[k - 1])} s; sort the rows, or mend the recording",
+        code="stamp_order",
     )
 
 

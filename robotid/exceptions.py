@@ -22,7 +22,15 @@ class ModelError(RobotIdError, ValueError):
 
 
 class DataError(RobotIdError, ValueError):
-    """A log or an array does not hold what it must."""
+    """A log or an array does not hold what it must.
+
+    Attributes:
+        code: A fixed word for what is wrong.
+    """
+
+    def __init__(self, message: str, code: str = "unusable_log") -> None:
+        self.code = code
+        super().__init__(message)
 
 
 class SettingsError(RobotIdError, ValueError):

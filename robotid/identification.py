@@ -54,6 +54,7 @@ class Identification:
         base_error: Their standard errors, shape (b,); inf where the data say nothing.
         identification: The recordings that were fitted, with predictions "estimate" and "wls".
         validation: The same of the recordings that were kept apart.
+        alarms: Faults of the recordings that make the result wrong, as the doctor found them.
     """
 
     model: RobotModel
@@ -69,6 +70,7 @@ class Identification:
     base_error: Array
     identification: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
+    alarms: tuple[str, ...] = ()
 
     @property
     def is_consistent(self) -> bool:
@@ -118,6 +120,7 @@ class Identification:
             {e.recording.name: e.metrics["estimate"] for e in kept},
             undetermined=self.estimate.undetermined,
             is_consistent=self.is_consistent,
+            alarms=self.alarms,
         )
 
 

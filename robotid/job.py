@@ -42,7 +42,10 @@ _TABLE: dict[str, Any] = {
         "trim": _NUMBER,
         "min_velocity": _NUMBER,
         "max_gap": _NUMBER,
+        "torque_delay": _NUMBER,
+        "velocity_delay": _NUMBER,
     },
+    "doctor": {"ignore": list},
     "model": {"armature": bool, "friction": str, "offset": bool},
     "torque": {"gains": dict},
     "columns": dict,
@@ -107,6 +110,7 @@ class Job:
         dynamics: Whether the written URDF's ``<dynamics>`` also get the identified friction.
         identification: Logs to fit.
         validation: Logs kept apart.
+        ignore: Codes of the doctor's errors that the user knows better.
     """
 
     urdf: Path
@@ -126,6 +130,7 @@ class Job:
     dynamics: bool = False
     identification: tuple[LogEntry, ...] = ()
     validation: tuple[LogEntry, ...] = ()
+    ignore: tuple[str, ...] = ()
 
     def model(self) -> RobotModel:
         """Return the robot.
@@ -217,6 +222,7 @@ class Job:
             "output": {"dynamics": self.dynamics},
             "identification": [_entry_settings(entry) for entry in self.identification],
             "validation": [_entry_settings(entry) for entry in self.validation],
+            "doctor": {"ignore": list(self.ignore)},
         }
 
 
@@ -297,6 +303,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             units=LogUnits(**table.get("units", {})),
             estimator=EstimatorSettings(**table.get("estimator", {})),
             dynamics=table.get("output", {}).get("dynamics", False),
+            ignore=tuple(table.get("doctor", {}).get("ignore", ())),
             **entries,
         )
     except SettingsError as error:

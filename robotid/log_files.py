@@ -211,7 +211,8 @@ class _Finder:
             raise DataError(
                 f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
                 f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains; "
-                f"CLI --gain {joint}=...)"
+                f"CLI --gain {joint}=...)",
+                code="missing_gain",
             )
         return tau or current or self._missing("tau", joint)
 
@@ -246,7 +247,8 @@ class _Finder:
         near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
         raise DataError(
             f"{self.where} has no column {sought!r}; {noun} found: {found}. {hint.format(near)}"
-            f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}",
+            code="missing_column",
         )
 
 

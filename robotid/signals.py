@@ -37,6 +37,8 @@ class SignalSettings:
             identified [rad/s or m/s]; 0 keeps all rows.
         max_gap: A longer step between two rows is a gap [s]; None: 2.5 median steps, or a quarter
             of the filter's period if that is longer.
+        torque_delay: How late the log has the torque against the position [s]; it is moved back.
+        velocity_delay: The same of the measured velocity [s].
     """
 
     rate: float | None = None
@@ -47,6 +49,8 @@ class SignalSettings:
     trim: float = 0.2
     min_velocity: float = 0.02
     max_gap: float | None = None
+    torque_delay: float = 0.0
+    velocity_delay: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("velocity", "acceleration"):
@@ -63,6 +67,10 @@ class SignalSettings:
             value = getattr(self, name)
             if not value >= 0:
                 raise SettingsError(f"{name} is {value}, wanted 0 or a positive number")
+        for name in ("torque_delay", "velocity_delay"):
+            value = getattr(self, name)
+            if not abs(value) <= 1:
+                raise SettingsError(f"{name} is {value}, wanted seconds between -1 and 1")
         if not 1 <= self.order <= 10:
             raise SettingsError(f"order is {self.order}, wanted 1 to 10")
 
@@ -98,7 +106,7 @@ def resolve(log: Log, settings: SignalSettings) -> SignalSettings:
             "columns, or set velocity = 'differentiated'"
         )
     if velocity == "auto":
-        is_timely = log.v is not None and velocity_lag(log) < _LATE
+        is_timely = log.v is not None and velocity_lag(log) - settings.velocity_delay < _LATE
         velocity = "measured" if is_timely else "differentiated"
     acceleration = settings.acceleration
     if acceleration == "measured" and log.a is None:
@@ -140,7 +148,8 @@ def process(log: Log, settings: SignalSettings) -> Trajectory:
         raise DataError(
             f"{log.path or 'log'}: none of its {len(breaks) + 1} uninterrupted stretches is long "
             f"enough for the filter and a trim of {settings.trim:g} s at each end; record longer, "
-            "or lower trim"
+            "or lower trim",
+            code="too_short",
         )
     t, q, v, a, tau = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     segment = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
@@ -216,7 +225,8 @@ def unwrap(log: Log, is_free: Array) -> Log:
         k = int(np.argmax(jumps[:, j]))
         raise DataError(
             f"{log.path or 'log'}: q_{log.joints[j]} jumps by a full turn at t = "
-            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; mend the recording"
+            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; mend the recording",
+            code="full_turn",
         )
     if not turned.any():
         return log
@@ -248,8 +258,9 @@ def _process_stretch(
         channels["v"] = log.v
     if settings.acceleration == "measured" and log.a is not None:
         channels["a"] = log.a
+    late = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
-        name: _filter(_resample(t, values[rows], grid), grid, settings)
+        name: _filter(_resample(t - late.get(name, 0.0), values[rows], grid), grid, settings)
         for name, values in channels.items()
     }
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], grid, axis=0)
@@ -279,7 +290,8 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
         return values
     from scipy.interpolate import CubicSpline
 
-    resampled: Array = CubicSpline(t, values, axis=0)(grid)
+    # of a channel moved in time nothing is known beyond its own ends
+    resampled: Array = CubicSpline(t, values, axis=0)(np.clip(grid, t[0], t[-1]))
     return resampled
 
 

@@ -70,7 +70,8 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     for j in np.flatnonzero(_is_near(factor, -1.0)):
         raise DataError(
             f"{where}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of q_{log.joints[j]}. "
-            "Negate one of them in the recording, or leave the dq columns out"
+            "Negate one of them in the recording, or leave the dq columns out",
+            code="velocity_sign",
         )
 
 
@@ -82,7 +83,8 @@ def _check_step(step: float, where: str) -> None:
     raise DataError(
         f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]} "
         f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
-        f"{_how_to_state('time', unit, 's')}"
+        f"{_how_to_state('time', unit, 's')}",
+        code="time_unit",
     )
 
 
@@ -93,7 +95,8 @@ def _check_clock(log: Log, factor: Array, where: str) -> None:
             looks = f"; the time looks like {_TIME_NAMES[unit]}" if power > 0 else ""
             raise DataError(
                 f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt{looks}. "
-                f"{_how_to_state('time', unit, 's')}"
+                f"{_how_to_state('time', unit, 's')}",
+                code="time_unit",
             )
 
 
@@ -104,7 +107,8 @@ def _check_reach(log: Log, turns: NDArray[np.bool_], where: str) -> None:
     if reach[j] > _FARTHEST:
         raise DataError(
             f"{where}: q_{log.joints[j]} reaches {reach[j]:.4g}, which looks like degrees (in "
-            f"radians {reach[j] / (2 * np.pi):.1f} turns). {_how_to_state('angle', 'deg', 'rad')}"
+            f"radians {reach[j] / (2 * np.pi):.1f} turns). {_how_to_state('angle', 'deg', 'rad')}",
+            code="angle_unit",
         )
 
 
@@ -115,7 +119,8 @@ def _check_degrees(log: Log, factor: Array, where: str) -> None:
             raise DataError(
                 f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the {wrong} "
                 "looks like degrees, the other like radians. Convert one of them in the recording. "
-                f"{_how_to_state('angle', 'deg', 'rad', both=True)}"
+                f"{_how_to_state('angle', 'deg', 'rad', both=True)}",
+                code="angle_unit",
             )
 
 

@@ -1,7 +1,7 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from robotid.metrics import JointMetrics, Metrics
 
@@ -21,12 +21,14 @@ class Finding:
         severity: "note", "warning" or "error".
         where: What it is about: a link, a joint, a parameter or a file.
         message: What was found, what was wanted, what to do.
+        evidence: The figures it rests on, by name.
     """
 
     code: str
     severity: str
     where: str
     message: str
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ def judge(
     *,
     undetermined: Sequence[str],
     is_consistent: bool,
+    alarms: Sequence[str] = (),
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -56,6 +59,7 @@ def judge(
         validation: Metrics of each kept recording, by its name.
         undetermined: Base parameters about which the data say nothing.
         is_consistent: Whether the parameters are physically possible.
+        alarms: Faults of the recordings that make any result of them wrong.
 
     Returns:
         The verdict. Without a kept recording it is at best "usable".
@@ -69,6 +73,7 @@ def judge(
             worse, doubt = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
             poor += worse
             doubts += doubt
+    poor = [*alarms, *sorted(poor, key=_rank)]
     missing = sorted(
         {joint for m in validation.values() for joint in identification.per_joint}
         - {joint for m in validation.values() for joint in m.per_joint}
@@ -118,6 +123,11 @@ def _judge_joint(
             f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted"
         ]
     return [], []
+
+
+def _rank(reason: str) -> int:
+    """Return 0 for what is worse than a constant, 1 for worse than the URDF, 2 for the rest."""
+    return 0 if "a constant" in reason else 1 if "the URDF" in reason else 2
 
 
 def _error(measured: JointMetrics) -> float:

@@ -4,6 +4,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.data import Log
+from robotid.doctor import alarming, diagnose
 from robotid.exceptions import ModelError
 from robotid.identification import Identification, identify
 from robotid.job import Job, LogEntry, job_from_settings
@@ -56,9 +58,13 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
     logs = [job.read(entry, model) for entry in job.identification]
     kept = [job.read(entry, model) for entry in job.validation]
     findings = [*_locked_findings(job, model), *_log_findings([*logs, *kept])]
+    diagnosis = diagnose(model, logs, kept, job.signals)
+    alarms = tuple(finding.message for finding in alarming(diagnosis, job.ignore))
+    findings += [finding for finding in diagnosis if finding.severity != "note"]
     identification = identify(
         model, logs, validation=kept, signals=job.signals, estimator=job.estimator
     )
+    identification = replace(identification, alarms=alarms)
     findings += _fit_findings(identification)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)

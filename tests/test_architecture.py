@@ -17,15 +17,16 @@ PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings lanes lapack log_source",
+    "innovations online_settings lanes lapack log_source console",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags",
-    3: "array_files estimators plant lumping prior rows",
+    3: "array_files estimators plant lumping prior rows log_checks channel_checks",
     4: "regressor excitation tables",
-    5: "validation sidecar estimator_settings simulation dynamics log_files",
-    6: "identification closed_loop conversion",
-    7: "online urdf job visualization report_plots paper_simulation paper_trajectories",
-    8: "report_page result inspection paper_errata",
+    5: "validation sidecar estimator_settings simulation dynamics log_files probe",
+    6: "identification closed_loop conversion explanations load_checks motion_checks",
+    7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
+    "model_checks",
+    8: "report_page result inspection paper_errata doctor",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
     11: "workflow",

@@ -33,6 +33,18 @@ def test_worse_than_a_constant_is_said_first():
     assert found.reasons[0] == "b: worse than a constant torque on val.csv (40.0 %)"
 
 
+def test_alarms_come_before_everything_and_constants_before_the_rest():
+    joints = {"a": joint(60.0), "b": joint(40.0, constant=False)}
+    logs = {"val.csv": Metrics(joints, 1.0)}
+    found = judge(
+        Metrics({}, 1.0), logs, undetermined=(), is_consistent=True, alarms=["torque of c swapped"]
+    )
+    assert found.status == "poor"
+    assert found.reasons[0] == "torque of c swapped"
+    assert found.reasons[1].startswith("b: worse than a constant")
+    assert found.reasons[2].startswith("a: predicted to 60.0 % only")
+
+
 def test_worse_than_the_urdf_is_poor():
     found = verdict({"a": joint(8.0, urdf=6.0)})
     assert found.status == "poor"

@@ -1,0 +1,156 @@
+"""The doctor's confusion table: what it finds in clean logs, spoilt logs and real recordings.
+
+Each row is a way to spoil a clean simulated log of a UR5 that its URDF does not describe (other
+masses, a tool, friction, noise); the columns are the findings of severity warning or error and,
+for what must be found, of any severity, as shares of the seeds.
+
+    python benchmarks/bench_doctor.py [--quick] [--seeds N]
+"""
+
+import argparse
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections import Counter
+from importlib.metadata import version
+from pathlib import Path
+
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from corruptions import CASES, ROBOTS, clean_log, robot, table_of
+
+from robotid.doctor import diagnose, examine
+from robotid.examples import example_urdf
+from robotid.job import Job, LogEntry, read_job
+from robotid.parameters import INERTIAL_TERMS
+from robotid.signals import SignalSettings
+from robotid.simulation import another_robot
+from robotid.tables import write_columns
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="one seed")
+    parser.add_argument("--seeds", type=int, default=8)
+    options = parser.parse_args()
+    seeds = range(1 if options.quick else options.seeds)
+    clean(seeds)
+    spoilt(seeds)
+    same_motion(seeds)
+    payload(seeds)
+    recordings()
+    speed()
+    print(
+        f"\nPython {platform.python_version()}, pin {version('pin')}, numpy {version('numpy')}, "
+        f"{platform.machine()}, {os.cpu_count()} cores"
+    )
+
+
+def clean(seeds):
+    print(
+        "\nclean simulated logs: findings above a note\n"
+        "\n| robot | logs | findings |\n|---|---|---|"
+    )
+    for name in ROBOTS:
+        model, found = robot(name), Counter()
+        for seed in seeds:
+            found.update(loud(diagnose(model, [clean_log(model, seed)], [], SignalSettings())))
+        print(f"| {name} | {len(seeds)} | {dict(found) or 'none'} |")
+
+
+def spoilt(seeds):
+    print(f"\nspoilt logs of a UR5, {len(seeds)} seeds each\n")
+    print("| corruption | wanted | found | other findings above a note |\n|---|---|---|---|")
+    model = robot("ur5")
+    tables = [table_of(clean_log(model, seed)) for seed in seeds]
+    hits = 0
+    for name, case in CASES.items():
+        found, other = 0, Counter()
+        for table in tables:
+            findings = examine_table(case, table)
+            found += any(f.code in case.codes for f in findings)
+            other.update(loud(findings) - set(case.codes))
+        hits += found
+        side = ", ".join(f"{code} {count}/{len(seeds)}" for code, count in other.most_common())
+        print(f"| {name} | {', '.join(case.codes)} | {found}/{len(seeds)} | {side or '-'} |")
+    print(f"\nfound by their own code: {hits} of {len(CASES) * len(seeds)}")
+
+
+def examine_table(case, table):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.csv"
+        write_columns(case.change(table), path)
+        job = Job(
+            urdf=example_urdf(case.urdf), gravity=case.gravity, identification=(LogEntry(path),)
+        )
+        return examine(job)
+
+
+def same_motion(seeds):
+    model, found, false = robot("ur5"), 0, 0
+    for seed in seeds:
+        first, again = clean_log(model, seed), clean_log(model, seed, rate=125.0)
+        other = clean_log(model, seed + 1000)
+        found += "repeated_motion" in loud(diagnose(model, [first], [again], SignalSettings()))
+        false += "repeated_motion" in loud(diagnose(model, [first], [other], SignalSettings()))
+    print(f"\nsame motion recorded again for validation: found {found}/{len(seeds)}")
+    print(f"another motion for validation: found {false}/{len(seeds)}")
+
+
+def payload(seeds):
+    print("\n| payload on a UR5 | payload found (warning) | mean estimate [kg] |\n|---|---|---|")
+    model = robot("ur5")
+    for mass in (0.0, 1.5, 3.0, 5.0):
+        found, estimates = 0, []
+        for seed in seeds:
+            findings = diagnose(model, [loaded_log(model, seed, mass)], [], SignalSettings())
+            found += "payload" in loud(findings)
+            estimates += [f.evidence["mass"] for f in findings if f.code == "payload"]
+        mean = f"{sum(estimates) / len(estimates):.2f}" if estimates else "-"
+        print(f"| {mass:g} kg beside the 1.2 kg tool | {found}/{len(seeds)} | {mean} |")
+
+
+def loaded_log(model, seed, mass):
+    import numpy as np
+
+    pi = another_robot(model, np.random.default_rng(seed))
+    last = pi[: model.layout.n_inertial].reshape(-1, len(INERTIAL_TERMS))[-1]
+    last += mass * np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
+    return clean_log(model, seed, pi=pi)
+
+
+def recordings():
+    if "ROBOTID_DATA" not in os.environ:
+        print("\nno real recordings: set ROBOTID_DATA to their folder")
+        return
+    print("\n| recording | findings above a note | notes | s |\n|---|---|---|---|")
+    for path in sorted((ROOT / "tests" / "jobs").glob("*.toml")):
+        start = time.perf_counter()
+        findings = examine(read_job(path))
+        seconds = time.perf_counter() - start
+        shown = Counter(f"{f.code} ({f.severity})" for f in findings if f.severity != "note")
+        notes = sorted({f.code for f in findings if f.severity == "note"})
+        loudly = ", ".join(f"{code} x{count}" for code, count in shown.items())
+        print(f"| {path.stem} | {loudly or '-'} | {', '.join(notes)} | {seconds:.1f} |")
+
+
+def speed():
+    model = robot("panda")
+    log = clean_log(model, 0, rate=1000.0)
+    start = time.perf_counter()
+    diagnose(model, [log], [], SignalSettings())
+    print(f"\n{len(log.t)} samples of 7 joints: {time.perf_counter() - start:.2f} s")
+
+
+def loud(findings):
+    return {f.code for f in findings if f.severity != "note"}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""Results as text on a terminal."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = ["print_files", "print_inspection", "print_result", "print_table", "print_verdict"]
+
+
+def print_result(result: dict[str, Any]) -> None:
+    """Print what an identification found.
+
+    Args:
+        result: The content of result.json.
+    """
+    structure = result["structure"]
+    print(
+        f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
+        f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
+        f"total mass {result['consistency']['total_mass']:.2f} kg"
+    )
+    print("\nfitted recordings")
+    print_table(result["identification"]["per_joint"], result["wls"]["identification"]["per_joint"])
+    for ours, wls in zip(result["validation"], result["wls"]["validation"], strict=True):
+        print(f"\nkept apart: {ours['log']}")
+        print_table(ours["per_joint"], wls["per_joint"])
+    for warning in result["warnings"]:
+        print(f"\n{warning['code']}: {warning['message']}")
+    print_verdict(result["verdict"])
+
+
+def print_table(per_joint: dict[str, Any], wls: dict[str, Any]) -> None:
+    """Print the metrics of each joint.
+
+    Args:
+        per_joint: Metrics by joint, as in result.json.
+        wls: Those of weighted least squares, or none.
+    """
+    width = max(len(joint) for joint in per_joint)
+    print(f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %")
+    for joint, m in per_joint.items():
+        other = wls.get(joint, {}).get("relative_error_pct")
+        urdf, gravity = (m.get(f"{key}_relative_error_pct") for key in ("urdf", "gravity_only"))
+        cells = [_cell(other), _cell(urdf), _cell(gravity, 9)]
+        rmse = f"{m['rmse']:.3g} {m['unit']}"
+        error = _cell(m["relative_error_pct"], 7)
+        flag = "" if m.get("better_than_constant", True) else "  worse than a constant"
+        print(f"  {joint:{width}}  {error}   {rmse:10}{cells[0]} {cells[1]}  {cells[2]}{flag}")
+
+
+def _cell(value: float | None, width: int = 7) -> str:
+    return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
+
+
+def print_verdict(verdict: dict[str, Any]) -> None:
+    """Print a verdict with its reasons.
+
+    Args:
+        verdict: Status and reasons, as in result.json.
+    """
+    print(f"\nverdict: {verdict['status']}")
+    for reason in verdict["reasons"]:
+        print(f"  - {reason}")
+
+
+def print_files(folder: str, names: Sequence[str]) -> None:
+    """Print which files were written.
+
+    Args:
+        folder: Where.
+        names: Their names.
+    """
+    print(f"\nwritten to {folder}:")
+    for name in names:
+        print(f"  {Path(folder) / name}")
+
+
+def print_inspection(content: dict[str, Any]) -> None:
+    """Print what a URDF holds.
+
+    Args:
+        content: What ``robotid inspect --json`` prints.
+    """
+    print(f"{content['robot']}: joints {', '.join(content['joints'])}")
+    if content["structure"]:
+        s = content["structure"]
+        print(
+            f"{s['standard']} standard inertial parameters, {s['base_inertial']} base; with drives "
+            f"{s['base']}"
+        )
+        for group in content["base_groups"]:
+            print(f"  {group}")
+    for finding in content["findings"]:
+        where = finding.get("link") or finding.get("joint") or ""
+        print(f"{finding['severity']}: {finding['code']} {where}: {finding['message']}")

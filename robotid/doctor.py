@@ -1,0 +1,199 @@
+"""The doctor: what is wrong with logs, or with the URDF for them, before anything is identified.
+
+Findings never change data. An error is what would give a wrong answer; it stops an identification
+unless its code is ignored.
+"""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from robotid.channel_checks import (
+    check_clipping,
+    check_noise,
+    check_quantisation,
+    check_spikes,
+    check_velocity_delay,
+    check_velocity_order,
+)
+from robotid.data import Log, Trajectory
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification import structural_mapping
+from robotid.job import Job, LogEntry
+from robotid.log_checks import (
+    check_clock,
+    check_gaps,
+    check_stale_rows,
+    check_standstill,
+    check_static,
+)
+from robotid.model import RobotModel
+from robotid.model_checks import check_torque_delay, check_torques
+from robotid.motion_checks import check_excitation, check_repeated_motion
+from robotid.probe import Probe, smooth_motion, take_probe
+from robotid.signals import SignalSettings
+from robotid.verdict import Finding
+
+__all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
+
+#: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
+CODES = (
+    "gravity", "joint_order", "position_offset", "position_order", "position_sign", "spikes",
+    "torque_order", "torque_sign", "velocity_order",
+)  # fmt: skip
+_RANK = {"error": 0, "warning": 1, "note": 2}
+_FINE = 1500  # instants for the delay of the torque
+
+
+def examine(job: Job) -> tuple[Finding, ...]:
+    """Examine the logs of a job.
+
+    Args:
+        job: The job. A log that cannot be read gives a finding, not an error.
+
+    Returns:
+        The findings, errors first.
+
+    Raises:
+        ModelError: If the URDF cannot be used.
+        SettingsError: If a setting does not fit.
+    """
+    model = job.model()
+    findings: list[Finding] = []
+    fitted, kept = (
+        _read(job, model, entries, findings) for entries in (job.identification, job.validation)
+    )
+    return _sorted([*findings, *diagnose(model, fitted, kept, job.signals)])
+
+
+def diagnose(
+    model: RobotModel, fitted: Sequence[Log], kept: Sequence[Log], signals: SignalSettings
+) -> tuple[Finding, ...]:
+    """Examine logs that were read.
+
+    Args:
+        model: The robot.
+        fitted: Logs to fit, of the model's joints in its order.
+        kept: Logs kept apart to validate with.
+        signals: How the logs become trajectories.
+
+    Returns:
+        The findings, errors first.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
+    findings: list[Finding] = []
+    motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
+    first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
+    for log, (motion, _) in zip(kept, motions[len(fitted) :], strict=True):
+        if motion is not None:
+            findings += check_repeated_motion(first, motion, _name(log))
+    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+    if probes:
+        names = ", ".join(_name(log) for log in fitted)
+        findings += check_excitation(structural_mapping(model), probes, names)
+    return _sorted(findings)
+
+
+def alarming(findings: Sequence[Finding], ignore: Sequence[str]) -> tuple[Finding, ...]:
+    """Return the findings that make an identification wrong, but for those the user knows better.
+
+    Args:
+        findings: What the doctor found.
+        ignore: Codes of errors that the user knows better.
+
+    Returns:
+        The errors that are not ignored.
+
+    Raises:
+        SettingsError: If a code to ignore is unknown.
+    """
+    for code in ignore:
+        if code not in CODES:
+            near = difflib.get_close_matches(code, CODES, n=1)
+            hint = f". Did you mean {near[0]!r}?" if near else ""
+            raise SettingsError(
+                f"doctor: ignore names {code!r}, wanted some of {list(CODES)}{hint}"
+            )
+    return tuple(f for f in findings if f.severity == "error" and f.code not in ignore)
+
+
+def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return findings as plain values, as ``robotid doctor --json`` prints them.
+
+    Args:
+        findings: The findings.
+
+    Returns:
+        {"findings": [{"code", "severity", "where", "message", "evidence"}]}.
+    """
+    return {
+        "findings": [
+            {
+                "code": finding.code,
+                "severity": finding.severity,
+                "where": finding.where,
+                "message": finding.message,
+                "evidence": {key: float(value) for key, value in finding.evidence.items()},
+            }
+            for finding in findings
+        ]
+    }
+
+
+def _read(
+    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
+) -> list[Log]:
+    """Return the logs that can be read; why the others cannot goes to the findings."""
+    logs = []
+    for entry in entries:
+        try:
+            logs.append(job.read(entry, model))
+        except DataError as error:
+            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
+    return logs
+
+
+def _examine_log(
+    model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
+) -> tuple[Trajectory | None, Probe | None]:
+    """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
+    name = _name(log)
+    findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in log.notes]
+    for check in (check_clock, check_gaps, check_stale_rows, check_quantisation, check_clipping):
+        findings += check(log)
+    for check in (check_spikes, check_noise, check_velocity_order):
+        findings += check(log)
+    findings += check_velocity_delay(log, signals.velocity_delay)
+    if model.free_flyer:
+        message = f"{name}: torques of a robot with a floating base are not judged"
+        findings.append(Finding("floating_base", "note", name, message))
+        return None, None
+    try:
+        motion = smooth_motion(model, log, signals)
+    except DataError as error:
+        findings.append(Finding(error.code, "error", name, str(error)))
+        return None, None
+    findings += check_standstill(log, motion.t, motion.v)
+    findings += check_static(log, motion.q, motion.v, model.layout.prismatic)
+    probe = take_probe(model, motion)
+    fine = take_probe(model, motion, samples=_FINE)
+    if probe is None or fine is None:
+        message = f"{name}: too little moves to judge torques by; record motion of every joint"
+        findings.append(Finding("no_motion", "warning", name, message))
+        return motion, None
+    torques = list(check_torques(probe, name))
+    findings += torques
+    if not any(finding.severity == "error" for finding in torques):
+        findings += check_torque_delay(fine, signals.cutoff, name)
+    return motion, probe
+
+
+def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    return tuple(sorted(findings, key=lambda finding: _RANK[finding.severity]))
+
+
+def _name(log: Log) -> str:
+    return Path(log.path).name or "log"

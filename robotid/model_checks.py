@@ -1,0 +1,269 @@
+"""Do the torques fit the model: signs, order of columns, gravity, positions, delay, excitation."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.explanations import Explanation, explanations
+from robotid.load_checks import check_loads
+from robotid.probe import Probe
+from robotid.verdict import Finding
+
+__all__ = ["check_torque_delay", "check_torques"]
+
+_CERTAIN = 2.5  # gain in the logarithm of the unexplained share, a factor 12, that is no chance
+_EXPLAINED = 0.2  # a reading that explains no torque better than this proves nothing
+_WRONG = 0.5  # a torque of the right sign is explained at least this well
+_EXCUSED = 0.3  # a torque that is explained so well with some load may have the right sign
+_TILT = 5.0  # [deg] gravity farther than this off is worth a warning
+_TURNED = 30.0  # [deg] ... and farther than this gives wrong answers
+_HINT = 0.7  # gain from which a tilt is believed
+_UNEXPLAINED = 0.25  # share of a torque's variance that no physics explains
+_LONGEST = 0.1  # [s] delays are sought up to this
+_FEW = 100  # rows from which a joint has a say in the delay
+_LATE = 0.01  # [s] a shorter delay of the torque is within the errors of friction models
+
+
+def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
+    """Yield what must be otherwise for the torques to fit the model.
+
+    The reading that explains the torques best is named, and only it; where the log is right as it
+    stands, the URDF's masses are checked.
+
+    Args:
+        probe: The motion.
+        name: What the log is called.
+
+    Yields:
+        Errors "torque_sign", "torque_order", "joint_order", "position_order", "position_sign",
+        "position_offset" or "gravity", or else what :func:`check_loads` yields; and
+        "unexplained_torque".
+    """
+    stated, loaded, others = explanations(probe)
+    best = min(others, key=lambda e: e.misfit)
+    found = list(_FINDINGS[best.kind](probe, stated, best, stated.misfit - best.misfit, name))
+    for finding in found:
+        # what a load on the last link would explain as well is no error for certain
+        excused = _is_excused(best, loaded)
+        yield replace(finding, severity="warning") if excused else finding
+    if not found:
+        yield from check_loads(probe, loaded.share, name)
+        yield from _unexplained(probe, loaded, name)
+
+
+def check_torque_delay(probe: Probe, cutoff: float | None, name: str) -> Iterator[Finding]:
+    """Yield how late the torque is against the position.
+
+    The delay minimises what the regressor leaves of the delayed torque, rows near a change of
+    direction apart; its uncertainty is the jackknife's over the joints.
+
+    Args:
+        probe: The motion.
+        cutoff: Cut-off of the filter that smoothed it [Hz], or None.
+        name: What the log is called.
+
+    Yields:
+        At most one "torque_delay".
+    """
+    delays = np.linspace(-_LONGEST, _LONGEST, 41)
+    torques = np.array([probe.torque_after(d) for d in delays])  # (D, N, n)
+    width = 1.0 / (cutoff or 20.0)
+    curves = [_residual_curve(probe, torques, j, width) for j in range(probe.tau.shape[1])]
+    told = np.array([curve for curve in curves if curve is not None])
+    if len(told) < 2:
+        return
+    delay = _minimum(delays, told.sum(axis=0))
+    without = [_minimum(delays, np.delete(told, j, axis=0).sum(axis=0)) for j in range(len(told))]
+    if not np.isfinite([delay, *without]).all():
+        return
+    n = len(told)
+    error = float(np.sqrt((n - 1) / n * np.sum((np.array(without) - np.mean(without)) ** 2)))
+    error = max(error, 0.001)
+    late = abs(delay) > max(_LATE, 3 * error)
+    message = (
+        f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
+        + (
+            f"; mend the logger's clock, or state [signals] torque_delay = {delay:.4f}"
+            if late
+            else ", no more than unmodelled friction may feign; nothing needs doing"
+        )
+    )
+    evidence = {"delay": delay, "std_error": error}
+    yield Finding("torque_delay", "warning" if late else "note", name, message, evidence)
+
+
+def _no_finding(*_: object) -> Iterator[Finding]:
+    yield from ()
+
+
+def _sign(
+    probe: Probe, stated: Explanation, best: Explanation, _gain: float, name: str
+) -> Iterator[Finding]:
+    for j in best.joints:
+        before, after = float(stated.share[j]), float(best.share[j])
+        if before < _WRONG or after > _EXPLAINED:
+            continue
+        joint = probe.model.joints[j]
+        message = (
+            f"{name}: the torque of {joint} has the opposite sign: as it is, {100 * before:.0f} % "
+            f"of its variance cannot be explained, negated {100 * after:.2g} %; negate tau_{joint} "
+            "(or its gain), or check the joint's axis in the URDF"
+        )
+        evidence = {"unexplained": before, "unexplained_if_negated": after}
+        yield Finding("torque_sign", "error", f"{name}: {joint}", message, evidence)
+
+
+def _exchanged(
+    probe: Probe, stated: Explanation, best: Explanation, gain: float, name: str
+) -> Iterator[Finding]:
+    if not _is_certain(best, gain):
+        return
+    names = [probe.model.joints[j] for j in best.joints]
+    if best.kind == "torque_order":
+        owners = [probe.model.joints[int(best.values[j])] for j in best.joints]
+        shown = ", ".join(f"tau_{a} is that of {b}" for a, b in zip(names, owners, strict=True))
+        what, todo = f"torque columns are exchanged: {shown}", "rename these torque columns"
+    elif best.kind == "position_order":
+        what, todo = f"the position columns of {names} are exchanged", "rename them"
+    else:
+        what, todo = f"all columns of {names} are exchanged", "name the joints rightly"
+    message = (
+        f"{name}: {what}: so read, the unexplained share of the worst torque falls from "
+        f"{100 * stated.share.max():.2g} to {100 * best.share.max():.2g} %; {todo}"
+    )
+    where = f"{name}: {', '.join(names)}"
+    yield Finding(best.kind, "error", where, message, _shares(stated, best, gain))
+
+
+def _position(
+    probe: Probe, stated: Explanation, best: Explanation, gain: float, name: str
+) -> Iterator[Finding]:
+    if not _is_certain(best, gain):
+        return
+    joint = probe.model.joints[best.joints[0]]
+    if best.kind == "position_sign":
+        what = f"the position of {joint} has the opposite sign; negate q_{joint} (and dq_{joint})"
+    else:
+        what = (
+            f"the zero of {joint} is off by about {best.values[0]:.2g} rad; correct q_{joint} or "
+            "the joint's origin in the URDF"
+        )
+    message = (
+        f"{name}: {what}: so read, the unexplained share of the worst torque falls from "
+        f"{100 * stated.share.max():.2g} to {100 * best.share.max():.2g} %"
+    )
+    where = f"{name}: {joint}"
+    yield Finding(best.kind, "error", where, message, _shares(stated, best, gain))
+
+
+def _gravity(
+    probe: Probe, stated: Explanation, best: Explanation, gain: float, name: str
+) -> Iterator[Finding]:
+    g, believed = np.array(best.values), probe.gravity
+    size = float(np.linalg.norm(believed))
+    cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    turned = angle > _TURNED and _is_certain(best, gain)
+    if not turned and (angle < _TILT or gain < _HINT):
+        return
+    shown = ", ".join(f"{x:.2f}" for x in g)
+    message = (
+        f"{name}: gravity along [{shown}] m/s^2 explains the torques best, {angle:.0f} degrees "
+        f"from the stated [{', '.join(f'{x:.2f}' for x in believed)}]; if the robot is mounted on "
+        f"a wall, a ceiling or a slope, state gravity = [{shown}] in the job file"
+    )
+    evidence = {"angle_deg": angle, "x": g[0], "y": g[1], "z": g[2], "gain": gain}
+    severity = "error" if turned else "warning"
+    yield Finding("gravity", severity, name, message, {k: float(v) for k, v in evidence.items()})
+
+
+_Maker = Callable[[Probe, Explanation, Explanation, float, str], Iterator[Finding]]
+_FINDINGS: dict[str, _Maker] = {
+    "stated": _no_finding,
+    "torque_sign": _sign,
+    "torque_order": _exchanged,
+    "joint_order": _exchanged,
+    "position_order": _exchanged,
+    "position_sign": _position,
+    "position_offset": _position,
+    "gravity": _gravity,
+}
+
+
+def _is_excused(best: Explanation, loaded: Explanation) -> bool:
+    if best.kind == "torque_sign":
+        return any(loaded.share[j] < _EXCUSED for j in best.joints)
+    return loaded.misfit - best.misfit < _CERTAIN
+
+
+def _is_certain(best: Explanation, gain: float) -> bool:
+    return gain > _CERTAIN and float(np.median(best.share)) < _EXPLAINED
+
+
+def _shares(stated: Explanation, best: Explanation, gain: float) -> dict[str, float]:
+    return {
+        "unexplained": float(stated.share.max()),
+        "unexplained_so_read": float(best.share.max()),
+        "gain": gain,
+    }
+
+
+def _unexplained(probe: Probe, stated: Explanation, name: str) -> Iterator[Finding]:
+    for j in np.flatnonzero(stated.share > _UNEXPLAINED):
+        joint, share = probe.model.joints[j], float(stated.share[j])
+        message = (
+            f"{name}: {100 * share:.0f} % of the variance of {joint}'s torque fits neither "
+            "gravity, inertia nor friction: the channel may hold another quantity, little but "
+            "noise, or a drive that is coupled to others; what depends on it is not to be trusted"
+        )
+        where = f"{name}: {joint}"
+        yield Finding("unexplained_torque", "warning", where, message, {"share": share})
+
+
+def _residual_curve(probe: Probe, torques: Array, j: int, width: float) -> Array | None:
+    """Return log of what is unexplained of joint j's torque at each delay, shape (D,)."""
+    rows = _steady_rows(probe, j, width)
+    if rows.sum() < _FEW:
+        return None
+    tau = torques[:, rows, j]
+    tau = tau - tau.mean(axis=1, keepdims=True)
+    size = np.einsum("dk,dk->d", tau, tau)
+    v = probe.v[:, j]
+    top = float(np.abs(v).max())
+    if size.min() <= 0:
+        return None
+    # friction of any odd curve of the speed, so that it is not taken for a delay
+    friction = np.column_stack([np.tanh(v / (0.1 * top)), np.tanh(v / (0.3 * top)), v * np.abs(v)])
+    carried = probe.model.support()[j, : probe.model.layout.n_inertial]
+    X = np.hstack([probe.regressor()[:, j][:, carried], probe.drive(j), friction])[rows]
+    length = np.linalg.norm(X, axis=0)
+    U, s, _ = np.linalg.svd(X / np.where(length > 0, length, 1.0), full_matrices=False)
+    Q = U[:, s > 1e-5 * s[0]]
+    share = 1 - np.einsum("db,db->d", tau @ Q, tau @ Q) / size
+    curve: Array = np.log(np.maximum(share, 0.0) + 1e-5)
+    return curve
+
+
+def _steady_rows(probe: Probe, j: int, width: float) -> Array:
+    """Return the rows farther than a width from a change of joint j's direction, (N,), bool."""
+    t, sign = probe.motion.t, np.sign(probe.motion.v[:, j])
+    turns = t[np.flatnonzero(np.diff(sign) != 0)]
+    at = t[probe.rows]
+    bounds = np.concatenate([[-np.inf], turns, [np.inf]])
+    after = np.searchsorted(bounds, at)
+    distance = np.minimum(at - bounds[after - 1], bounds[after] - at)
+    steady: Array = (distance > width) & (np.abs(probe.v[:, j]) > 0.02)
+    return steady
+
+
+def _minimum(at: Sequence[float] | Array, values: Array) -> float:
+    """Return where a sampled curve is smallest, by a parabola; NaN at an end."""
+    i = int(np.argmin(values))
+    if not 0 < i < len(values) - 1:
+        return float("nan")
+    left, middle, right = values[i - 1 : i + 2]
+    curvature = left - 2 * middle + right
+    fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
+    return float(at[i] + fraction * (at[1] - at[0]))
