@@ -114,8 +114,8 @@ def _broken(path: Path, error: Exception) -> DataError:
     """Return the error that tells what the library says of a file."""
     reason = str(error) or type(error).__name__
     return DataError(
-        f"{path.name}: broken or unfinished bag ({reason}); record it again, or restore it with "
-        "'mcap recover', 'ros2 bag reindex' or 'rosbag reindex'"
+        f"{path.name}: broken, unfinished or foreign bag ({reason}); record it again, or "
+        "restore it with 'mcap recover', 'ros2 bag reindex' or 'rosbag reindex'"
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapLibraryWriter
 from recorders import (
     StoragePlugin,
     messages_of,
@@ -323,7 +324,20 @@ def test_broken_files_are_refused_by_name(tmp_path, name, left):
     path = FORMATS[name](tmp_path, make_log(2000))
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * left)])
-    with pytest.raises(DataError, match=rf"^{path.name}: broken .*"):
+    with pytest.raises(DataError, match=rf"^{path.name}: broken,? .*"):
+        read_log(path, JOINTS)
+
+
+def test_an_mcap_file_that_is_not_of_ros2_says_so(tmp_path):
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = McapLibraryWriter(file)
+        writer.start(profile="ros1")
+        writer.finish()
+    with refused(
+        "run.mcap: broken, unfinished or foreign bag (Profile is not ros2.); record it again, or "
+        "restore it with 'mcap recover', 'ros2 bag reindex' or 'rosbag reindex'"
+    ):
         read_log(path, JOINTS)
 
 
