@@ -151,8 +151,7 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
     """
     _check_form(form)
     (_, q2), (v1, v2), (a1, a2) = _pair("q", q), _pair("v", v), _pair("a", a)
-    c2, s2 = np.cos(q2), np.sin(q2)
-    a12, v12 = 2 * a1 + a2, v2**2 + 2 * v1 * v2
+    c2, s2, a12, v12 = np.cos(q2), np.sin(q2), 2 * a1 + a2, v2**2 + 2 * v1 * v2
     row1 = [a1, a1 + a2, c2 * a12 - 2 * s2 * v1 * v2, -s2 * v2**2, -s2 * a12 - c2 * v12]
     row2 = [0.0, a1 + a2, c2 * a1, s2 * v1**2, -s2 * a1 + c2 * v1**2]
     if form == "printed":
@@ -160,8 +159,8 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
     if form == "corrected":
         row1[2:4], row2[2:4] = [row1[2] + row1[3]], [row2[2] + row2[3]]
     G = np.empty((*np.shape(row1[2]), 2, len(row1)))
-    for column, (upper, lower) in enumerate(zip(row1, row2, strict=True)):
-        G[..., 0, column], G[..., 1, column] = upper, lower
+    for column, pair in enumerate(zip(row1, row2, strict=True)):
+        G[..., 0, column], G[..., 1, column] = pair
     return G
 
 
