@@ -1,14 +1,15 @@
 """Arrays in memory to estimate: base parameters, rows, factors and weighted least squares.
 
 "full QR" is the plain way: Pinocchio in a loop, W stacked, numpy's QR (without the estimate). All
-ways are run in turn in this process, wall-clock time, the shortest counts. "memory" is the largest
+ways are run in turn in this process, the shortest counts: wall-clock time, or with --cpu the
+processor's, which other work on the machine changes less. "memory" is the largest
 amount that Python and NumPy hold over the input arrays, by tracemalloc in a run of its own. Where
 FIGAROH is installed (an environment of its own with `pip install robotid[fast] figaroh`), its
 regressor and double QR of the same samples are timed too. The last lines are the start: the
 compiled path used first ever (it compiles) and first in a process.
 
     python benchmarks/bench_end_to_end.py [--quick] [--million]
-    python benchmarks/bench_end_to_end.py --readme    # the table of the README
+    python benchmarks/bench_end_to_end.py --readme --cpu    # the table of the README
 """
 
 import argparse
@@ -59,10 +60,12 @@ print(time.perf_counter() - middle)
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="1e3 samples only")
+    parser.add_argument("--quick", action="store_true", help="1e3 samples only, no humanoid")
     parser.add_argument("--million", action="store_true", help="1e6 samples too (half an hour)")
     parser.add_argument("--readme", action="store_true", help="panda at 1e4, 1e5 and 1e6 only")
+    parser.add_argument("--cpu", action="store_true", help="processor time, for a busy machine")
     options = parser.parse_args()
+    clock = time.process_time if options.cpu else time.perf_counter
     sizes = [1_000] if options.quick else [1_000, 10_000, 100_000]
     sizes += [1_000_000] if options.million else []
     names = list(ROBOTS)
@@ -76,13 +79,13 @@ def main():
     print("|" + "---|" * 11)
     for name in names:
         for samples in sizes:
-            if name != "TALOS" or samples <= 10_000:
-                print(row(name, samples, threads), flush=True)
+            if name != "TALOS" or (samples <= 1_000 and not options.quick):
+                print(row(name, samples, threads, clock), flush=True)
     start()
-    print(f"\n{machine()}")
+    print(f"\n{'processor' if options.cpu else 'wall-clock'} time; {machine()}")
 
 
-def row(name, samples, threads):
+def row(name, samples, threads, clock):
     model = robot(name)
     trajectory = motion(model, samples, np.random.default_rng(0))
     mapping = structural_mapping(model)
@@ -90,13 +93,14 @@ def row(name, samples, threads):
     if is_installed():
         identify(model, trajectory, True, 1)  # reads the compiled code
         ways["compiled"] = lambda: identify(model, trajectory, True, 1)
-        ways["threads"] = lambda: identify(model, trajectory, True, threads)
+        if clock is time.perf_counter:  # threads save no processor time
+            ways["threads"] = lambda: identify(model, trajectory, True, threads)
     if 8 * samples * model.n_rows * len(model.layout.names) < LARGEST:
         ways["full"] = lambda: full_qr(model, mapping, trajectory)
         if find_spec("figaroh"):
             ways["figaroh"] = lambda: figaroh_factor(model, trajectory)
     repeats = 1 if samples > 100_000 else 3
-    seconds = side_by_side(list(ways.values()), repeats, time.perf_counter)
+    seconds = side_by_side(list(ways.values()), repeats, clock)
     times = dict(zip(ways, seconds, strict=True))
     full = times.get("full")
     cells = [f"{times[key]:.2f}" if key in times else "-" for key in ("figaroh", "full")]

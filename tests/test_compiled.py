@@ -114,6 +114,20 @@ def test_compiled_rows_are_pinocchios_on_random_trees(seed, tmp_path):
     assert_is_pinocchio(model, motion(model, rng, 64))
 
 
+def test_a_mimic_joint_follows_at_its_ratio_above_and_beside_its_leader(tmp_path, rng):
+    mimic = '<mimic joint="j1" multiplier="-2.5" offset="0.3"/></joint>'
+    parts = [LINK.format("l0")]
+    for i, parent in ((1, 0), (2, 1), (3, 0), (4, 2)):  # 2 is carried by its leader 1, 3 is not
+        text = {k: " ".join(map(str, rng.standard_normal(3))) for k in ("axis", "xyz", "rpy")}
+        joint = JOINT.format(i=i, kind="revolute", parent=parent, **text)
+        parts += [LINK.format(f"l{i}"), joint.replace("</joint>", mimic) if i in (2, 3) else joint]
+    path = tmp_path / "tree.urdf"
+    path.write_text(f'<robot name="tree">{"".join(parts)}</robot>')
+    model = RobotModel.from_urdf(path, mimic="coupled")
+    assert model.joints == ("j1", "j4")
+    assert_is_pinocchio(model, motion(model, rng, 64))
+
+
 @pytest.mark.parametrize("reach", [1e-9, 1.0, 1e3, 1e5])
 def test_small_and_large_angles_keep_their_digits(reach, ur5, rng):
     assert_is_pinocchio(ur5, motion(ur5, rng, 100, reach))

@@ -58,7 +58,7 @@ class OLS(Estimator):
         sigma = _noise(factors, solution.theta, _effective_parameters(factors, solution, None))
         A = factors.R[:, :, :-1]
         bread = solution.covariance  # (W^T W)^+
-        meat = np.einsum("jki,jkl,j->il", A, A, sigma**2)
+        meat = np.einsum("jki,jkl,j->il", A, A, sigma**2, optimize=True)
         covariance = bread @ meat @ bread / self.independent_share
         return _estimate(factors, solution, covariance, sigma, 1, "solved by QR")
 
