@@ -1,6 +1,6 @@
 """Do the torques fit the model: signs, order of columns, gravity, positions, delay, excitation."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,8 @@ _TURNED = 30.0  # [deg] ... and farther than this gives wrong answers
 _HINT = 0.7  # gain from which a tilt is believed
 _UNEXPLAINED = 0.25  # share of a torque's variance that no physics explains
 _LONGEST = 0.1  # [s] delays are sought up to this
+_WIDTH = 0.07  # [s] about the delay, where the misfit is still a parabola
+_FINEST = 0.001  # [s] an estimate is not better than this
 _FEW = 100  # rows from which a joint has a say in the delay
 _LATE = 0.01  # [s] a shorter delay of the torque is within the errors of friction models
 
@@ -74,13 +76,13 @@ def check_torque_delay(probe: Probe, cutoff: float | None, name: str) -> Iterato
     told = np.array([curve for curve in curves if curve is not None])
     if len(told) < 2:
         return
-    delay = _minimum(delays, told.sum(axis=0))
-    without = [_minimum(delays, np.delete(told, j, axis=0).sum(axis=0)) for j in range(len(told))]
+    delay = _centre(delays, told)
+    without = [_centre(delays, np.delete(told, j, axis=0)) for j in range(len(told))]
     if not np.isfinite([delay, *without]).all():
         return
     n = len(told)
     error = float(np.sqrt((n - 1) / n * np.sum((np.array(without) - np.mean(without)) ** 2)))
-    error = max(error, 0.001)
+    error = max(error, _FINEST)
     late = abs(delay) > max(_LATE, 3 * error)
     message = (
         f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
@@ -211,7 +213,17 @@ def _shares(stated: Explanation, best: Explanation, gain: float) -> dict[str, fl
 
 
 def _unexplained(probe: Probe, stated: Explanation, name: str) -> Iterator[Finding]:
-    for j in np.flatnonzero(stated.share > _UNEXPLAINED):
+    bad = np.flatnonzero(stated.share > _UNEXPLAINED)
+    if 2 * len(bad) > len(stated.share):
+        message = (
+            f"{name}: the torques of {len(bad)} of {len(stated.share)} joints fit neither gravity, "
+            "inertia nor friction of this model: the base may move or the robot touch something, "
+            "the log or the URDF may be of another robot; nothing identified from it can be right"
+        )
+        evidence = {"joints": len(bad), "share": float(np.median(stated.share))}
+        yield Finding("unexplained_torque", "warning", name, message, evidence)
+        return
+    for j in bad:
         joint, share = probe.model.joints[j], float(stated.share[j])
         message = (
             f"{name}: {100 * share:.0f} % of the variance of {joint}'s torque fits neither "
@@ -258,12 +270,19 @@ def _steady_rows(probe: Probe, j: int, width: float) -> Array:
     return steady
 
 
-def _minimum(at: Sequence[float] | Array, values: Array) -> float:
-    """Return where a sampled curve is smallest, by a parabola; NaN at an end."""
-    i = int(np.argmin(values))
-    if not 0 < i < len(values) - 1:
-        return float("nan")
-    left, middle, right = values[i - 1 : i + 2]
-    curvature = left - 2 * middle + right
-    fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
-    return float(at[i] + fraction * (at[1] - at[0]))
+def _centre(delays: Array, curves: Array) -> float:
+    """Return where the joints' curves are smallest together, NaN if nowhere inside.
+
+    Each curve is taken relative to its smallest value, and a parabola is fitted to the sum, once
+    over all delays and once near that centre: noise makes ripples that a single minimum follows.
+    """
+    total = np.exp(curves - curves.min(axis=1, keepdims=True)).sum(axis=0)
+    centre, width = 0.0, np.inf
+    for _ in range(2):
+        near = np.abs(delays - centre) <= width
+        square, slope, _ = np.polyfit(delays[near], total[near], 2)
+        centre = -slope / (2 * square) if square > 0 else np.nan
+        if not abs(centre) < _LONGEST:
+            return float("nan")
+        width = _WIDTH
+    return float(centre)
