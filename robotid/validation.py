@@ -94,13 +94,15 @@ def shares_rows(one: Log, other: Log) -> bool:
         other: Another log of the same joints.
 
     Returns:
-        Whether a row of positions and torques among 200 spread over the first is in the second.
+        Whether more than 2 % of 200 rows of positions and torques spread over the first are in
+        the second; windows that meet share their common row, which counts for nothing.
     """
     every = max(1, len(one.t) // 200)
     sampled = np.hstack([one.q, one.tau])[::every]
     likely = sampled[np.isin(sampled[:, 0], other.q[:, 0])]
     rows = np.hstack([other.q, other.tau])[np.isin(other.q[:, 0], likely[:, 0])]
-    return bool(any((rows == row).all(axis=1).any() for row in likely))
+    shared = sum(bool((rows == row).all(axis=1).any()) for row in likely)
+    return shared > max(1, 0.02 * len(sampled))
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:

@@ -88,6 +88,15 @@ def test_tx40_has_sane_masses_and_armatures(run):
     assert consistent.pooled_rmse < 1.02 * wls.pooled_rmse
 
 
+@pytest.mark.parametrize("name", ALL)
+def test_no_stretch_kept_apart_is_taken_for_a_fitted_one(run, name):
+    identification, result, _ = run(name)
+    assert identification.refitted == ()
+    codes = {warning["code"] for warning in result["warnings"]}
+    assert "validation_was_fitted" not in codes
+    assert not identification.alarms
+
+
 def test_late_velocities_are_not_used(run):
     # TIAGo reports velocity 140 to 190 ms late, the Panda 6 ms, like its torque
     tiago, panda = run("tiago")[0], run("panda_inria")[0]

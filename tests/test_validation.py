@@ -62,6 +62,9 @@ def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
     part = later.window(8.0, 9.0)
     assert shares_rows(part, log)
     assert not shares_rows(other, log)
+    before, after = log.window(end=6.0), log.window(start=6.0)
+    assert before.t[-1] == after.t[0]  # both hold the row where they meet
+    assert not shares_rows(after, before)
     jittered = Log(t=log.t, q=log.q, tau=log.tau * (1 + 1e-12), joints=log.joints)
     assert not shares_rows(jittered, log)
 
