@@ -65,7 +65,9 @@ def _summary(content: Mapping[str, Any]) -> str:
     status = "good" if max(last.values()) <= 1e-4 else "poor"
     count = len(next(iter(models.values()))["relative_error"]) - 1
     reached = "".join(
-        f"<li>{escape(name)}: relative error {number(error, '.2g').html}</li>"
+        f"<li>{escape(name)}: relative error {number(error, '.2g').html}, or "
+        f"{number(content['on_program'][name]['relative_error'][-1], '.2g').html} where the robot "
+        "starts on its program and not one degree beside it</li>"
         for name, error in last.items()
     )
     return (
@@ -175,7 +177,7 @@ def _failure_table(by_model: Mapping[str, Any], title: str) -> str:
     for name, found in by_model.items():
         kinds: dict[str, list[float]] = {}
         for failure in found["failures"]:
-            kind = failure["reason"].split(":")[0].split(" at ")[0]
+            kind = failure["reason"].split(":")[0].split(" in iteration")[0].split(",")[0]
             kinds.setdefault(kind, []).append(failure["relative_error"])
         for kind, errors in kinds.items():
             cells = [number(len(errors), "d"), number(float(np.median(errors)), ".2g")]

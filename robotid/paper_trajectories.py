@@ -88,21 +88,12 @@ class RandomRuns:
         }
 
     def _reason(self, r: int) -> str:
-        error, count = self.errors[:, r], len(self.errors) - 1
         if self.history.lost[r]:
             return f"the robot ran away from its program in iteration {self.history.lost[r]}"
+        reason = _course(self.errors[:, r])
         if skipped := self.history.skipped[r]:
-            return f"D(q, P^) was not positive definite at {skipped} updates, which were left out"
-        if error[-1] > error[0]:
-            return f"the error grew, from {error[0]:.2g} to {error[-1]:.2g}"
-        earlier = error[max(0, count - 10)]
-        lost = 1.0 - error[-1] / earlier
-        if lost < _STALLED:
-            return f"stalled at an error of {error[-1]:.2g}: the motion excites too little"
-        return (
-            f"slow: an error of {error[-1]:.2g} is left after {count} iterations and falls by "
-            f"{100 * lost:.2g} % in ten"
-        )
+            reason += f"; {skipped} updates were left out, as D(q, P^) was not positive definite"
+        return reason
 
 
 def random_runs(
@@ -148,3 +139,17 @@ def random_runs(
     )
     errors = history.relative_error(P)
     return RandomRuns(amplitude, duration, gain, guess, offset, errors, history)
+
+
+def _course(error: Array) -> str:
+    """Return why an error, shape (L + 1,), is not small at its end."""
+    count = len(error) - 1
+    lost = 1.0 - error[-1] / error[max(0, count - 10)]
+    if error[-1] > error[0]:
+        return f"the error grew, from {error[0]:.2g} to {error[-1]:.2g}"
+    if lost < _STALLED:
+        return f"stalled: the motion excites too little; an error of {error[-1]:.2g} is left"
+    return (
+        f"slow: an error of {error[-1]:.2g} is left after {count} iterations and falls by "
+        f"{100 * lost:.2g} % in ten"
+    )

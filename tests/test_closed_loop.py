@@ -281,6 +281,13 @@ def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
     np.testing.assert_array_equal(history.estimates[:, 1], alone.estimates[:, 0])
 
 
+def test_a_run_that_is_lost_keeps_its_estimate():
+    history = run(settings=short(2), offset=np.array([2e3, 0.0]))  # [rad]
+    np.testing.assert_array_equal(history.lost, [1])
+    assert len(history.estimates) == 2  # there was nothing left to do
+    np.testing.assert_array_equal(history.estimates[-1], [P4 / 2])
+
+
 def test_the_history_keeps_the_control_when_asked():
     history = run(settings=short(2, updates=10), keep_torques=True)
     assert history.torques.shape == (2, 10, 1, 2)

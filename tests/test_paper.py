@@ -177,9 +177,13 @@ def test_random_runs_tell_every_failure(rng):
     ("change", "reason"),
     [
         ({"lost": 3}, "the robot ran away from its program in iteration 3"),
-        ({"skipped": 7}, "D(q, P^) was not positive definite at 7 updates, which were left out"),
+        (
+            {"skipped": 7},
+            "slow: an error of 0.4 is left after 1 iterations and falls by 20 % in ten; 7 updates "
+            "were left out, as D(q, P^) was not positive definite",
+        ),
         ({"errors": [0.5, 0.6]}, "the error grew, from 0.5 to 0.6"),
-        ({"errors": [0.5, 0.5]}, "stalled at an error of 0.5: the motion excites too little"),
+        ({"errors": [0.5, 0.5]}, "stalled: the motion excites too little; an error of 0.5 is left"),
     ],
 )
 def test_each_kind_of_failure_has_its_reason(change, reason, rng):
