@@ -114,7 +114,8 @@ class Identification:
     @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        kept = [e for e in self.validation if e not in self.refitted]
+        refitted = self.refitted
+        kept = [e for e in self.validation if e not in refitted]
         return judge(
             self.metrics(),
             {e.recording.name: e.metrics["estimate"] for e in kept},
