@@ -4,15 +4,18 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from robotid import __version__
 from robotid.console import print_files, print_inspection, print_result, print_table, print_verdict
 from robotid.exceptions import RobotIdError, SettingsError
-
-if TYPE_CHECKING:
-    from robotid.job import Job
+from robotid.flags import (
+    add_job_flags,
+    add_log_flags,
+    add_source_flags,
+    job_from_flags,
+    source_settings,
+)
 
 __all__ = ["main"]
 
@@ -70,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     identify.add_argument("--out", default="robotid-out", metavar="DIR", help="folder to write to")
     identify.add_argument("--json", action="store_true", help="print result.json")
-    _add_job_flags(identify)
+    add_job_flags(identify)
     identify.set_defaults(run=_identify)
 
     track = commands.add_parser("track", help="run over a log as if live: history, step changes")
@@ -78,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("logs", nargs=1, metavar="LOG")
     track.add_argument("--out", default="robotid-track", metavar="DIR", help="folder to write to")
     track.add_argument("--json", action="store_true", help="print track.json")
-    _add_log_flags(track.add_argument_group("the log"))
+    add_log_flags(track.add_argument_group("the log"))
     track.set_defaults(run=_track, validate=[], estimator=None)
 
     doctor = commands.add_parser(
@@ -87,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     doctor.add_argument("source", metavar="JOB.toml | URDF")
     doctor.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
-    _add_job_flags(doctor)
+    add_job_flags(doctor)
     doctor.set_defaults(run=_doctor)
 
     validate = commands.add_parser("validate", help="measure a result's prediction on other logs")
@@ -102,46 +105,10 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("log", metavar="IN", help="a log of any format, or a bag's folder")
     convert.add_argument("out", metavar="OUT", help="file to write; its suffix says the format")
     convert.add_argument("--joints", metavar="A,B,...", help="joints to write; default: all")
-    _add_source_flags(convert)
+    add_source_flags(convert)
     convert.add_argument("--json", action="store_true", help="print one JSON object")
     convert.set_defaults(run=_convert)
     return parser
-
-
-def _add_job_flags(parser: argparse.ArgumentParser) -> None:
-    flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
-    flags.add_argument("--validate", nargs="+", default=[], metavar="LOG", help="logs kept apart")
-    names = "consistent (default), wls, ols, rls, kalman, prx or gradient"
-    flags.add_argument("--estimator", metavar="NAME", help=names)
-    _add_log_flags(flags)
-
-
-def _add_log_flags(flags: "argparse._ArgumentGroup") -> None:
-    flags.add_argument("--joints", metavar="A,B,...", help="joints to identify, in order")
-    flags.add_argument("--lock", action="append", default=[], metavar="JOINT=POSITION")
-    flags.add_argument("--gain", action="append", default=[], metavar="JOINT=N_M_PER_A")
-    flags.add_argument("--rate", type=float, metavar="HZ", help="grid to resample to")
-    flags.add_argument("--cutoff", metavar="HZ", help="of the low-pass filter, or false")
-    flags.add_argument("--friction", metavar="MODEL", help="none, viscous or viscous+coulomb")
-    flags.add_argument(
-        "--dynamics", action="store_true", help="write friction into the URDF's <dynamics> too"
-    )
-    flags.add_argument(
-        "--ignore",
-        action="append",
-        default=[],
-        metavar="CODE",
-        help="error of the doctor that you know better",
-    )
-    flags.add_argument("--time-unit", metavar="UNIT", help="s, ms, us or ns")
-    flags.add_argument("--angle-unit", metavar="UNIT", help="rad or deg")
-    _add_source_flags(flags)
-
-
-def _add_source_flags(flags: "argparse._ActionsContainer") -> None:
-    flags.add_argument("--topic", metavar="NAME", help="topic of a bag, or group of a file")
-    flags.add_argument("--effort", metavar="MEANING", help="torque (default) or current")
-    flags.add_argument("--stamp", metavar="CLOCK", help="of a bag: header (default) or log")
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -194,7 +161,7 @@ def _inspect(options: argparse.Namespace) -> None:
 def _identify(options: argparse.Namespace) -> None:
     from robotid.workflow import run_job
 
-    _, result = run_job(_job(options), options.out)
+    _, result = run_job(job_from_flags(options), options.out)
     if options.json:
         print(json.dumps(result, allow_nan=False))
         return
@@ -205,7 +172,7 @@ def _identify(options: argparse.Namespace) -> None:
 def _track(options: argparse.Namespace) -> None:
     from robotid.tracking import run_track
 
-    found = run_track(_job(options), options.out)
+    found = run_track(job_from_flags(options), options.out)
     if options.json:
         print(json.dumps(found, allow_nan=False))
         return
@@ -229,7 +196,7 @@ def _track(options: argparse.Namespace) -> None:
 def _doctor(options: argparse.Namespace) -> None:
     from robotid.doctor import examine, findings_to_dict
 
-    content = findings_to_dict(examine(_job(options)))
+    content = findings_to_dict(examine(job_from_flags(options)))
     if options.json:
         print(json.dumps(content, allow_nan=False))
         return
@@ -260,7 +227,7 @@ def _convert(options: argparse.Namespace) -> None:
     from robotid.log_source import LogSource
 
     joints = options.joints.split(",") if options.joints else None
-    source = LogSource(**_source_settings(options))
+    source = LogSource(**source_settings(options))
     done = convert(options.log, options.out, joints=joints, source=source)
     if options.json:
         print(json.dumps(asdict(done)))
@@ -269,76 +236,6 @@ def _convert(options: argparse.Namespace) -> None:
     print(f"  columns {', '.join(done.columns)}")
     if done.ignored:
         print(f"  not of a joint, left out: {', '.join(done.ignored)}")
-
-
-def _source_settings(options: argparse.Namespace) -> dict[str, Any]:
-    given = {name: getattr(options, name) for name in ("topic", "effort", "stamp")}
-    return {name: value for name, value in given.items() if value is not None}
-
-
-def _job(options: argparse.Namespace) -> "Job":
-    from robotid.job import job_from_settings, read_job
-
-    if Path(options.source).suffix == ".toml":
-        given = [name for name in _JOB_FLAGS if getattr(options, name)]
-        if options.logs or given:
-            raise SettingsError(
-                f"{options.source} is a job file, which states its logs and settings itself; "
-                f"leave out {options.logs or given}"
-            )
-        return read_job(options.source)
-    if not options.logs:
-        raise SettingsError("no log was given: robotid identify URDF LOG [LOG ...], or JOB.toml")
-    table: dict[str, Any] = {
-        "urdf": options.source,
-        "identification": [{"log": log} for log in options.logs],
-        "validation": [{"log": log} for log in options.validate],
-        "locked": _pairs(options.lock, "--lock"),
-        "torque": {"gains": _pairs(options.gain, "--gain")},
-        "signals": {},
-        "units": {},
-        "doctor": {"ignore": options.ignore},
-    }
-    if options.joints:
-        table["joints"] = options.joints.split(",")
-    if options.estimator:
-        table["estimator"] = {"name": options.estimator}
-    if options.friction:
-        table["model"] = {"friction": options.friction}
-    if options.rate is not None:
-        table["signals"]["rate"] = options.rate
-    if options.cutoff is not None:
-        table["signals"]["cutoff"] = _cutoff(options.cutoff)
-    if options.dynamics:
-        table["output"] = {"dynamics": True}
-    table["log"] = _source_settings(options)
-    units = {"time": options.time_unit, "angle": options.angle_unit}
-    table["units"] = {key: value for key, value in units.items() if value}
-    return job_from_settings(table, "command line", Path())
-
-
-_JOB_FLAGS = (
-    "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
-    "time_unit", "angle_unit", "dynamics", "topic", "effort", "stamp", "ignore",
-)  # fmt: skip
-
-
-def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
-    pairs = {}
-    for word in words:
-        name, _, number = word.partition("=")
-        try:
-            pairs[name] = float(number)
-        except ValueError as error:
-            raise SettingsError(f"{flag} {word!r}: wanted JOINT=NUMBER") from error
-    return pairs
-
-
-def _cutoff(word: str) -> float | bool:
-    try:
-        return False if word == "false" else float(word)
-    except ValueError as error:
-        raise SettingsError(f"--cutoff {word!r}: wanted a frequency [Hz] or false") from error
 
 
 def _print_paper(result: dict[str, Any]) -> None:

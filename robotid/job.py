@@ -1,6 +1,5 @@
 """The job: which robot, which logs, which settings; read from TOML with every key checked."""
 
-import difflib
 import os
 import tomllib
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from typing import Any
 from robotid.data import Log
 from robotid.estimator_settings import EstimatorSettings
 from robotid.exceptions import SettingsError
+from robotid.job_keys import KEYS, check_keys
 from robotid.log_files import read_log
 from robotid.log_source import LogSource
 from robotid.model import GRAVITY, RobotModel
@@ -26,51 +26,6 @@ _FRICTION = {
     "viscous+coulomb": ("viscous", "coulomb"),
 }
 _NUMBER = (int, float)
-_TABLE: dict[str, Any] = {
-    "urdf": str,
-    "joints": list,
-    "locked": dict,
-    "gravity": list,
-    "free_flyer": bool,
-    "mimic": str,
-    "signals": {
-        "rate": _NUMBER,
-        "cutoff": (*_NUMBER, bool),
-        "order": int,
-        "velocity": str,
-        "acceleration": str,
-        "trim": _NUMBER,
-        "min_velocity": _NUMBER,
-        "max_gap": _NUMBER,
-        "torque_delay": _NUMBER,
-        "velocity_delay": _NUMBER,
-    },
-    "doctor": {"ignore": list},
-    "model": {"armature": bool, "friction": str, "offset": bool},
-    "torque": {"gains": dict},
-    "columns": dict,
-    "log": {"topic": str, "joints": dict, "effort": str, "stamp": str},
-    "units": {"time": str, "angle": str},
-    "coupling": [{"name": str, "ratios": dict}],
-    "estimator": {
-        "name": str,
-        "margin": _NUMBER,
-        "prior_weight": _NUMBER,
-        "forgetting": _NUMBER,
-        "walk": _NUMBER,
-        "gate": (*_NUMBER, bool),
-        "step": str,
-        "metric": str,
-        "average": bool,
-        "passes": int,
-        "seed": int,
-        "step_size": _NUMBER,
-        "physical": bool,
-    },
-    "output": {"dynamics": bool},
-    "identification": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
-    "validation": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
-}
 
 
 @dataclass(frozen=True)
@@ -181,7 +136,7 @@ class Job:
         """Return the job as plain values, in the shape of the job file, paths made absolute."""
         signals = {
             key: getattr(self.signals, key)
-            for key in _TABLE["signals"]
+            for key in KEYS["signals"]
             if getattr(self.signals, key) is not None
         }
         if self.signals.cutoff is None:
@@ -263,7 +218,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
     Raises:
         SettingsError: If a key or a value is wrong.
     """
-    _check(table, _TABLE, where, "")
+    check_keys(table, KEYS, where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
     model = table.get("model", {})
@@ -332,52 +287,6 @@ def _numbers(table: Mapping[str, Any], where: str, name: str) -> dict[str, float
         if isinstance(value, bool) or not isinstance(value, _NUMBER):
             raise SettingsError(f"{where}: {name}.{key} is {value!r}, wanted a number")
     return {key: float(value) for key, value in table.items()}
-
-
-def _check(table: Mapping[str, Any], schema: Mapping[str, Any], where: str, section: str) -> None:
-    """Refuse keys that are not in the schema and values of another type."""
-    for key, value in table.items():
-        at = f"{where}: {section}{key}"
-        if key not in schema:
-            near = difflib.get_close_matches(key, schema, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise SettingsError(f"{at} is not a known key{hint} Known: {sorted(schema)}")
-        wanted = schema[key]
-        if isinstance(wanted, dict):
-            if not isinstance(value, Mapping):
-                raise SettingsError(f"{at} is {value!r}, wanted a table [{section}{key}]")
-            _check(value, wanted, where, f"{section}{key}.")
-        elif isinstance(wanted, list):
-            _check_array(value, wanted[0], where, f"{section}{key}")
-        elif not isinstance(value, wanted) or (isinstance(value, bool) and not _takes_bool(wanted)):
-            raise SettingsError(f"{at} is {value!r}, wanted {_type_name(wanted)}")
-
-
-def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str) -> None:
-    if not isinstance(value, list) or not all(isinstance(item, Mapping) for item in value):
-        raise SettingsError(f"{where}: {name} is {value!r}, wanted tables written as [[{name}]]")
-    for item in value:
-        _check(item, schema, where, f"{name}.")
-        for required in ("log", "name", "ratios"):
-            if required in schema and required not in item:
-                raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
-
-
-def _takes_bool(wanted: object) -> bool:
-    return wanted is bool or (isinstance(wanted, tuple) and bool in wanted)
-
-
-def _type_name(wanted: type | tuple[type, ...]) -> str:
-    names = {
-        str: "text",
-        bool: "true or false",
-        list: "a list",
-        dict: "a table",
-        int: "a whole number",
-    }
-    if isinstance(wanted, tuple):
-        return "a number or false" if bool in wanted else "a number"
-    return names[wanted]
 
 
 def _entry_settings(entry: LogEntry) -> dict[str, Any]:
