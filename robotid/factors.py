@@ -8,7 +8,7 @@ Factors of two logs merge into the factor of both.
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from robotid.exceptions import DataError
 from robotid.lapack import Triangle
 from robotid.problem import Problem, RowSource
 
-__all__ = ["Factors", "compress", "merge"]
+__all__ = ["Factors", "compress", "compress_stretches", "merge"]
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -103,21 +103,37 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     References:
         Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
     """
-    n, c = problem.n_joints, len(problem.names)
-    active = [np.append(np.flatnonzero(problem.support[j]), c) for j in range(n)]
-    triangles = [Triangle(len(columns)) for columns in active]
     if problem.sources:
-        rows = np.sum([source.rows for source in problem.sources], axis=0)
-        _fold_sources(triangles, active, problem, threads)
-    else:
-        rows = _fold_blocks(triangles, active, problem)
-    # what is not finite in a row is not finite in R
-    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
-        raise DataError("the problem holds a row that is not finite; check the trajectory")
-    dense = np.zeros((n, c + 1, c + 1))
-    for j, columns in enumerate(active):
-        dense[j][np.ix_(columns, columns)] = triangles[j].R
-    return Factors(dense, rows, problem.names)
+        return _compress(problem, threads)
+    triangles, active = _empty(problem)
+    rows = _fold_blocks(triangles, active, problem)
+    return _dense(triangles, active, rows, problem.names)
+
+
+def compress_stretches(
+    problem: Problem, length: int, *, threads: int | None = None
+) -> tuple[Factors, ...]:
+    """Fold each stretch of a problem into factors of its own, as for held-out stretches.
+
+    Args:
+        problem: The rows, of one log or several; not one that comes in blocks only.
+        length: Samples per stretch, at least 1; the last stretch of each log may have fewer.
+        threads: As of :func:`compress`.
+
+    Returns:
+        The factors of each stretch, in order; merged they are those of the whole problem.
+
+    Raises:
+        DataError: If a row is not finite, or the problem comes in blocks only.
+    """
+    if not problem.sources:
+        raise DataError("the problem comes in blocks only; it cannot be cut into stretches")
+    stretches = (
+        source.part(start, min(start + length, source.samples))
+        for source in problem.sources
+        for start in range(0, source.samples, length)
+    )
+    return tuple(_compress(replace(problem, sources=(part,)), threads) for part in stretches)
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
@@ -144,6 +160,34 @@ def merge(factors: Sequence[Factors]) -> Factors:
     stacked = np.concatenate([f.R for f in factors], axis=1)
     R = np.array([_triangle(stack) for stack in stacked])
     return Factors(R, np.sum([f.rows for f in factors], axis=0), first.names)
+
+
+def _compress(problem: Problem, threads: int | None) -> Factors:
+    """Return the factors of the rows of a problem's sources."""
+    triangles, active = _empty(problem)
+    _fold_sources(triangles, active, problem, threads)
+    rows = np.sum([source.rows for source in problem.sources], axis=0)
+    return _dense(triangles, active, rows, problem.names)
+
+
+def _empty(problem: Problem) -> tuple[list[Triangle], list[Array]]:
+    """Return empty factors and the columns, torque included, that each joint's rows have."""
+    c = len(problem.names)
+    active = [np.append(np.flatnonzero(row), c) for row in problem.support]
+    return [Triangle(len(columns)) for columns in active], active
+
+
+def _dense(
+    triangles: Sequence[Triangle], active: Sequence[Array], rows: Array, names: tuple[str, ...]
+) -> Factors:
+    # what is not finite in a row is not finite in R
+    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
+        raise DataError("the problem holds a row that is not finite; check the trajectory")
+    size = len(names) + 1
+    dense = np.zeros((len(triangles), size, size))
+    for R, triangle, columns in zip(dense, triangles, active, strict=True):
+        R[np.ix_(columns, columns)] = triangle.R
+    return Factors(dense, rows, names)
 
 
 def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem) -> Array:

@@ -73,6 +73,18 @@ class RowSource(ABC):
         """
 
     @abstractmethod
+    def part(self, start: int, stop: int) -> "RowSource":
+        """Return the rows of samples start to stop only.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+
+        Returns:
+            The same columns of those rows.
+        """
+
+    @abstractmethod
     def select(self, columns: Array) -> "RowSource":
         """Return the same rows with fewer columns.
 

@@ -110,6 +110,22 @@ class TrajectoryRows(RowSource):
         used: Array = np.count_nonzero(self.weights > 0, axis=0)
         return used
 
+    def part(self, start: int, stop: int) -> "TrajectoryRows":
+        """Return the rows of samples start to stop only.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+
+        Returns:
+            The rows.
+        """
+        window = slice(start, stop)
+        motion = self.trajectory
+        arrays = {key: getattr(motion, key)[window] for key in ("t", "q", "v", "a", "tau")}
+        trajectory = replace(motion, segment=motion.segment[window], **arrays)
+        return replace(self, trajectory=trajectory, weights=self.weights[window])
+
     def select(self, columns: Array) -> "TrajectoryRows":
         """Return the same rows with fewer columns.
 

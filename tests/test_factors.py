@@ -3,9 +3,11 @@ import pytest
 import scipy.linalg
 
 from robotid import lapack
+from robotid.data import Trajectory
 from robotid.exceptions import DataError
-from robotid.factors import compress, merge
+from robotid.factors import compress, compress_stretches, merge
 from robotid.problem import Problem, concatenate
+from robotid.regressor import build_problem
 
 
 def make(rng, samples=300, n=3, c=5, block=64, weight=None, support=None):
@@ -160,3 +162,23 @@ def test_samples_are_the_rows_instant_by_instant(rng):
     assert len(samples) == 300
     np.testing.assert_array_equal(samples[7].Y, W[21:24])
     np.testing.assert_array_equal(samples[7].tau, tau[21:24])
+
+
+def test_stretches_merge_into_the_factors_of_the_whole(ur5, rng):
+    t = np.arange(250) / 100.0
+    q, v, a, tau = rng.uniform(-1, 1, (4, 250, 6))
+    motion = Trajectory(t, q, v, a, tau, ur5.joints, 100.0, np.zeros(250, dtype=int))
+    weight = rng.integers(0, 2, (250, 6)).astype(float)
+    problem = build_problem(ur5, motion, weight).select(np.arange(3, 40))
+    stretches = compress_stretches(concatenate([problem, problem]), 100)
+    assert len(stretches) == 6
+    np.testing.assert_array_equal(stretches[1].rows, (weight[100:200] > 0).sum(axis=0))
+    whole, merged = compress(problem), merge(stretches[3:])
+    np.testing.assert_array_equal(merged.rows, whole.rows)
+    for a, b in zip(merged.R, whole.R, strict=True):
+        np.testing.assert_allclose(gram(a), gram(b), rtol=1e-11, atol=1e-9)
+
+
+def test_stretches_need_rows_that_can_be_cut(rng):
+    with pytest.raises(DataError, match="cannot be cut"):
+        compress_stretches(make(rng)[0], 10)
