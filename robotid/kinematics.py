@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from robotid.exceptions import ModelError
 
@@ -99,6 +100,12 @@ class Tree:
     joints: tuple[Joint, ...]
     inertials: Mapping[str, Inertial]
     xml: str
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "inertials": dict(self.inertials)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, inertials=MappingProxyType(state["inertials"]))
 
     @property
     def movable(self) -> tuple[Joint, ...]:

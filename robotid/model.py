@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -102,6 +103,12 @@ class RobotModel:
             prismatic=frozenset(j.name for j in tree.movable if j.type == "prismatic"),
         )
         return cls(tree, reduced, layout, G, shift, free_flyer, MappingProxyType(positions), mimic)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "locked": dict(self.locked)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, locked=MappingProxyType(state["locked"]))
 
     @property
     def name(self) -> str:

@@ -20,7 +20,7 @@ FLOORS = {
     "innovations online_settings job_keys lanes lapack log_source console",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags",
-    3: "array_files estimators plant lumping prior rows log_checks channel_checks",
+    3: "array_files estimators plant lumping prior rows log_checks channel_checks pieces",
     4: "regressor excitation tables",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
     6: "identification closed_loop conversion explanations load_checks motion_checks",

@@ -1,0 +1,142 @@
+"""Long logs as pieces: each comes down to its factors, by itself, in any process, in any order.
+
+A piece is a fixed stretch of rows of one log, whatever the number of workers: what it comes down
+to never depends on who reduces it, nor on what else is reduced beside it.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.data import Trajectory
+from robotid.exceptions import DataError
+from robotid.factors import Factors, compress, merge
+from robotid.problem import Problem
+
+__all__ = ["Piece", "Reduction", "join", "reduce_in_turn"]
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """What the rows of a piece, or of many, come down to.
+
+    Attributes:
+        factors: Their triangular factors.
+        squares: Sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows).
+        samples: Number of these samples.
+    """
+
+    factors: Factors
+    squares: Array
+    samples: int
+
+    @classmethod
+    def of(
+        cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
+    ) -> "Reduction":
+        """Reduce the problem of one trajectory.
+
+        Args:
+            problem: The base problem of the trajectory, rows weighted.
+            trajectory: The trajectory.
+            threads: As of :func:`robotid.factors.compress`.
+
+        Returns:
+            The reduction.
+
+        Raises:
+            DataError: If a row is not finite.
+        """
+        motion = (trajectory.tau, trajectory.v, trajectory.a)
+        squares = np.array([np.einsum("kj,kj->j", x, x) for x in motion])
+        return cls(compress(problem, threads=threads), squares, len(trajectory.t))
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return the reduction as plain arrays by name, as for a checkpoint."""
+        return {
+            "R": self.factors.R,
+            "rows": self.factors.rows,
+            "names": np.array(self.factors.names),
+            "squares": self.squares,
+            "samples": np.array(self.samples),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
+        """Return the reduction that arrays hold; see :meth:`to_arrays`.
+
+        Args:
+            arrays: The arrays by name.
+
+        Returns:
+            The reduction, to the same bits.
+        """
+        factors = Factors(arrays["R"], arrays["rows"], tuple(arrays["names"].tolist()))
+        return cls(factors, arrays["squares"], int(arrays["samples"]))
+
+
+class Piece(ABC):
+    """A stretch of a log that is reduced by itself. Pieces can be pickled, and are small."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What messages call it, as ``run3.parquet rows 0-65536``."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """About how many samples it has, for progress."""
+
+    @abstractmethod
+    def reduce(self, *, threads: int | None = None) -> Reduction:
+        """Read the piece and reduce it to the factors of its base problem.
+
+        Args:
+            threads: As of :func:`robotid.factors.compress`; the result does not depend on it.
+
+        Returns:
+            The reduction; one of no samples if no sample of the piece is left.
+
+        Raises:
+            DataError: If a row cannot be used.
+        """
+
+
+def join(reductions: Sequence[Reduction]) -> Reduction:
+    """Return what all the rows of several reductions come down to.
+
+    Args:
+        reductions: At least one; all with the same columns and joints.
+
+    Returns:
+        The reduction.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not reductions:
+        raise DataError("no reduction was given; at least one log is needed")
+    return Reduction(
+        merge([r.factors for r in reductions]),
+        np.sum([r.squares for r in reductions], axis=0),
+        sum(r.samples for r in reductions),
+    )
+
+
+def reduce_in_turn(pieces: Sequence[Piece]) -> tuple[Reduction, ...]:
+    """Reduce pieces one after the other.
+
+    Args:
+        pieces: The pieces.
+
+    Returns:
+        One reduction per piece, in order; :func:`join` gives the whole.
+
+    Raises:
+        DataError: If a row cannot be used.
+    """
+    return tuple(piece.reduce() for piece in pieces)
