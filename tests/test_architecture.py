@@ -17,11 +17,11 @@ PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings job_keys lanes lapack log_source console",
-    2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
+    "innovations online_settings job_keys lanes lapack log_source console signal_settings",
+    2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags",
-    3: "array_files estimators plant lumping prior rows log_checks channel_checks pieces",
-    4: "regressor excitation tables",
+    3: "array_files estimators plant lumping prior rows log_checks signals pieces",
+    4: "regressor excitation tables channel_checks",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
     6: "identification closed_loop conversion explanations load_checks motion_checks",
     7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
