@@ -142,6 +142,11 @@ class Trajectory:
         if self.rate is not None and not 0 < self.rate < np.inf:
             raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
 
+    @property
+    def squares(self) -> Array:
+        """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
+        return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
+
 
 def suggestion(name: str, known: Collection[str]) -> str:
     """Return the question whether the nearest known name was meant, or "" if none is near.

@@ -4,7 +4,7 @@ Nothing is filtered or differentiated across a gap, or from one log into the nex
 be switched off: with ``cutoff=None`` and no ``rate`` the rows stay as they were recorded.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -22,6 +22,7 @@ __all__ = [
     "is_moving",
     "process",
     "resolve",
+    "turns_note",
     "unwrap",
     "velocity_lag",
 ]
@@ -217,7 +218,19 @@ def unwrap(log: Log, is_free: Array) -> Log:
     q = log.q.copy()
     q[:, turned] = np.unwrap(q[:, turned], axis=0)
     names = [log.joints[j] for j in np.flatnonzero(turned)]
-    return replace(log, q=q, notes=(*log.notes, f"full turns taken out of the angle of {names}"))
+    return replace(log, q=q, notes=(*log.notes, turns_note(names)))
+
+
+def turns_note(joints: Sequence[str]) -> str:
+    """Return what the reader should know where full turns were taken out.
+
+    Args:
+        joints: Names of the joints.
+
+    Returns:
+        The note.
+    """
+    return f"full turns taken out of the angle of {list(joints)}"
 
 
 def _distance(slope: Array, v: Array, shift: int) -> float:
