@@ -23,10 +23,10 @@ FLOORS = {
     3: "array_files estimators plant lumping prior rows log_checks signals pieces",
     4: "regressor excitation tables channel_checks",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
-    6: "identification closed_loop conversion explanations load_checks motion_checks",
-    7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
+    6: "recordings closed_loop conversion explanations load_checks motion_checks",
+    7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks",
-    8: "report_page result inspection paper_errata doctor",
+    8: "online report_page result inspection paper_errata doctor",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
     11: "workflow",
