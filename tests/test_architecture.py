@@ -19,13 +19,13 @@ FLOORS = {
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
     "innovations online_settings job_keys lanes lapack log_source console signal_settings",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
-    "compiled columns array_tables csv_files parquet_files bags",
+    "time_stamps compiled columns array_tables csv_files parquet_files bags",
     3: "array_files estimators plant lumping prior rows log_checks signals pieces",
     4: "regressor excitation tables channel_checks",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
     6: "recordings closed_loop conversion explanations load_checks motion_checks",
     7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
-    "model_checks",
+    "model_checks long_logs",
     8: "online report_page result inspection paper_errata doctor",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
