@@ -49,16 +49,17 @@ INSIDE_FUNCTIONS = {
     "h5py": {"array_files"},
     "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
     "clarabel": {"estimators"},
+    "scs": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
 ESTIMATOR_FLOORS = {
     name: floor
     for floor, names in enumerate(
         (
-            "estimator",
-            "least_squares recursive",
+            "estimator cones priors",
+            "least_squares recursive solvers constraints",
             "physical rls kalman descent",
-            "prx gradient",
+            "prx gradient weighting log_cholesky",
             "__init__",
         )
     )
