@@ -19,7 +19,7 @@ from robotid.exceptions import DataError
 from robotid.lapack import Triangle
 from robotid.problem import Problem, RowSource
 
-__all__ = ["Factors", "compress", "compress_stretches", "merge"]
+__all__ = ["Factors", "compress", "compress_stretches", "cut", "merge"]
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -134,6 +134,27 @@ def compress_stretches(
         for start in range(0, source.samples, length)
     )
     return tuple(_compress(replace(problem, sources=(part,)), threads) for part in stretches)
+
+
+def cut(problem: Problem, stretches: int, logs: int = 1) -> tuple[Factors, ...]:
+    """Fold one of several logs in contiguous stretches, as many of all logs together as wanted.
+
+    Args:
+        problem: The rows of the log.
+        stretches: Number wanted of all logs, at least 1; each log has at least one.
+        logs: Number of logs.
+
+    Returns:
+        The factors of each stretch, in order.
+
+    Raises:
+        DataError: If a row is not finite.
+    """
+    count = -(-stretches // logs)
+    if count <= 1:
+        return (compress(problem),)
+    samples = sum(source.samples for source in problem.sources)
+    return compress_stretches(problem, -(-samples // count))
 
 
 def merge(factors: Sequence[Factors]) -> Factors:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,8 +19,9 @@ from robotid.estimator_settings import (
 )
 from robotid.estimators import WLS, Estimate
 from robotid.exceptions import DataError
-from robotid.factors import Factors, compress, merge
+from robotid.factors import Factors, cut, merge
 from robotid.lumping import held_parameters
+from robotid.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.metrics import Metrics
 from robotid.model import RobotModel
 from robotid.parameters import pseudo_inertia
@@ -83,6 +85,11 @@ class Identification:
         signs = self.standard[self.model.layout.is_nonnegative()]
         return bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
 
+    @cached_property
+    def mass_matrix(self) -> MassMatrixCheck:
+        """The mass matrix of the standard parameters over random poses."""
+        return check_mass_matrix(self.model, self.standard)
+
     @property
     def sources(self) -> tuple[str, ...]:
         """Where each standard parameter comes from: "data", "mixed" or "prior"."""
@@ -90,7 +97,9 @@ class Identification:
         names = np.where(
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
-        return tuple(names.tolist())
+        pinned = self.estimate.details.get("pinned", ())
+        kept = [name.rsplit(".", 1)[0] in pinned for name in self.model.layout.names]
+        return tuple(np.where(kept, "prior", names).tolist())
 
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.
@@ -158,12 +167,17 @@ def identify(
     fitted = [prepare(model, log, settings) for log in logs]
     kept = [prepare(model, log, settings) for log in validation]
     mapping = structural_mapping(model)
-    factors = merge([compress(_problem(model, mapping, recording)) for recording in fitted])
+    stretches = tuple(
+        stretch
+        for recording in fitted
+        for stretch in cut(_problem(model, mapping, recording), choice.held_out, len(fitted))
+    )
+    factors = merge(stretches)
     share = min(_independent_share(recording) for recording in fitted)
     prior = model.standard_parameters()
     spread = prior_spread(model, [recording.trajectory for recording in fitted])
     wls = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Prior(prior, spread, share, wls.sigma)
+    before = Prior(prior, spread, share, wls.sigma, stretches)
     estimate = _run(choice, model, mapping, before, fitted, factors, wls)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)

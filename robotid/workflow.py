@@ -12,6 +12,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.data import Log
+from robotid.consistency_findings import consistency_findings
 from robotid.doctor import alarming, diagnose
 from robotid.exceptions import ModelError
 from robotid.identification import Identification, identify
@@ -181,6 +182,7 @@ def _fit_findings(identification: Identification) -> list[Finding]:
             "URDF was written; use the 'consistent' estimator for one that loads"
         )
         findings.append(Finding("urdf_not_written", "warning", "urdf", message))
+    findings += consistency_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

@@ -21,12 +21,12 @@ FLOORS = {
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags",
     3: "array_files estimators plant lumping prior rows log_checks channel_checks",
-    4: "regressor excitation tables",
-    5: "validation sidecar estimator_settings simulation dynamics log_files probe",
+    4: "regressor excitation tables link_geometry constraint_settings",
+    5: "validation sidecar estimator_settings simulation dynamics log_files probe mass_matrix",
     6: "identification closed_loop conversion explanations load_checks motion_checks",
     7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks",
-    8: "report_page result inspection paper_errata doctor",
+    8: "report_page result inspection paper_errata doctor consistency_findings",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
     11: "workflow",
@@ -37,13 +37,14 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
     "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior", "rows",
-    "compiled",
+    "compiled", "link_geometry", "mass_matrix",
 }  # fmt: skip
 NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
+    "trimesh": {"link_geometry"},
     "pyarrow": {"parquet_files"},
     "rosbags": {"bags"},
     "h5py": {"array_files"},
@@ -58,7 +59,8 @@ ESTIMATOR_FLOORS = {
         (
             "estimator cones priors",
             "least_squares recursive solvers constraints",
-            "physical rls kalman descent",
+            "programme rls kalman descent",
+            "physical",
             "prx gradient weighting log_cholesky",
             "__init__",
         )

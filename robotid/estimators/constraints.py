@@ -10,10 +10,10 @@ from robotid.estimators.cones import Cone, svec
 from robotid.exceptions import SettingsError
 from robotid.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
-__all__ = ["Constraints", "check_constraints", "consistency_cone", "equalities"]
+__all__ = ["SIGN_MARGIN", "Constraints", "check_constraints", "consistency_cone", "equalities"]
 
-_SIGN_MARGIN = 1e-9  # drive terms stay above this share of their scale, so that rounding cannot
-# make them negative
+#: Drive terms stay above this share of their scale, so that rounding cannot make them negative.
+SIGN_MARGIN = 1e-9
 _ROUNDING = 1e-9  # [kg], [m]: a pinned body may lie that far outside its bounds
 
 
@@ -97,7 +97,7 @@ def consistency_cone(
     """
     p = len(layout.names)
     signs = np.flatnonzero(layout.is_nonnegative())
-    G, h = [np.eye(p)[signs]], [np.full(len(signs), -_SIGN_MARGIN)]
+    G, h = [np.eye(p)[signs]], [np.full(len(signs), -SIGN_MARGIN)]
     labels = [f"drive_signs {layout.names[i]}" for i in signs]
     C, c, named = _bounds(constraints, layout)
     C = C * scale

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.cones import Cone, Subspace
+from robotid.estimators.cones import Subspace
 from robotid.estimators.constraints import (
     Constraints,
     check_constraints,
@@ -21,8 +21,9 @@ from robotid.estimators.constraints import (
 )
 from robotid.estimators.estimator import Estimate, Estimator, as_factors
 from robotid.estimators.least_squares import WLS
-from robotid.estimators.priors import METRICS, Penalty, body_units, make_penalty
-from robotid.estimators.solvers import SOLVERS, ConeSolution, least_squares
+from robotid.estimators.priors import METRICS, Penalty, WeightChoice, body_units, make_penalty
+from robotid.estimators.programme import Programme
+from robotid.estimators.solvers import SOLVERS, ConeSolution
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.factors import Factors
 from robotid.parameters import ParameterLayout
@@ -31,9 +32,6 @@ from robotid.problem import Problem
 __all__ = ["Consistent"]
 
 _PRIOR_LED = 0.9  # a base parameter whose spread shrinks by less than this is undetermined
-_STEPS = 60  # of Newton's method on a penalty that is not quadratic
-_SETTLED = 1e-12  # decrease of the objective below which it has converged, relative
-_HALVINGS = 40
 _ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
 
 
@@ -64,6 +62,7 @@ class Consistent(Estimator):
             "riemannian"; see :func:`robotid.estimators.priors.make_penalty`.
         constraints: Bounds beside physical consistency.
         solver: "clarabel" or "scs".
+        choice: How ``prior_weight`` was chosen, if it was.
         check: Whether the other solver solves it, too; its difference is stated in the details.
 
     References:
@@ -85,6 +84,7 @@ class Consistent(Estimator):
     constraints: Constraints = field(default_factory=Constraints)
     solver: str = "clarabel"
     check: bool = False
+    choice: WeightChoice | None = None
 
     def __post_init__(self) -> None:
         p = len(self.layout.names)
@@ -203,10 +203,7 @@ class Consistent(Estimator):
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
     def minimise(self, rows: Array) -> tuple[ConeSolution, Array]:
-        """Minimise |rows [K pi; -1]|^2 and the penalty over the cone.
-
-        A penalty that is not quadratic is minimised by Newton's method: its expansion to second
-        order is a fit like any other, and a step keeps to the cone since that is convex.
+        """Minimise |rows [K pi; -1]|^2 and the weighted penalty over the cone.
 
         Args:
             rows: Information, shape (k, b + 1), as of :meth:`rows`.
@@ -217,27 +214,7 @@ class Consistent(Estimator):
         Raises:
             NotConvergedError: If the cone solver or Newton's method does not solve it.
         """
-        penalty, iterations = self.penalty, 0
-        solution, R = self._expanded(rows, penalty.centre)
-        if penalty.is_quadratic:
-            return solution, self._covariance(R)
-        value = self.objective(rows, solution.x)
-        for step in range(1, _STEPS + 1):
-            pi, iterations = solution.x, iterations + solution.n_iter
-            solution, R = self._expanded(rows, pi)
-            direction = solution.x - pi
-            decrease = np.sum((R @ self.space.basis.T @ (direction / self.prior_std)) ** 2)
-            share, lower = self._along(rows, pi, direction, value)
-            if decrease <= _SETTLED * (1.0 + value) or share == 0:  # nothing left but rounding
-                message = f"{solution.message}, after {step} Newton steps"
-                solution = replace(solution, n_iter=iterations, message=message)
-                return solution, self._covariance(R)
-            solution, value = replace(solution, x=pi + share * direction), lower
-        raise NotConvergedError(
-            f"the {self.metric} prior's fit still changes after {_STEPS} Newton steps; use the "
-            "'euclidean' prior",
-            "max_iterations",
-        )
+        return self.programme.minimise(rows, self.prior_weight)
 
     def objective(self, rows: Array, pi: Array) -> float:
         """Return what :meth:`minimise` minimises.
@@ -249,8 +226,7 @@ class Consistent(Estimator):
         Returns:
             The weighted squares of the residual plus the weighted penalty [-].
         """
-        residual = rows[:, :-1] @ (self.K @ pi) - rows[:, -1]
-        return float(residual @ residual + self.prior_weight * self.penalty.value(pi))
+        return self.programme.objective(rows, pi, self.prior_weight)
 
     def active(self, pi: Array, tolerance: float = _ACTIVE) -> tuple[Array, tuple[str, ...]]:
         """Return the constraints that bind at parameters, linearised there.
@@ -263,33 +239,25 @@ class Consistent(Estimator):
             Gradients with respect to pi, shape (a, p), of what the constraints hold at 0, and the
             family and owner of each, as "pseudo_inertia forearm"; equalities are not among them.
         """
-        gradients, labels = self.cone.active(pi / self.prior_std, tolerance)
+        gradients, labels = self.programme.cone.active(pi / self.prior_std, tolerance)
         return gradients / self.prior_std, labels
 
     @cached_property
+    def programme(self) -> Programme:
+        """The convex programme, for any data and weight."""
+        size, scale = self.layout.n_inertial, self.prior_std
+        E, e = equalities(self.constraints, self.layout, self.prior)
+        cone = consistency_cone(
+            self.constraints, self.layout, scale, self._held, body_units(scale[:size]), self.margin
+        )
+        penalty = make_penalty(self.metric, self.layout, self.prior, scale, self._held)
+        space = Subspace.of(E * scale, e)
+        return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)
+
+    @property
     def penalty(self) -> Penalty:
         """The penalty on the distance from the prior."""
-        return make_penalty(self.metric, self.layout, self.prior, self.prior_std, self._held)
-
-    @cached_property
-    def cone(self) -> Cone:
-        """The inequalities, in units of the prior's spread x = pi / prior_std."""
-        shrink = body_units(self.prior_std[: self.layout.n_inertial])
-        return consistency_cone(
-            self.constraints, self.layout, self.prior_std, self._held, shrink, self.margin
-        )
-
-    @cached_property
-    def space(self) -> Subspace:
-        """What the equalities leave, in the same units."""
-        E, e = equalities(self.constraints, self.layout, self.prior)
-        return Subspace.of(E * self.prior_std, e)
-
-    def prior_covariance(self) -> Array:
-        """Return the covariance that the prior alone gives, at its weight, shape (p, p)."""
-        H = self._scaled_hessian(self.penalty.centre)
-        basis = self.space.basis
-        return self._covariance(scipy.linalg.cholesky(basis.T @ H @ basis))
+        return self.programme.penalty
 
     def undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the base parameters about which the data say next to nothing.
@@ -301,7 +269,8 @@ class Consistent(Estimator):
         Returns:
             Their names.
         """
-        before = np.einsum("bi,ij,bj->b", self.K, self.prior_covariance(), self.K)
+        prior = self.programme.prior_covariance(self.prior_weight)
+        before = np.einsum("bi,ij,bj->b", self.K, prior, self.K)
         after = np.einsum("bi,ij,bj->b", self.K, covariance, self.K)
         is_open = (after > _PRIOR_LED**2 * before) & (before > 0)
         return tuple(np.array(base_names)[is_open].tolist())
@@ -310,59 +279,20 @@ class Consistent(Estimator):
     def _held(self) -> Array:
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
 
-    def _scaled_hessian(self, pi: Array) -> Array:
-        """Return half the Hessian of the weighted penalty in units of the spread."""
-        H = 0.5 * self.prior_weight * self.penalty.hessian(pi)
-        scaled: Array = H * np.outer(self.prior_std, self.prior_std)
-        return scaled
-
-    def _expanded(self, rows: Array, pi: Array) -> tuple[ConeSolution, Array]:
-        """Minimise with the penalty expanded at pi; return also R, R^T R half the Hessian."""
-        H = self._scaled_hessian(pi)
-        slope = 0.5 * self.prior_weight * self.penalty.gradient(pi) * self.prior_std
-        L = scipy.linalg.cholesky(H)  # H = L^T L
-        lowest = pi / self.prior_std - scipy.linalg.cho_solve((L, False), slope)
-        # the data rows stand over prior rows, both in units of the spread
-        A = np.vstack([rows[:, :-1] @ self.K * self.prior_std, L])
-        d = np.concatenate([rows[:, -1], L @ lowest])
-        space = self.space
-        cone, free = self.cone, space.basis.shape[1]
-        if free < len(pi):
-            A, d, cone = A @ space.basis, d - A @ space.origin, cone.restrict(space)
-        triangle = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][:free]
-        solution = least_squares(
-            triangle[:, :-1],
-            triangle[:, -1],
-            cone,
-            solver=self.solver,
-            max_iterations=self.max_iterations,
-        )
-        x = solution.x if free == len(pi) else space.origin + space.basis @ solution.x
-        return replace(solution, x=x * self.prior_std), triangle[:, :-1]
-
-    def _along(self, rows: Array, pi: Array, direction: Array, value: float) -> tuple[float, float]:
-        """Return the share of a step that lowers the objective, and the objective there."""
-        share = 1.0
-        for _ in range(_HALVINGS):
-            lower = self.objective(rows, pi + share * direction)
-            if lower <= value:
-                return share, lower
-            share *= 0.5
-        return 0.0, value
-
-    def _covariance(self, R: Array) -> Array:
-        """Return (R^T R)^-1 of a triangular R, from what the equalities leave to all of pi."""
-        inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
-        spread = self.prior_std[:, None] * self.space.basis @ inverse
-        covariance: Array = spread @ spread.T
-        return covariance
-
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""
+        chosen = (
+            {}
+            if self.choice is None
+            else {
+                "chosen_by": self.choice.how,
+                "curve": [list(pair) for pair in self.choice.curve],
+            }
+        )
         return {
-            "prior": {"metric": self.metric, "weight": self.prior_weight},
+            "prior": {"metric": self.metric, "weight": self.prior_weight, **chosen},
             "solver": self.solver,
-            "constraints": list(self.cone.families),
+            "constraints": list(self.programme.cone.families),
             "active": sorted(set(self.active(pi)[1])),
             "pinned": list(self.constraints.pinned),
         }

@@ -16,10 +16,34 @@ from robotid.parameters import (
     pseudo_inertia_basis,
 )
 
-__all__ = ["METRICS", "Penalty", "Quadratic", "body_units", "make_penalty", "pull_back_metric"]
+__all__ = [
+    "METRICS",
+    "Penalty",
+    "Quadratic",
+    "WeightChoice",
+    "body_units",
+    "make_penalty",
+    "pull_back_metric",
+]
 
 METRICS = ("euclidean", "entropic", "riemannian")
 _THINNEST = 0.01  # a prior's pseudo-inertia is not thinner than that, relative to its body's size
+
+
+@dataclass(frozen=True)
+class WeightChoice:
+    """How the weight of the prior was chosen.
+
+    Attributes:
+        weight: The weight [-].
+        how: "cv" or "evidence".
+        curve: Pairs of weight and score, ascending: prediction error of held-out stretches over
+            the noise level ("cv"), or minus the log evidence; smaller is better.
+    """
+
+    weight: float
+    how: str
+    curve: tuple[tuple[float, float], ...]
 
 
 class Penalty(ABC):

@@ -42,7 +42,13 @@ class ConeSolution:
 
 
 def least_squares(
-    A: Array, d: Array, cone: Cone, *, solver: str = "clarabel", max_iterations: int = 200
+    A: Array,
+    d: Array,
+    cone: Cone,
+    *,
+    solver: str = "clarabel",
+    max_iterations: int = 200,
+    is_exact: bool = True,
 ) -> ConeSolution:
     """Minimise |A x - d|^2 over a cone; without it, and exactly, if it does not bind.
 
@@ -55,6 +61,7 @@ def least_squares(
         cone: Where x must lie.
         solver: One of ``SOLVERS``.
         max_iterations: Bound on its iterations.
+        is_exact: Whether to solve for the corrections, too.
 
     Returns:
         The solution.
@@ -70,7 +77,7 @@ def least_squares(
     call, name = SOLVERS[solver], _NAMES[solver]
     G, h = cone.rows
     x, iterations, statuses = np.zeros(len(d)), 0, []
-    for reach in _REACHES:
+    for reach in _REACHES if is_exact else _REACHES[:1]:
         y, status, count = call(
             A, (d - A @ x) / reach, G, (h + G @ x) / reach, cone, max_iterations
         )
