@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
-from robotid.data import Log
 from robotid.consistency_findings import consistency_findings
+from robotid.data import Log
 from robotid.doctor import alarming, diagnose
 from robotid.exceptions import ModelError
 from robotid.identification import Identification, identify
