@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.cones import svec
+from robotid.estimators.cones import svec, unsvec
 from robotid.estimators.constraints import SIGN_MARGIN, Constraints
 from robotid.estimators.estimator import Estimate, Estimator, as_factors
 from robotid.estimators.physical import Consistent
@@ -16,13 +16,20 @@ from robotid.factors import Factors
 from robotid.parameters import pseudo_inertia, pseudo_inertia_basis
 from robotid.problem import Problem
 
-__all__ = ["LogCholesky", "from_log_cholesky", "log_cholesky_jacobian", "to_log_cholesky"]
+__all__ = [
+    "LogCholesky",
+    "from_log_cholesky",
+    "log_cholesky_curvature",
+    "log_cholesky_jacobian",
+    "to_log_cholesky",
+]
 
 _INSIDE = 1e-6  # a start on the boundary is moved inside by that, free of units
 _STEPS = 500
 _SETTLED = 1e-14  # predicted decrease at which it has converged, relative to the objective
 _FLAT = 1e-9  # smallest curvature that damping counts with, relative
 _TOO_STIFF = 1e16  # damping at which no step lowers the objective any more
+_LONGEST = 4.0  # change of a coordinate in one step: most stand in an exponential
 _SPREAD = 1.0  # of random starts, in log-Cholesky parameters
 
 
@@ -95,34 +102,52 @@ class LogCholesky(Estimator):
         )
 
     def _descend(self, rows: Array, z: Array) -> tuple[Array, float, int, bool]:
-        """Minimise from a point by damped Newton steps; return the end, its value and the steps.
-
-        The curvature leaves out that of the coordinates, which counts for nothing where the
-        gradient in pi vanishes: there the steps converge quadratically.
-        """
+        """Minimise from a point by damped Newton steps; return the end, its value and the steps."""
         fit, damping = self.fit_in_cone, 1e-3
-        D = rows[:, :-1] @ fit.K
-        pi, J = self._parameters(z)
-        value = fit.objective(rows, pi)
+        value = fit.objective(rows, self._parameters(z)[0])
         for step in range(1, _STEPS + 1):
-            residual = D @ pi - rows[:, -1]
-            weight = fit.prior_weight
-            slope = J.T @ (2.0 * D.T @ residual + weight * fit.penalty.gradient(pi))
-            H = J.T @ (2.0 * D.T @ D + weight * fit.penalty.hessian(pi)) @ J
+            slope, H = self.derivatives(rows, z)
+            unit = np.sqrt(np.maximum(np.abs(np.diag(H)), _FLAT * np.abs(np.diag(H)).max()))
             while True:
-                damped = H + damping * np.diag(np.maximum(np.diag(H), _FLAT * np.diag(H).max()))
-                move = -scipy.linalg.solve(damped, slope, assume_a="pos")
+                move = _damped_step(H / np.outer(unit, unit), slope / unit, damping) / unit
+                move *= min(1.0, _LONGEST / np.abs(move).max())
                 predicted = -float(slope @ move)
                 if predicted <= _SETTLED * value or damping > _TOO_STIFF:
-                    return z, value, step, predicted <= _SETTLED * value
-                ahead, J_ahead = self._parameters(z + np.clip(move, -2.0, 2.0))
-                lower = fit.objective(rows, ahead)
+                    return z, value, step, damping <= _TOO_STIFF
+                lower = fit.objective(rows, self._parameters(z + move)[0])
                 if lower < value:
                     break
                 damping = max(4.0 * damping, 1e-12)
-            z, pi, J, value = z + np.clip(move, -2.0, 2.0), ahead, J_ahead, lower
-            damping /= 10.0
+            z, value, damping = z + move, lower, damping / 10.0
         return z, value, _STEPS, False
+
+    def derivatives(self, rows: Array, z: Array) -> tuple[Array, Array]:
+        """Return gradient and Hessian of the objective with respect to the coordinates.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`Consistent.rows`.
+            z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
+
+        Returns:
+            Gradient, shape (p,), and Hessian, shape (p, p).
+        """
+        fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
+        pi, J = self._parameters(z)
+        D = rows[:, :-1] @ fit.K
+        in_pi = 2.0 * D.T @ (D @ pi - rows[:, -1]) + fit.prior_weight * fit.penalty.gradient(pi)
+        curvature = 2.0 * D.T @ D + fit.prior_weight * fit.penalty.hessian(pi)
+        H = J.T @ curvature @ J
+        # what the coordinates themselves bend: tr(G d2M) with G the gradient in the matrices
+        grow = np.linalg.inv(self._shrink)
+        G = grow @ unsvec((in_pi[:size].reshape(-1, 10) @ _TO_PI.T).reshape(-1)) @ grow
+        bent = log_cholesky_curvature(z[:size].reshape(-1, 10), G)
+        for i, block in enumerate(bent):
+            part = slice(10 * i, 10 * i + 10)
+            H[part, part] += block
+        signs = size + np.flatnonzero(self._signs)
+        slope: Array = J.T @ in_pi
+        H[signs, signs] += slope[signs]  # the second derivative of an exponential is its first
+        return slope, H
 
     def _coordinates(self, pi: Array) -> Array:
         """Return the coordinates of parameters, moved inside if they are on the boundary."""
@@ -212,16 +237,31 @@ def log_cholesky_jacobian(z: Array) -> Array:
     Returns:
         Derivatives, shape (n, 10, 4, 4).
     """
-    U, size = _factor(z), np.exp(z[:, 0])
-    dU = np.zeros((len(z), 10, 4, 4))
-    dU[:, 0] = U
-    for i in range(3):
-        dU[:, 1 + i, i, i] = U[:, i, i]
-    for k, (i, j) in enumerate(_UPPER):
-        dU[:, 4 + k, i, j] = size
-    half = dU @ U.transpose(0, 2, 1)[:, None]
+    half = _slopes(z) @ _factor(z).transpose(0, 2, 1)[:, None]
     slopes: Array = half + half.transpose(0, 1, 3, 2)
     return slopes
+
+
+def log_cholesky_curvature(z: Array, G: Array) -> Array:
+    """Return the second derivatives of tr(G U U^T) with respect to the parameters.
+
+    Args:
+        z: Parameters, shape (n, 10).
+        G: Symmetric matrices, shape (n, 4, 4).
+
+    Returns:
+        Hessians, shape (n, 10, 10).
+    """
+    dU, U = _slopes(z), _factor(z)
+    H = 2.0 * np.einsum("nkai,nab,nlbi->nkl", dU, G, dU, optimize=True)
+    along = 2.0 * np.einsum("nab,nkai,nbi->nk", G, dU, U, optimize=True)  # tr(G dU U^T), twice
+    # U is exponential in alpha, and its diagonal in d
+    H[:, 0, :] += along
+    H[:, 1:, 0] += along[:, 1:]
+    for k in range(1, 4):
+        H[:, k, k] += along[:, k]
+    curvature: Array = H
+    return curvature
 
 
 _UPPER = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # s12 s23 s13 t1 t2 t3
@@ -238,8 +278,30 @@ def _factor(z: Array) -> Array:
     return scaled
 
 
+def _slopes(z: Array) -> Array:
+    """Return the derivatives of U, shape (n, 10, 4, 4)."""
+    U = _factor(z)
+    dU = np.zeros((len(z), 10, 4, 4))
+    dU[:, 0] = U
+    for i in range(3):
+        dU[:, 1 + i, i, i] = U[:, i, i]
+    for k, (i, j) in enumerate(_UPPER):
+        dU[:, 4 + k, i, j] = np.exp(z[:, 0])
+    return dU
+
+
+def _damped_step(H: Array, slope: Array, damping: float) -> Array:
+    """Return the Newton step with eigenvalues made positive, which never goes uphill."""
+    values, vectors = np.linalg.eigh(H)
+    bent = np.maximum(np.abs(values), 1e-15) + damping
+    step: Array = -vectors @ ((vectors.T @ slope) / bent)
+    return step
+
+
+_TO_PI = np.linalg.inv(svec(pseudo_inertia_basis()))  # svec(J) @ _TO_PI = pi
+
+
 def _inertial(J: Array) -> Array:
     """Return the inertial parameters of symmetric matrices, shape (..., 10)."""
-    to_pi = np.linalg.inv(svec(pseudo_inertia_basis()))
-    parameters: Array = svec(J) @ to_pi
+    parameters: Array = svec(J) @ _TO_PI
     return parameters
