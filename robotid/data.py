@@ -147,6 +147,20 @@ class Trajectory:
         """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
         return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
 
+    def part(self, start: int, stop: int) -> "Trajectory":
+        """Return the samples start to stop.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one; beyond the end means to the end.
+
+        Returns:
+            The samples.
+        """
+        window = slice(start, stop)
+        arrays = {key: getattr(self, key)[window] for key in ("t", "q", "v", "a", "tau")}
+        return replace(self, segment=self.segment[window], **arrays)
+
 
 def suggestion(name: str, known: Collection[str]) -> str:
     """Return the question whether the nearest known name was meant, or "" if none is near.

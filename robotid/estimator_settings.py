@@ -1,13 +1,15 @@
 """Which estimator is wanted, with its own settings; and the estimator made of them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from dataclasses import field as dataclass_field
 from typing import Any
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
+from robotid.constraint_settings import ConstraintSettings
 from robotid.estimators import (
     OLS,
     PRX,
@@ -18,7 +20,13 @@ from robotid.estimators import (
     Kalman,
     NormalisedGradient,
 )
+from robotid.estimators.log_cholesky import LogCholesky
+from robotid.estimators.priors import METRICS
+from robotid.estimators.solvers import SOLVERS
+from robotid.estimators.weighting import choose_weight
 from robotid.exceptions import SettingsError
+from robotid.factors import Factors, gather
+from robotid.link_geometry import geometry_half_spaces
 from robotid.lumping import held_parameters
 from robotid.model import RobotModel
 
@@ -32,12 +40,15 @@ __all__ = [
     "make_estimator",
 ]
 
-_PROJECTION = ("margin", "prior_weight")
+_PROJECTION = ("margin", "prior", "prior_weight", "solver", "check", "constraints")
+_WEIGHTS = ("cv", "evidence")
+_FOLDS = 6  # held out in turn by prior_weight = "cv"
 #: The keys that each estimator has, beside its name.
 KEYS: Mapping[str, tuple[str, ...]] = {
     "ols": (),
     "wls": (),
     "consistent": _PROJECTION,
+    "log_cholesky": (*_PROJECTION, "starts", "seed"),
     "rls": ("forgetting", "physical", *_PROJECTION),
     "kalman": ("walk", "gate", "physical", *_PROJECTION),
     "prx": ("step", "metric", "average", "passes", "seed", "physical", *_PROJECTION),
@@ -52,10 +63,17 @@ class EstimatorSettings:
     """Which estimator, and its own settings. A setting of another estimator is refused.
 
     Attributes:
-        name: "ols", "wls", "consistent", "rls", "kalman", "prx" or "gradient".
+        name: "ols", "wls", "consistent", "log_cholesky", "rls", "kalman", "prx" or "gradient".
         margin: Of "consistent" and ``physical``: smallest eigenvalue of a body's pseudo-inertia
             relative to its prior size [-].
-        prior_weight: Of "consistent" and ``physical``: weight of the URDF's values [-].
+        prior: Of the same: metric of the distance from the URDF's values, "euclidean", "entropic"
+            or "riemannian".
+        prior_weight: Of the same: weight of the URDF's values [-], or how it is chosen from the
+            fitted logs: "cv" (stretches held out in turn) or "evidence".
+        solver: Of the same: "clarabel" or "scs".
+        check: Of the same: whether the other solver solves it, too.
+        constraints: Of the same: see :class:`robotid.constraint_settings.ConstraintSettings`.
+        starts: Of "log_cholesky": random starts beside the one from the cone programme.
         forgetting: Of "rls": weight of a sample relative to the next one [-].
         walk: Of "kalman": random walk per sample, as a share of the prior's spread [-].
         gate: Of "kalman": probability with which a good row passes; False for no gate.
@@ -64,13 +82,14 @@ class EstimatorSettings:
         average: Of "prx" and "gradient": whether the iterates are averaged.
         passes: Of "prx" and "gradient": largest number of passes over the logs.
         seed: Of "prx" and "gradient": seed of the order of the samples; negative: that of time.
+            Of "log_cholesky": seed of the random starts.
         step_size: Of "gradient": relaxation, above 0 and below 2 [-].
         physical: Of the recursive ones: whether the last estimate is made physically possible.
     """
 
     name: str = "consistent"
     margin: float = 1e-4
-    prior_weight: float = 1.0
+    prior_weight: float | str = 1.0
     forgetting: float = 1.0
     walk: float = 0.0
     gate: float | bool = 1 - 1e-7
@@ -81,19 +100,31 @@ class EstimatorSettings:
     seed: int = 0
     step_size: float = 1.0
     physical: bool = False
+    prior: str = "euclidean"
+    solver: str = "clarabel"
+    check: bool = False
+    constraints: Mapping[str, Any] = dataclass_field(default_factory=dict)
+    starts: int = 0
 
     def __post_init__(self) -> None:
         if self.name not in KEYS:
             raise SettingsError(f"estimator is {self.name!r}, wanted one of {list(ESTIMATORS)}")
         own = KEYS[self.name]
         for field in fields(self)[1:]:
-            if field.name not in own and getattr(self, field.name) != field.default:
+            value = getattr(self, field.name)
+            if field.name not in own and value != field.default and value != {}:
                 raise SettingsError(
                     f"estimator {self.name!r} has no setting {field.name!r}; it has {list(own)}"
                 )
+        if isinstance(self.prior_weight, str) and self.prior_weight not in _WEIGHTS:
+            raise SettingsError(
+                f"prior_weight is {self.prior_weight!r}, wanted a positive number or one of "
+                f"{list(_WEIGHTS)}"
+            )
         for key in ("margin", "prior_weight", "passes"):
-            if not getattr(self, key) > 0:
-                raise SettingsError(f"{key} is {getattr(self, key)}, wanted a positive number")
+            number = getattr(self, key)
+            if not isinstance(number, str) and not number > 0:
+                raise SettingsError(f"{key} is {number}, wanted a positive number")
         _check_range("forgetting", self.forgetting, 0 < self.forgetting <= 1, "0 < x <= 1")
         _check_range("walk", self.walk, self.walk >= 0, "x >= 0")
         _check_range("step_size", self.step_size, 0 < self.step_size < 2, "0 < x < 2")
@@ -101,6 +132,10 @@ class EstimatorSettings:
         _check_range("gate", self.gate, is_gate, "0.5 <= x < 1, or false")
         _check_choice("step", self.step, ("exact", "printed"))
         _check_choice("metric", self.metric, ("noise", "mass", "rows"))
+        _check_choice("prior", self.prior, METRICS)
+        _check_choice("solver", self.solver, tuple(SOLVERS))
+        _check_range("starts", self.starts, self.starts >= 0, "x >= 0")
+        ConstraintSettings(**self.constraints)
 
     @property
     def needs_mass(self) -> bool:
@@ -121,12 +156,14 @@ class Prior:
         spread: How far they may plausibly be wrong, shape (p,).
         share: Share of the rows that count as independent [-].
         sigma: Noise level of each joint, shape (n,) [N m or N].
+        stretches: Factors of the stretches of the fitted logs, to choose a weight with.
     """
 
     pi: Array
     spread: Array
     share: float
     sigma: Array
+    stretches: tuple[Factors, ...] = ()
 
 
 def make_estimator(
@@ -149,7 +186,11 @@ def make_estimator(
         return WLS(independent_share=prior.share)
     if settings.name in RECURSIVE:
         return _recursive(settings, mapping, prior)
-    return consistent_fit(settings, model, mapping, prior)
+    fit = consistent_fit(settings, model, mapping, prior)
+    if settings.name == "log_cholesky":
+        rng = np.random.default_rng(settings.seed)
+        return LogCholesky(fit, starts=settings.starts, rng=rng)
+    return fit
 
 
 def consistent_fit(
@@ -165,17 +206,31 @@ def consistent_fit(
 
     Returns:
         The estimator.
+
+    Raises:
+        SettingsError: If constraints contradict each other or do not fit the robot.
     """
-    return Consistent(
+    constraints = ConstraintSettings(**settings.constraints)
+    geometry = geometry_half_spaces(model, constraints.com_within)
+    weight = settings.prior_weight
+    fit = Consistent(
         layout=model.layout,
         K=mapping.K,
         prior=prior.pi,
         prior_std=prior.spread,
         held=held_parameters(model),
         margin=settings.margin,
-        prior_weight=settings.prior_weight,
+        prior_weight=1.0 if isinstance(weight, str) else weight,
         independent_share=prior.share,
+        metric=settings.prior,
+        constraints=constraints.to_constraints(geometry),
+        solver=settings.solver,
+        check=settings.check,
     )
+    if not isinstance(weight, str):
+        return fit
+    choice = choose_weight(fit, gather(prior.stretches, _FOLDS), weight)
+    return replace(fit, prior_weight=choice.weight, choice=choice)
 
 
 def _recursive(settings: EstimatorSettings, mapping: BaseMapping, prior: Prior) -> Estimator:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import scipy.linalg.lapack
@@ -19,7 +20,7 @@ from robotid.exceptions import DataError
 from robotid.lapack import Triangle
 from robotid.problem import Problem, RowSource
 
-__all__ = ["Factors", "compress", "compress_stretches", "merge"]
+__all__ = ["Factors", "compress", "compress_stretches", "gather", "merge"]
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -128,12 +129,17 @@ def compress_stretches(
     """
     if not problem.sources:
         raise DataError("the problem comes in blocks only; it cannot be cut into stretches")
-    stretches = (
-        source.part(start, min(start + length, source.samples))
+    parts = [
+        replace(problem, sources=(source.part(start, min(start + length, source.samples)),))
         for source in problem.sources
         for start in range(0, source.samples, length)
-    )
-    return tuple(_compress(replace(problem, sources=(part,)), threads) for part in stretches)
+    ]
+    is_parallel = all(source.is_parallel for source in problem.sources)
+    workers = (_cores() if is_parallel else 1) if threads is None else threads
+    if min(workers, len(parts)) <= 1:
+        return tuple(_compress(part, 1) for part in parts)
+    with ThreadPoolExecutor(min(workers, len(parts))) as pool:
+        return tuple(pool.map(partial(_compress, threads=1), parts))
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
@@ -160,6 +166,20 @@ def merge(factors: Sequence[Factors]) -> Factors:
     stacked = np.concatenate([f.R for f in factors], axis=1)
     R = np.array([_triangle(stack) for stack in stacked])
     return Factors(R, np.sum([f.rows for f in factors], axis=0), first.names)
+
+
+def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
+    """Return fewer, longer stretches: neighbours merged, as for held-out stretches.
+
+    Args:
+        stretches: Factors of stretches, in order.
+        count: Number wanted, at least 1.
+
+    Returns:
+        At most so many factors of about as many stretches each, in order.
+    """
+    edges = np.linspace(0, len(stretches), min(count, len(stretches)) + 1).round().astype(int)
+    return tuple(merge(stretches[i:j]) for i, j in pairwise(edges))
 
 
 def _compress(problem: Problem, threads: int | None) -> Factors:

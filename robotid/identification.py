@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from robotid.estimators import WLS, Estimate
 from robotid.exceptions import DataError
 from robotid.factors import Factors
 from robotid.lumping import held_parameters
+from robotid.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.metrics import Metrics
 from robotid.model import RobotModel
 from robotid.parameters import pseudo_inertia
@@ -28,6 +30,7 @@ from robotid.prior import spread_of
 from robotid.recordings import LoadedRecordings, Recordings
 from robotid.regressor import random_regressor
 from robotid.signals import SignalSettings
+from robotid.standard_errors import StandardErrors, measured_errors
 from robotid.validation import Evaluation, pool, prepare
 from robotid.verdict import Verdict, judge
 
@@ -40,6 +43,7 @@ __all__ = [
     "structural_mapping",
 ]
 
+_GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
 
@@ -62,6 +66,7 @@ class Identification:
         base_error: Their standard errors, shape (b,); inf where the data say nothing.
         identification: The recordings that were fitted, with predictions "estimate" and "wls".
         validation: The same of the recordings that were kept apart.
+        errors: What the standard errors rest on.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
     """
 
@@ -78,6 +83,7 @@ class Identification:
     base_error: Array
     identification: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
+    errors: StandardErrors
     alarms: tuple[str, ...] = ()
 
     @property
@@ -91,6 +97,11 @@ class Identification:
         signs = self.standard[self.model.layout.is_nonnegative()]
         return bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
 
+    @cached_property
+    def mass_matrix(self) -> MassMatrixCheck:
+        """The mass matrix of the standard parameters over random poses."""
+        return check_mass_matrix(self.model, self.standard)
+
     @property
     def sources(self) -> tuple[str, ...]:
         """Where each standard parameter comes from: "data", "mixed" or "prior"."""
@@ -98,7 +109,9 @@ class Identification:
         names = np.where(
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
-        return tuple(names.tolist())
+        pinned = self.estimate.details.get("pinned", ())
+        kept = [name.rsplit(".", 1)[0] in pinned for name in self.model.layout.names]
+        return tuple(np.where(kept, "prior", names).tolist())
 
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.
@@ -183,13 +196,29 @@ def conclude(
         NotConvergedError: If a solver fails.
     """
     mapping = structural_mapping(model)
-    reduction = join(recordings.reduce(mapping))
+    reductions = recordings.reduce(mapping)
+    reduction = join(reductions)
+    stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share
     prior = model.standard_parameters()
     spread = spread_of(model, reduction.squares, reduction.samples)
-    wls = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Prior(prior, spread, share, wls.sigma)
-    estimate = _run(choice, model, mapping, before, recordings, factors, wls)
+    rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
+    before = Prior(prior, spread, share, rough.sigma, stretches)
+    estimate = _run(choice, model, mapping, before, recordings, factors, rough)
+    wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
+    if choice.name in _GRADIENT and not choice.physical:
+        estimate = _with_spread(estimate, wls)
+    else:
+        sigma = np.ones_like(rough.sigma) if choice.name == "ols" else rough.sigma
+        estimate, errors = measured_errors(
+            estimate,
+            stretches,
+            factors,
+            share,
+            mapping.K,
+            estimate.sigma if estimate.names == mapping.names else sigma,
+            is_filter=choice.name == "kalman" or choice.forgetting < 1,
+        )
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     wls_standard = mapping.to_standard(wls.theta, prior, spread)
@@ -211,6 +240,7 @@ def conclude(
         base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
         identification=fitted,
         validation=kept,
+        errors=errors,
     )
 
 
@@ -249,10 +279,10 @@ def _run(
     if choice.name not in RECURSIVE:
         return estimator.fit(factors)
     estimate = estimator.fit(recordings.problem(mapping, with_mass=choice.needs_mass))
-    if choice.name in ("prx", "gradient"):
-        estimate = _with_spread(estimate, wls)
     if not choice.physical:
         return estimate
+    if choice.name in _GRADIENT:
+        estimate = _with_spread(estimate, wls)
     return consistent_fit(choice, model, mapping, prior).project(estimate)
 
 

@@ -40,7 +40,18 @@ KEYS: dict[str, Any] = {
     "estimator": {
         "name": str,
         "margin": _NUMBER,
-        "prior_weight": _NUMBER,
+        "prior": str,
+        "prior_weight": (*_NUMBER, str),
+        "solver": str,
+        "check": bool,
+        "starts": int,
+        "constraints": {
+            "mass": dict,
+            "total_mass": (*_NUMBER, list),
+            "com": dict,
+            "com_within": str,
+            "pinned": list,
+        },
         "forgetting": _NUMBER,
         "walk": _NUMBER,
         "gate": (*_NUMBER, bool),
@@ -112,5 +123,6 @@ def _type_name(wanted: type | tuple[type, ...]) -> str:
         int: "a whole number",
     }
     if isinstance(wanted, tuple):
-        return "a number or false" if bool in wanted else "a number"
+        others = {bool: "false", str: "text", list: "a list"}
+        return " or ".join(["a number", *(others[kind] for kind in wanted if kind in others)])
     return names[wanted]

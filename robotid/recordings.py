@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
 from robotid.data import Trajectory
+from robotid.factors import compress_stretches
 from robotid.model import RobotModel
 from robotid.pieces import Reduction
 from robotid.problem import Problem, concatenate
@@ -18,6 +19,10 @@ from robotid.signals import SignalSettings
 from robotid.validation import Evaluation, Recording, evaluate, shares_rows
 
 __all__ = ["LoadedRecordings", "Recordings", "base_problem", "independent_share"]
+
+
+_STRETCHES = 48  # of all logs together: enough to see how much their scores scatter
+_CORRELATIONS = 10  # shortest stretch in correlation times of noise behind the filter
 
 
 class Recordings(ABC):
@@ -36,7 +41,7 @@ class Recordings(ABC):
             mapping: Standard to base parameters.
 
         Returns:
-            One reduction per log or piece of a log, in order.
+            One reduction per stretch of a log, in order of time.
 
         Raises:
             DataError: If a row cannot be used.
@@ -98,12 +103,19 @@ class LoadedRecordings(Recordings):
             mapping: Standard to base parameters.
 
         Returns:
-            One reduction per log.
+            One reduction per stretch, each longer than the correlation of filtered noise.
         """
-        return tuple(
-            Reduction.of(base_problem(self.model, mapping, r.trajectory, r.mask), r.trajectory)
-            for r in self.fitted
-        )
+        count = -(-_STRETCHES // len(self.fitted))
+        reductions: list[Reduction] = []
+        for recording in self.fitted:
+            motion, mask = recording.trajectory, recording.mask
+            shortest = round(_CORRELATIONS / independent_share(recording.signals))
+            length = max(-(-len(motion.t) // count), shortest)
+            problem = base_problem(self.model, mapping, motion, mask)
+            for k, factors in enumerate(compress_stretches(problem, length)):
+                part = motion.part(k * length, (k + 1) * length)
+                reductions.append(Reduction(factors, part.squares, len(part.t)))
+        return tuple(reductions)
 
     def problem(self, mapping: BaseMapping, *, with_mass: bool = False) -> Problem:
         """See :meth:`Recordings.problem`.

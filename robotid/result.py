@@ -236,6 +236,8 @@ def _consistency(identification: Identification) -> dict[str, Any]:
             for body, J_i in zip(layout.bodies, J, strict=True)
         ],
         "total_mass": float(J[:, 3, 3].sum()),
+        "mass_matrix": dataclasses.asdict(identification.mass_matrix),
+        "fit": dict(identification.estimate.details),
     }
 
 

@@ -120,11 +120,8 @@ class TrajectoryRows(RowSource):
         Returns:
             The rows.
         """
-        window = slice(start, stop)
-        motion = self.trajectory
-        arrays = {key: getattr(motion, key)[window] for key in ("t", "q", "v", "a", "tau")}
-        trajectory = replace(motion, segment=motion.segment[window], **arrays)
-        return replace(self, trajectory=trajectory, weights=self.weights[window])
+        motion = self.trajectory.part(start, stop)
+        return replace(self, trajectory=motion, weights=self.weights[start:stop])
 
     def select(self, columns: Array) -> "TrajectoryRows":
         """Return the same rows with fewer columns.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
+from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
 from robotid.exceptions import ModelError
@@ -181,6 +182,7 @@ def _fit_findings(identification: Identification) -> list[Finding]:
             "URDF was written; use the 'consistent' estimator for one that loads"
         )
         findings.append(Finding("urdf_not_written", "warning", "urdf", message))
+    findings += consistency_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

@@ -16,17 +16,18 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings job_keys lanes lapack log_source console signal_settings",
+    1: "parameters data problem program proximity kinematics metrics xml_splice "
+    "examples innovations online_settings job_keys lanes lapack log_source console signal_settings",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
     "time_stamps compiled columns array_tables csv_files parquet_files bags",
-    3: "array_files estimators plant lumping prior rows log_checks signals pieces",
-    4: "regressor excitation tables channel_checks",
-    5: "validation sidecar estimator_settings simulation dynamics log_files probe",
+    3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
+    4: "standard_errors regressor excitation tables channel_checks link_geometry "
+    "constraint_settings",
+    5: "validation sidecar estimator_settings simulation dynamics log_files probe mass_matrix",
     6: "recordings closed_loop conversion explanations load_checks motion_checks",
     7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs",
-    8: "online report_page result inspection paper_errata doctor",
+    8: "online report_page result inspection paper_errata doctor consistency_findings",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
     11: "workflow",
@@ -37,28 +38,31 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
     "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior", "rows",
-    "compiled",
+    "compiled", "link_geometry", "mass_matrix",
 }  # fmt: skip
 NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
     "meshcat": {"visualization"},
+    "trimesh": {"link_geometry"},
     "pyarrow": {"parquet_files"},
     "rosbags": {"bags"},
     "h5py": {"array_files"},
     "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
     "clarabel": {"estimators"},
+    "scs": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
 ESTIMATOR_FLOORS = {
     name: floor
     for floor, names in enumerate(
         (
-            "estimator",
-            "least_squares recursive",
-            "physical rls kalman descent",
-            "prx gradient",
+            "estimator cones priors",
+            "least_squares recursive solvers constraints",
+            "programme rls kalman descent",
+            "physical",
+            "prx gradient weighting log_cholesky",
             "__init__",
         )
     )

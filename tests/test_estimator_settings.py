@@ -90,7 +90,11 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
         "gate": 0.999999,
         "physical": True,
         "margin": 1e-4,
+        "prior": "euclidean",
         "prior_weight": 1.0,
+        "solver": "clarabel",
+        "check": False,
+        "constraints": {},
     }
     assert "a Kalman filter" in (tmp_path / "out" / "report.html").read_text()
     stated = json.loads((tmp_path / "out" / "result.json").read_text())

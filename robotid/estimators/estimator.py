@@ -1,7 +1,9 @@
 """The interface of estimators and what they return."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +30,7 @@ class Estimate:
         converged: Whether the iteration ended by its own criterion.
         n_iter: Number of iterations.
         message: What the estimator says of its run.
+        details: How it was fitted, plain values by name: prior, constraints, solver.
     """
 
     theta: Array
@@ -40,6 +43,7 @@ class Estimate:
     converged: bool
     n_iter: int
     message: str
+    details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def std_error(self) -> Array:

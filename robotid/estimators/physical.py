@@ -4,25 +4,35 @@ Every body gets a positive definite pseudo-inertia, every drive armature and fri
 sign; where the data say nothing the parameters stay near their prior.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
+from robotid.estimators.cones import Subspace
+from robotid.estimators.constraints import (
+    Constraints,
+    check_constraints,
+    consistency_cone,
+    equalities,
+)
 from robotid.estimators.estimator import Estimate, Estimator, as_factors
 from robotid.estimators.least_squares import WLS
+from robotid.estimators.priors import METRICS, Penalty, WeightChoice, body_units, make_penalty
+from robotid.estimators.programme import Programme
+from robotid.estimators.solvers import SOLVERS, ConeSolution
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.factors import Factors
-from robotid.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
+from robotid.parameters import ParameterLayout
 from robotid.problem import Problem
 
 __all__ = ["Consistent"]
 
-_SIGN_MARGIN = 1e-9  # drive terms stay above this share of their scale, so that rounding cannot
-# make them negative
-_REACHES = (1.0, 1e-3, 1e-5)  # units of the first solution and of its corrections
 _PRIOR_LED = 0.9  # a base parameter whose spread shrinks by less than this is undetermined
+_ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +41,11 @@ class Consistent(Estimator):
 
     Minimises, over the standard parameters pi,
 
-        sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight |(pi - prior) / prior_std|^2
+        sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
-    subject to J(pi_i) - J(held_i) >= margin T_i for each body i, and armature, viscous and Coulomb
-    coefficients >= 0. The noise levels sigma_j come from weighted least squares.
+    subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
+    coefficients >= 0, and the further constraints. The noise levels sigma_j come from weighted
+    least squares.
 
     Attributes:
         layout: The standard parameters.
@@ -47,6 +58,12 @@ class Consistent(Estimator):
         prior_weight: Weight of the prior [-].
         independent_share: Share of the rows that count as independent, 2 cutoff / rate.
         max_iterations: Bound on the iterations of the cone solver.
+        metric: How the distance from the prior is measured: "euclidean", "entropic" or
+            "riemannian"; see :func:`robotid.estimators.priors.make_penalty`.
+        constraints: Bounds beside physical consistency.
+        solver: "clarabel" or "scs".
+        choice: How ``prior_weight`` was chosen, if it was.
+        check: Whether the other solver solves it, too; its difference is stated in the details.
 
     References:
         Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
@@ -63,6 +80,11 @@ class Consistent(Estimator):
     prior_weight: float = 1.0
     independent_share: float = 1.0
     max_iterations: int = 200
+    metric: str = "euclidean"
+    constraints: Constraints = field(default_factory=Constraints)
+    solver: str = "clarabel"
+    check: bool = False
+    choice: WeightChoice | None = None
 
     def __post_init__(self) -> None:
         p = len(self.layout.names)
@@ -77,6 +99,12 @@ class Consistent(Estimator):
             raise DataError(
                 f"margin {self.margin} and prior_weight {self.prior_weight} must be positive"
             )
+        if self.metric not in METRICS or self.solver not in SOLVERS:
+            raise DataError(
+                f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
+                f"{self.solver!r}, wanted one of {list(SOLVERS)}"
+            )
+        check_constraints(self.constraints, self.layout, self.prior, self._held)
 
     def fit(self, data: Problem | Factors) -> Estimate:
         """Estimate the standard parameters; see :meth:`Estimator.fit`.
@@ -86,7 +114,7 @@ class Consistent(Estimator):
 
         Returns:
             The estimate over the p standard parameters. The covariance is that of the fit without
-            the constraints, an upper bound where one is active; rank, condition number and the
+            the inequalities, an upper bound where one is active; rank, condition number and the
             names of undetermined parameters are those of the base parameters.
 
         Raises:
@@ -94,28 +122,31 @@ class Consistent(Estimator):
             NotConvergedError: If the cone solver does not solve it.
         """
         factors = as_factors(data)
-        wls = WLS(prior=self.K @ self.prior, independent_share=self.independent_share).fit(factors)
-        R = factors.weighted(wls.sigma / np.sqrt(self.independent_share))
-        theta, covariance, n_iter, message = self._minimise(R)
+        wls = self.noise_fit(factors)
+        rows = self.rows(factors, wls.sigma)
+        solution, covariance = self.minimise(rows)
+        details = self._details(solution.x)
+        if self.check:
+            details["check"] = self._second_opinion(rows, solution.x, factors)
         return Estimate(
-            theta=theta,
+            theta=solution.x,
             covariance=covariance,
             names=self.layout.names,
             sigma=wls.sigma,
             rank=wls.rank,
             condition=wls.condition,
-            undetermined=self._undetermined(covariance, factors.names),
+            undetermined=self.undetermined(covariance, factors.names),
             converged=True,
-            n_iter=n_iter,
-            message=message,
+            n_iter=solution.n_iter,
+            message=solution.message,
+            details=details,
         )
 
     def project(self, estimate: Estimate) -> Estimate:
         """Return the possible standard parameters nearest to an estimate of the base parameters.
 
         Nearest in the metric of its covariance C, the prior beside it, with the constraints of
-        :meth:`fit`: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight
-        |(pi - prior) / prior_std|^2.
+        :meth:`fit`: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi).
 
         Args:
             estimate: Base parameters, as a recursive estimator has them at any moment. Those of
@@ -135,125 +166,153 @@ class Consistent(Estimator):
                 "or 'kalman', which have one"
             )
         rows = _information_rows(estimate, known)  # (k, b + 1)
-        theta, covariance, n_iter, message = self._minimise(rows)
+        solution, covariance = self.minimise(rows)
         return replace(
             estimate,
-            theta=theta,
+            theta=solution.x,
             covariance=covariance,
             names=self.layout.names,
-            undetermined=self._undetermined(covariance, estimate.names),
-            n_iter=estimate.n_iter + n_iter,
-            message=f"{estimate.message}; made physically possible, {message}",
+            undetermined=self.undetermined(covariance, estimate.names),
+            n_iter=estimate.n_iter + solution.n_iter,
+            message=f"{estimate.message}; made physically possible, {solution.message}",
+            details=self._details(solution.x),
         )
 
-    def _minimise(self, rows: Array) -> tuple[Array, Array, int, str]:
-        """Minimise |rows [K pi; -1]|^2 and the prior over the cone, rows (k, b + 1).
+    def noise_fit(self, factors: Factors) -> Estimate:
+        """Return the weighted least squares fit that the noise levels come from.
 
-        Returns pi, its covariance without the constraints, iterations and what the solver said.
+        Args:
+            factors: The factors, of base parameters.
+
+        Returns:
+            The estimate; directions that the data leave open keep the prior.
         """
-        # in units of the prior's spread, x = pi / prior_std, the data rows stand over prior rows
-        root = np.sqrt(self.prior_weight)
-        A = np.vstack([rows[:, :-1] @ self.K * self.prior_std, root * np.eye(len(self.prior))])
-        d = np.concatenate([rows[:, -1], root * self.prior / self.prior_std])
-        triangle = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][: len(self.prior) + 1]
-        x, n_iter, message = self._solve(triangle[:-1, :-1], triangle[:-1, -1])
-        covariance = self.prior_std[:, None] * _inverse_gram(triangle[:-1, :-1]) * self.prior_std
-        return x * self.prior_std, covariance, n_iter, message
+        prior = self.K @ self.prior
+        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
 
-    def _undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the base parameters about which the data say next to nothing."""
+    def rows(self, factors: Factors, sigma: Array) -> Array:
+        """Return the rows [R d] with |R K pi - d|^2 the weighted squares of the residual.
+
+        Args:
+            factors: The factors, of base parameters.
+            sigma: Noise level per joint, shape (n,) [N m or N].
+
+        Returns:
+            Upper triangular factor, shape (b + 1, b + 1), free of units.
+        """
+        return factors.weighted(sigma / np.sqrt(self.independent_share))
+
+    def minimise(self, rows: Array) -> tuple[ConeSolution, Array]:
+        """Minimise |rows [K pi; -1]|^2 and the weighted penalty over the cone.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+
+        Returns:
+            The solution, its x being pi, shape (p,); and the covariance without the inequalities.
+
+        Raises:
+            NotConvergedError: If the cone solver or Newton's method does not solve it.
+        """
+        return self.programme.minimise(rows, self.prior_weight)
+
+    def objective(self, rows: Array, pi: Array) -> float:
+        """Return what :meth:`minimise` minimises.
+
+        Args:
+            rows: Information, shape (k, b + 1).
+            pi: Standard parameters, shape (p,).
+
+        Returns:
+            The weighted squares of the residual plus the weighted penalty [-].
+        """
+        return self.programme.objective(rows, pi, self.prior_weight)
+
+    def active(self, pi: Array, tolerance: float = _ACTIVE) -> tuple[Array, tuple[str, ...]]:
+        """Return the constraints that bind at parameters, linearised there.
+
+        Args:
+            pi: Standard parameters, shape (p,).
+            tolerance: Slack below which a constraint counts as active, free of units.
+
+        Returns:
+            Gradients with respect to pi, shape (a, p), of what the constraints hold at 0, and the
+            family and owner of each, as "pseudo_inertia forearm"; equalities are not among them.
+        """
+        gradients, labels = self.programme.cone.active(pi / self.prior_std, tolerance)
+        return gradients / self.prior_std, labels
+
+    @cached_property
+    def programme(self) -> Programme:
+        """The convex programme, for any data and weight."""
+        size, scale = self.layout.n_inertial, self.prior_std
+        E, e = equalities(self.constraints, self.layout, self.prior)
+        cone = consistency_cone(
+            self.constraints, self.layout, scale, self._held, body_units(scale[:size]), self.margin
+        )
+        penalty = make_penalty(self.metric, self.layout, self.prior, scale, self._held)
+        space = Subspace.of(E * scale, e)
+        return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)
+
+    @property
+    def penalty(self) -> Penalty:
+        """The penalty on the distance from the prior."""
+        return self.programme.penalty
+
+    def undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the base parameters about which the data say next to nothing.
+
+        Args:
+            covariance: Of the standard parameters, shape (p, p).
+            base_names: Names of the base parameters.
+
+        Returns:
+            Their names.
+        """
+        prior = self.programme.prior_covariance(self.prior_weight)
+        before = np.einsum("bi,ij,bj->b", self.K, prior, self.K)
         after = np.einsum("bi,ij,bj->b", self.K, covariance, self.K)
-        before = (self.K**2) @ (self.prior_std**2 / self.prior_weight)
-        return tuple(np.array(base_names)[after > _PRIOR_LED**2 * before].tolist())
+        is_open = (after > _PRIOR_LED**2 * before) & (before > 0)
+        return tuple(np.array(base_names)[is_open].tolist())
 
     @property
     def _held(self) -> Array:
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
 
-    def _solve(self, A: Array, d: Array) -> tuple[Array, int, str]:
-        """Minimise |A x - d|^2 over the cone; without it, and exactly, if it does not bind."""
-        x = scipy.linalg.solve_triangular(A, d)
-        pi = x * self.prior_std
-        signs = x[self.layout.is_nonnegative()]
-        shrink = self._shrink()
-        J = shrink @ pseudo_inertia(pi[: self.layout.n_inertial] - self._held) @ shrink
-        if np.linalg.eigvalsh(J).min() >= self.margin and (signs >= _SIGN_MARGIN).all():
-            return x, 0, "no constraint binds"
-        return self._solve_cone(A, d)
+    def _details(self, pi: Array) -> dict[str, Any]:
+        """Return how it was fitted, as plain values."""
+        chosen = (
+            {}
+            if self.choice is None
+            else {
+                "chosen_by": self.choice.how,
+                "curve": [list(pair) for pair in self.choice.curve],
+            }
+        )
+        return {
+            "prior": {"metric": self.metric, "weight": self.prior_weight, **chosen},
+            "solver": self.solver,
+            "constraints": list(self.programme.cone.families),
+            "active": sorted(set(self.active(pi)[1])),
+            "pinned": list(self.constraints.pinned),
+        }
 
-    def _solve_cone(self, A: Array, d: Array) -> tuple[Array, int, str]:
-        """Minimise |A x - d|^2 over the cone, then again for ever smaller corrections of x.
-
-        The solver's tolerance is relative to the problem: solved for a correction in units of
-        1e-3 and 1e-5, its error shrinks likewise (measured on exact data: 2e-7, 5e-14, 2e-15).
-        """
-        G, h = self._cone_rows()
-        x, iterations, statuses = np.zeros(len(d)), 0, []
-        for reach in _REACHES:
-            y, status, count = self._call_solver(A, (d - A @ x) / reach, G, (h + G @ x) / reach)
-            statuses.append(status)
-            iterations += count
-            if status not in ("Solved", "AlmostSolved"):
-                break
-            x = x + reach * y
-        if "Solved" not in statuses:
-            raise NotConvergedError(
-                "the physically consistent fit was not solved by Clarabel; check the URDF's "
-                "inertials with 'robotid inspect', or use the 'wls' estimator",
-                statuses[-1],
-            )
-        return x, iterations, f"Clarabel: {', then '.join(statuses)}"
-
-    def _call_solver(self, A: Array, d: Array, G: Array, h: Array) -> tuple[Array, str, int]:
-        """Minimise |z|^2 with z = (A x - d) / size and h + G x in the cone (residual form)."""
-        import clarabel
-        from scipy import sparse
-
-        p = len(d)
-        size = np.linalg.norm(A, axis=0).max()
-        P = sparse.block_diag([sparse.csc_matrix((p, p)), sparse.eye(p)], format="csc")
-        rows = sparse.bmat([[A / size, -sparse.eye(p)], [-G, None]], format="csc")
-        right = np.concatenate([d / size, h])
-        signs = int(self.layout.is_nonnegative().sum())
-        cones = [clarabel.ZeroConeT(p), clarabel.NonnegativeConeT(signs)]
-        cones += [clarabel.PSDTriangleConeT(4)] * len(self.layout.bodies)
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_threads = 1
-        settings.max_iter = self.max_iterations
-        # at the default 1e-8 it stalls on easy problems, at an optimum right to 1e-9
-        settings.tol_gap_abs = settings.tol_gap_rel = 1e-7
-        solver = clarabel.DefaultSolver(P, np.zeros(2 * p), rows, right, cones, settings)
-        solution = solver.solve()
-        return np.array(solution.x[:p]), str(solution.status), int(solution.iterations)
-
-    def _cone_rows(self) -> tuple[Array, Array]:
-        """Return G, h with h + G x in the cone: signs first, then svec of each pseudo-inertia."""
-        p = len(self.prior)
-        signs = np.flatnonzero(self.layout.is_nonnegative())
-        G, h = [np.eye(p)[signs]], [np.full(len(signs), -_SIGN_MARGIN)]
-        basis = pseudo_inertia_basis()
-        scaled = zip(pseudo_inertia(self._held), self._shrink(), strict=True)
-        for i, (J_held, shrink) in enumerate(scaled):
-            part = slice(10 * i, 10 * i + 10)
-            block = np.zeros((10, p))
-            for k in range(10):
-                block[:, 10 * i + k] = _svec(shrink @ basis[k] @ shrink)
-            block[:, part] *= self.prior_std[part]
-            G.append(block)
-            h.append(-_svec(shrink @ J_held @ shrink + self.margin * np.eye(4)))
-        return np.vstack(G), np.concatenate(h)
-
-    def _shrink(self) -> Array:
-        """Return T_i^-1/2 per body, which makes its pseudo-inertia free of units, (bodies, 4, 4).
-
-        The size of a body is that of its prior's spread: mass m and radius r from m and m r.
-        """
-        spread = self.prior_std[: self.layout.n_inertial].reshape(-1, 10)
-        mass, radius = spread[:, 0], spread[:, 1] / spread[:, 0]
-        diagonal = np.column_stack([1 / radius] * 3 + [np.ones_like(mass)])
-        shrink: Array = np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
-        return shrink
+    def _second_opinion(self, rows: Array, pi: Array, factors: Factors) -> dict[str, Any]:
+        """Return what the other solver makes of it, as plain values."""
+        (other,) = (name for name in SOLVERS if name != self.solver)
+        try:
+            solution, _ = replace(self, solver=other).minimise(rows)
+        except NotConvergedError as error:
+            return {"solver": other, "status": error.status}
+        objective = self.objective(rows, pi)
+        change = factors.R[:, :, :-1] @ (self.K @ (solution.x - pi))
+        torque = np.sqrt((change**2).sum() / factors.torque_squares().sum())
+        return {
+            "solver": other,
+            "status": solution.message,
+            "objective_difference": (self.objective(rows, solution.x) - objective) / objective,
+            "torque_difference": float(torque),
+        }
 
 
 def _information_rows(estimate: Estimate, known: Array) -> Array:
@@ -272,18 +331,3 @@ def _information_rows(estimate: Estimate, known: Array) -> Array:
     chosen[:, -1] = estimate.theta[known]
     rows: Array = scipy.linalg.solve_triangular(L, chosen, lower=True)
     return rows
-
-
-def _svec(S: Array) -> Array:
-    """Return the upper triangle of a symmetric matrix by columns, off-diagonals times sqrt 2."""
-    weight = np.where(np.eye(len(S), dtype=bool), 1.0, np.sqrt(2.0))
-    columns, rows = np.tril_indices(len(S))  # (j, i) with i <= j
-    values: Array = (S * weight)[rows, columns]
-    return values
-
-
-def _inverse_gram(R: Array) -> Array:
-    """Return (R^T R)^-1 of a triangular R."""
-    inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
-    gram: Array = inverse @ inverse.T
-    return gram

@@ -1,0 +1,61 @@
+"""What is worth a word about the physical side of a fit: mass matrix, solvers, active bounds."""
+
+from robotid.identification import Identification
+from robotid.verdict import Finding
+
+__all__ = ["consistency_findings"]
+
+_SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
+_SAME_OPTIMUM = 1e-3  # the same of the objectives of log-Cholesky and cone programme
+
+
+def consistency_findings(identification: Identification) -> list[Finding]:
+    """Return findings about the consistency of a fit.
+
+    Args:
+        identification: What was found.
+
+    Returns:
+        The findings, none if all is well.
+    """
+    findings = []
+    check, details = identification.mass_matrix, identification.estimate.details
+    if not check.is_positive:
+        message = (
+            f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
+            f"of {check.poses} random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g}): "
+            "a simulation with these parameters is unstable; use the 'consistent' estimator"
+        )
+        findings.append(Finding("mass_matrix", "warning", "standard_parameters", message))
+    second = details.get("check")
+    if second is not None and "torque_difference" not in second:
+        message = (
+            f"the second solver, {second['solver']}, did not solve the fit "
+            f"(status: {second['status']}); the result is that of {details['solver']} alone"
+        )
+        findings.append(Finding("second_solver_failed", "warning", "estimator", message))
+    elif second is not None and second["torque_difference"] > _SAME_TORQUE:
+        message = (
+            f"{details['solver']} and {second['solver']} differ by "
+            f"{100 * second['torque_difference']:.2g} % of the torque (objective: "
+            f"{100 * second['objective_difference']:.2g} %); trust the lower objective"
+        )
+        findings.append(Finding("solvers_differ", "warning", "estimator", message))
+    bounds = [name for name in details.get("active", ()) if name.startswith(_USER_BOUNDS)]
+    if bounds:
+        message = (
+            f"the data push against the bounds {bounds}: check these bounds, the torque scale "
+            "(gains) and the payload"
+        )
+        findings.append(Finding("bound_binds", "note", "estimator", message))
+    gap = min(details.get("gaps", [0.0]))
+    if gap > _SAME_OPTIMUM:
+        message = (
+            f"log-Cholesky ended {100 * gap:.2g} % above the optimum of the cone programme; use "
+            "the 'consistent' estimator, or more starts"
+        )
+        findings.append(Finding("optimum_gap", "warning", "estimator", message))
+    return findings
+
+
+_USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
