@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -27,17 +27,29 @@ _PART = 16384  # samples per part: long enough that merging costs nothing, short
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """Triangular factors of [W_j tau_j], joint by joint.
+    """Triangular factors of [W_j tau_j], joint by joint, each with the columns that it has.
 
     Attributes:
-        R: Upper triangular factors, shape (n, c + 1, c + 1).
+        triangles: Upper triangular factors, n arrays of shape (c_j + 1, c_j + 1).
+        columns: The columns that joint j has, n arrays of shape (c_j,), ascending.
         rows: Number of rows folded in per joint, shape (n,), int.
         names: Names of the c columns.
     """
 
-    R: Array
+    triangles: tuple[Array, ...]
+    columns: tuple[Array, ...]
     rows: Array
     names: tuple[str, ...]
+
+    @property
+    def R(self) -> Array:
+        """The factors over all c columns, shape (n, c + 1, c + 1), zeros where a joint has none."""
+        size = len(self.names) + 1
+        dense = np.zeros((len(self.triangles), size, size))
+        for R, triangle, own in zip(dense, self.triangles, self.columns, strict=True):
+            places = np.append(own, size - 1)
+            R[np.ix_(places, places)] = triangle
+        return dense
 
     def select(self, columns: Array) -> "Factors":
         """Return the factors of fewer columns.
@@ -48,12 +60,20 @@ class Factors:
         Returns:
             Factors over the same rows.
         """
-        kept = np.append(np.asarray(columns, dtype=int), len(self.names))
-        R = np.array([_triangle(R_j[:, kept]) for R_j in self.R])
-        return Factors(R, self.rows, tuple(self.names[i] for i in columns))
+        columns = np.asarray(columns, dtype=int)
+        triangles, kept = [], []
+        for triangle, own in zip(self.triangles, self.columns, strict=True):
+            kept.append(np.flatnonzero(np.isin(columns, own)))
+            places = np.append(np.searchsorted(own, columns[kept[-1]]), len(own))
+            triangles.append(_triangle(triangle[:, places]))
+        names = tuple(self.names[i] for i in columns)
+        return Factors(tuple(triangles), tuple(kept), self.rows, names)
 
     def weighted(self, sigma: Array) -> Array:
         """Return one factor of all joints, the rows of joint j divided by sigma_j.
+
+        A joint's columns are those of another one that carries it, or nearly so: each factor is
+        folded into the smallest that has all its columns, from the finger to the base.
 
         Args:
             sigma: Noise level per joint, shape (n,) [N m or N], positive.
@@ -61,8 +81,19 @@ class Factors:
         Returns:
             Triangular factor of the stacked [W_j tau_j] / sigma_j, shape (c + 1, c + 1).
         """
-        stacked = self.R / np.asarray(sigma)[:, None, None]
-        return _triangle(stacked.reshape(-1, self.R.shape[2]))
+        c = len(self.names)
+        folded = [Triangle(len(own) + 1) for own in self.columns]
+        everything = Triangle(c + 1)
+        carriers = self._carriers
+        for j in sorted(range(len(folded)), key=lambda j: (len(self.columns[j]), -j)):
+            own = np.append(self.columns[j], c)
+            folded[j].fold_triangle(self.triangles[j] / sigma[j], np.arange(len(own)))
+            k = carriers[j]
+            if k is None:
+                everything.fold_triangle(folded[j].R, own)
+            else:
+                folded[k].fold_triangle(folded[j].R, np.searchsorted(self.columns[k], own))
+        return everything.R
 
     def residual_squares(self, theta: Array) -> Array:
         """Return the sum of squared residuals |tau_j - W_j theta|^2 of each joint.
@@ -73,14 +104,55 @@ class Factors:
         Returns:
             Sums, shape (n,) [(N m)^2 or N^2].
         """
-        residual = self.R[:, :, -1] - self.R[:, :, :-1] @ theta
-        squares: Array = np.einsum("ji,ji->j", residual, residual)
-        return squares
+        residuals = [
+            R[:, -1] - R[:, :-1] @ theta[own]
+            for R, own in zip(self.triangles, self.columns, strict=True)
+        ]
+        return np.array([residual @ residual for residual in residuals])
 
     def torque_squares(self) -> Array:
         """Return the sum of squared torques |tau_j|^2, shape (n,) [(N m)^2 or N^2]."""
-        squares: Array = np.einsum("ji,ji->j", self.R[:, :, -1], self.R[:, :, -1])
-        return squares
+        return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])
+
+    def information(self, weights: Array) -> Array:
+        """Return sum_j weight_j W_j^T W_j.
+
+        Args:
+            weights: Weight per joint, shape (n,).
+
+        Returns:
+            The sum, shape (c, c).
+        """
+        total = np.zeros((len(self.names), len(self.names)))
+        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
+            total[np.ix_(own, own)] += weight * (R[:, :-1].T @ R[:, :-1])
+        return total
+
+    def leverages(self, covariance: Array) -> Array:
+        """Return the trace of W_j C W_j^T for each joint.
+
+        Args:
+            covariance: C, shape (c, c).
+
+        Returns:
+            Traces, shape (n,).
+        """
+        pairs = [
+            (R[:, :-1], covariance[np.ix_(own, own)])
+            for R, own in zip(self.triangles, self.columns, strict=True)
+        ]
+        return np.array([np.vdot(A @ C, A) for A, C in pairs])
+
+    @cached_property
+    def _carriers(self) -> list[int | None]:
+        """The joint with the fewest columns among those that have all of joint j's, or None."""
+        order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
+        sets = [set(own.tolist()) for own in self.columns]
+        carriers: list[int | None] = [None] * len(order)
+        for position, j in enumerate(order):
+            wider = (k for k in order[position + 1 :] if sets[j] <= sets[k])
+            carriers[j] = next(wider, None)
+        return carriers
 
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
@@ -108,7 +180,7 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         return _compress(problem, threads)
     triangles, active = _empty(problem)
     rows = _fold_blocks(triangles, active, problem)
-    return _dense(triangles, active, rows, problem.names)
+    return _checked(triangles, active, rows, problem.names)
 
 
 def compress_stretches(
@@ -158,14 +230,22 @@ def merge(factors: Sequence[Factors]) -> Factors:
         raise DataError("no factors were given; at least one log is needed")
     first = factors[0]
     for other in factors[1:]:
-        if other.names != first.names or other.R.shape != first.R.shape:
+        if other.names != first.names or len(other.rows) != len(first.rows):
             raise DataError(
-                f"factors differ: {first.R.shape[0]} joints x {len(first.names)} columns and "
-                f"{other.R.shape[0]} joints x {len(other.names)} columns"
+                f"factors differ: {len(first.rows)} joints x {len(first.names)} columns and "
+                f"{len(other.rows)} joints x {len(other.names)} columns"
             )
-    stacked = np.concatenate([f.R for f in factors], axis=1)
-    R = np.array([_triangle(stack) for stack in stacked])
-    return Factors(R, np.sum([f.rows for f in factors], axis=0), first.names)
+    triangles, columns = [], []
+    for j in range(len(first.rows)):
+        own = np.unique(np.concatenate([f.columns[j] for f in factors]))
+        total = Triangle(len(own) + 1)
+        for f in factors:
+            places = np.append(np.searchsorted(own, f.columns[j]), len(own))
+            total.fold_triangle(f.triangles[j], places)
+        triangles.append(total.R)
+        columns.append(own)
+    rows = np.sum([f.rows for f in factors], axis=0)
+    return Factors(tuple(triangles), tuple(columns), rows, first.names)
 
 
 def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
@@ -187,7 +267,7 @@ def _compress(problem: Problem, threads: int | None) -> Factors:
     triangles, active = _empty(problem)
     _fold_sources(triangles, active, problem, threads)
     rows = np.sum([source.rows for source in problem.sources], axis=0)
-    return _dense(triangles, active, rows, problem.names)
+    return _checked(triangles, active, rows, problem.names)
 
 
 def _empty(problem: Problem) -> tuple[list[Triangle], list[Array]]:
@@ -197,17 +277,14 @@ def _empty(problem: Problem) -> tuple[list[Triangle], list[Array]]:
     return [Triangle(len(columns)) for columns in active], active
 
 
-def _dense(
+def _checked(
     triangles: Sequence[Triangle], active: Sequence[Array], rows: Array, names: tuple[str, ...]
 ) -> Factors:
     # what is not finite in a row is not finite in R
     if not all(np.isfinite(triangle.R).all() for triangle in triangles):
         raise DataError("the problem holds a row that is not finite; check the trajectory")
-    size = len(names) + 1
-    dense = np.zeros((len(triangles), size, size))
-    for R, triangle, columns in zip(dense, triangles, active, strict=True):
-        R[np.ix_(columns, columns)] = triangle.R
-    return Factors(dense, rows, names)
+    own = tuple(columns[:-1] for columns in active)
+    return Factors(tuple(triangle.R for triangle in triangles), own, rows, names)
 
 
 def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem) -> Array:
@@ -243,9 +320,7 @@ def _fold_sources(
         ]
         for part in _parts(source, threads):
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
-                rows = np.zeros((len(place), len(triangle.R)), order="F")
-                rows[:, place] = R_j
-                triangle.fold(rows)
+                triangle.fold_triangle(R_j, place)
 
 
 def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:

@@ -54,14 +54,34 @@ class Triangle:
         References:
             LAPACK Working Note 257; Golub, Van Loan (2013), Matrix Computations, section 6.5.3.
         """
+        self._fold(rows, 0, 0)
+
+    def fold_triangle(self, other: Array, places: Array) -> None:
+        """Replace R by the triangular factor of [R; other], its zeros left out of the work.
+
+        Args:
+            other: Upper triangular factor, shape (m, m).
+            places: Which of the c columns it has, shape (m,), ascending.
+        """
+        first = int(places[0])
+        rows = np.zeros((len(places), len(self.R) - first), order="F")
+        rows[:, places - first] = other
+        self._fold(rows, first, len(rows))
+
+    def _fold(self, rows: Array, first: int, triangular: int) -> None:
+        """Fold rows that begin at a column, the last ones of them upper trapezoidal."""
         if len(rows) == 0:
             return
-        call = _dtpqrt()
+        call, width = _dtpqrt(), rows.shape[1]
+        panel = min(self._panel, width)
         if call is None:
-            self.R[:] = scipy.linalg.lapack.dtpqrt(0, self._panel, self.R, rows)[0]
+            corner = self.R[first:, first:]
+            corner[:] = scipy.linalg.lapack.dtpqrt(triangular, panel, corner, rows)[0]
             return
-        self._sizes[0] = len(rows)
-        self._sizes[5] = max(len(rows), rows.strides[1] // rows.itemsize)
+        ldb = max(len(rows), rows.strides[1] // rows.itemsize)
+        self._sizes[:4] = len(rows), width, triangular, panel
+        self._sizes[5] = ldb
+        self._addresses[4] = self.R.ctypes.data + first * (len(self.R) + 1) * self.R.itemsize
         self._addresses[6] = rows.ctypes.data
         call(*self._addresses)
 

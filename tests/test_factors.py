@@ -182,3 +182,52 @@ def test_stretches_merge_into_the_factors_of_the_whole(ur5, rng):
 def test_stretches_need_rows_that_can_be_cut(rng):
     with pytest.raises(DataError, match="cannot be cut"):
         compress_stretches(make(rng)[0], 10)
+
+
+def tree_support(kind):
+    """Support of a tree: each joint has the columns of all that it carries."""
+    tree = {
+        "chain": [[1, 1, 1, 1, 1], [0, 1, 1, 1, 1], [0, 0, 0, 1, 1]],
+        "two fingers on a palm": [[1, 1, 1, 1, 1], [0, 1, 1, 0, 0], [0, 0, 0, 1, 1]],
+        "apart": [[1, 1, 0, 0, 0], [0, 0, 1, 0, 1], [0, 0, 0, 1, 0]],
+        "overlapping": [[1, 1, 1, 0, 0], [0, 0, 1, 1, 1], [0, 0, 0, 0, 0]],
+        "alike": [[1, 0, 1, 1, 1]] * 3,
+    }
+    return np.array(tree[kind], dtype=bool)
+
+
+@pytest.mark.parametrize(
+    "kind", ["chain", "two fingers on a palm", "apart", "overlapping", "alike"]
+)
+def test_compact_factors_are_those_of_the_dense_rows(rng, kind):
+    problem, W, tau = make(rng, support=tree_support(kind))
+    factors, A = compress(problem), np.column_stack([W, tau])
+    assert [len(own) for own in factors.columns] == problem.support.sum(axis=1).tolist()
+    sigma = np.array([0.5, 2.0, 3.0])
+    R = factors.weighted(sigma)
+    np.testing.assert_array_equal(R, np.triu(R))
+    np.testing.assert_allclose(gram(R), gram(A / np.tile(sigma, 300)[:, None]), atol=1e-10)
+
+    columns = np.array([4, 0, 2])  # not in order
+    selected, kept = factors.select(columns), A[:, [4, 0, 2, 5]]
+    for j in range(3):
+        np.testing.assert_allclose(gram(selected.R[j]), gram(kept[j::3]), atol=1e-10)
+
+    by_joint = [W[j::3] for j in range(3)]
+    np.testing.assert_allclose(
+        factors.information(sigma),
+        sum(s * W_j.T @ W_j for s, W_j in zip(sigma, by_joint, strict=True)),
+        atol=1e-10,
+    )
+    C = gram(rng.standard_normal((5, 5)))
+    traces = [np.trace(W_j @ C @ W_j.T) for W_j in by_joint]
+    np.testing.assert_allclose(factors.leverages(C), traces, rtol=1e-10)
+
+
+def test_factors_with_other_columns_per_joint_merge(rng):
+    one, W, tau = make(rng, support=tree_support("chain"))
+    other, V, force = make(rng, support=tree_support("apart"))
+    merged = merge([compress(one), compress(other)])
+    for j in range(3):
+        A = np.vstack([np.column_stack([W, tau])[j::3], np.column_stack([V, force])[j::3]])
+        np.testing.assert_allclose(gram(merged.R[j]), gram(A), atol=1e-10)

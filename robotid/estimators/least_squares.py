@@ -56,9 +56,7 @@ class OLS(Estimator):
         factors = as_factors(data)
         solution = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
         sigma = _noise(factors, solution.theta, _effective_parameters(factors, solution, None))
-        A = factors.R[:, :, :-1]
-        bread = solution.covariance  # (W^T W)^+
-        meat = np.einsum("jki,jkl,j->il", A, A, sigma**2, optimize=True)
+        bread, meat = solution.covariance, factors.information(sigma**2)  # bread: (W^T W)^+
         covariance = bread @ meat @ bread / self.independent_share
         return _estimate(factors, solution, covariance, sigma, 1, "solved by QR")
 
@@ -174,10 +172,8 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
 
 def _effective_parameters(factors: Factors, solution: Solution, sigma: Array | None) -> Array:
     """Return how many parameters the rows of each joint determine: the trace of their leverage."""
-    A = factors.R[:, :, :-1]
-    weight = np.ones(len(A)) if sigma is None else 1.0 / sigma**2
-    spent: Array = np.einsum("jki,il,jkl,j->j", A, solution.covariance, A, weight, optimize=True)
-    return spent
+    leverages = factors.leverages(solution.covariance)
+    return leverages if sigma is None else leverages / sigma**2
 
 
 def _noise(factors: Factors, theta: Array, spent: Array) -> Array:

@@ -134,7 +134,7 @@ class RLS(RecursiveEstimator[RLSState]):
             The estimate. Where the data leave a parameter open its variance is infinite.
         """
         c = len(names)
-        factors = Factors(state.R[None], np.array([int(state.rows)]), names)
+        factors = Factors((state.R,), (np.arange(c),), np.array([int(state.rows)]), names)
         start = np.zeros(c) if self.prior is None else self.prior
         solution = solve_factor(factors, np.ones(1), start)
         freedom = max(state.rows - solution.rank, 1.0)
