@@ -55,7 +55,8 @@ class Reduction:
     def to_arrays(self) -> dict[str, Array]:
         """Return the reduction as plain arrays by name, as for a checkpoint."""
         return {
-            "R": self.factors.R,
+            **{f"R_{j}": R for j, R in enumerate(self.factors.triangles)},
+            **{f"columns_{j}": own for j, own in enumerate(self.factors.columns)},
             "rows": self.factors.rows,
             "names": np.array(self.factors.names),
             "squares": self.squares,
@@ -72,7 +73,13 @@ class Reduction:
         Returns:
             The reduction, to the same bits.
         """
-        factors = Factors(arrays["R"], arrays["rows"], tuple(arrays["names"].tolist()))
+        rows, joints = arrays["rows"], range(len(arrays["rows"]))
+        factors = Factors(
+            tuple(np.asfortranarray(arrays[f"R_{j}"]) for j in joints),
+            tuple(arrays[f"columns_{j}"] for j in joints),
+            rows,
+            tuple(arrays["names"].tolist()),
+        )
         return cls(factors, arrays["squares"], int(arrays["samples"]))
 
 

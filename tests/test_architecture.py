@@ -16,8 +16,8 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
-    1: "parameters data problem program proximity kinematics metrics xml_splice "
-    "examples innovations online_settings job_keys lanes lapack log_source console signal_settings",
+    1: "parameters data problem program proximity kinematics metrics xml_splice examples "
+    "innovations online_settings job_keys lanes lapack log_source console signal_settings",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
     "time_stamps compiled columns array_tables csv_files parquet_files bags",
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
@@ -27,7 +27,8 @@ FLOORS = {
     6: "recordings closed_loop conversion explanations load_checks motion_checks",
     7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs",
-    8: "online report_page result inspection paper_errata doctor consistency_findings",
+    8: "online report_page result inspection paper_errata doctor consistency_findings "
+    "long_recordings long_jobs",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
     11: "workflow",
