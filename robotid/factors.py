@@ -19,7 +19,7 @@ from robotid.exceptions import DataError
 from robotid.lapack import Triangle
 from robotid.problem import Problem, RowSource
 
-__all__ = ["Factors", "compress", "compress_stretches", "merge"]
+__all__ = ["Factors", "available_cores", "compress", "compress_stretches", "merge"]
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -162,6 +162,13 @@ def merge(factors: Sequence[Factors]) -> Factors:
     return Factors(R, np.sum([f.rows for f in factors], axis=0), first.names)
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _compress(problem: Problem, threads: int | None) -> Factors:
     """Return the factors of the rows of a problem's sources."""
     triangles, active = _empty(problem)
@@ -231,7 +238,7 @@ def _fold_sources(
 def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
     """Yield the factors of each part of a source in order."""
     starts = range(0, source.samples, _PART)
-    workers = (_cores() if source.is_parallel else 1) if threads is None else threads
+    workers = (available_cores() if source.is_parallel else 1) if threads is None else threads
     if min(workers, len(starts)) <= 1:
         yield from (_fold_part(source, start) for start in starts)
         return
@@ -245,13 +252,6 @@ def _fold_part(source: RowSource, start: int) -> list[Array]:
         for triangle, rows in zip(triangles, block, strict=True):
             triangle.fold(rows)
     return [triangle.R for triangle in triangles]
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _triangle(rows: Array) -> Array:

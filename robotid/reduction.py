@@ -1,0 +1,276 @@
+"""Pieces to their reductions: in this process, in worker processes, or by another backend.
+
+Every piece is reduced by itself with one BLAS thread, so its reduction has the same bits wherever
+it is made; the reductions come back in the order of the pieces.
+"""
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.connection import Connection
+from typing import TypeAlias
+
+from threadpoolctl import threadpool_limits
+
+from robotid.checkpoint import Checkpoint
+from robotid.exceptions import SettingsError, WorkerError
+from robotid.factors import available_cores
+from robotid.pieces import Piece, Reduction
+from robotid.task import Outcome, run_task
+
+__all__ = [
+    "Backend",
+    "ProcessBackend",
+    "ProgressCallback",
+    "SerialBackend",
+    "choose_workers",
+    "reduce_pieces",
+]
+
+#: Called with what is being done, how many units are done, how many there are, and the unit.
+ProgressCallback: TypeAlias = Callable[[str, int, int, str], None]
+
+_WORTH_WORKERS = 500_000  # samples from which workers pay their start, about a second each
+
+_log = logging.getLogger(__name__)
+
+
+class Backend(ABC):
+    """Where pieces are reduced."""
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """What messages call it, as ``2 worker processes``."""
+
+    @abstractmethod
+    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
+        """Reduce pieces; closing the iterator ends the work.
+
+        Args:
+            pieces: Index and piece.
+
+        Yields:
+            Index and reduction of each piece once, in any order.
+
+        Raises:
+            DataError: If a row cannot be used.
+            WorkerError: If a worker ends before its work.
+        """
+
+
+class SerialBackend(Backend):
+    """Reduces pieces one after the other in this process."""
+
+    @property
+    def description(self) -> str:
+        """What messages call it."""
+        return "this process"
+
+    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
+        """Reduce pieces; see :meth:`Backend.run`.
+
+        Args:
+            pieces: Index and piece.
+
+        Yields:
+            Index and reduction of each piece, in order.
+        """
+        for index, piece in pieces:
+            with threadpool_limits(limits=1, user_api="blas"), _named(piece):
+                reduction = piece.reduce()
+            yield index, reduction
+
+
+@dataclass(frozen=True)
+class ProcessBackend(Backend):
+    """Reduces pieces in worker processes, started anew, with one BLAS thread each.
+
+    The workers end with the process that started them, however it ends.
+
+    Attributes:
+        workers: Number of processes, at least 1.
+    """
+
+    workers: int
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise SettingsError(f"workers is {self.workers}, wanted at least 1")
+
+    @property
+    def description(self) -> str:
+        """What messages call it."""
+        return f"{self.workers} worker processes, one BLAS thread each"
+
+    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
+        """Reduce pieces, at most two per worker under way; see :meth:`Backend.run`.
+
+        Args:
+            pieces: Index and piece.
+
+        Yields:
+            Index and reduction of each piece, as they come.
+
+        Raises:
+            DataError: If a row cannot be used.
+            WorkerError: If a worker ends before its work.
+        """
+        context = multiprocessing.get_context("spawn")
+        lifeline, held = context.Pipe(duplex=False)
+        pool = ProcessPoolExecutor(
+            min(self.workers, len(pieces)), context, _start_worker, (lifeline,)
+        )
+        try:
+            yield from _collect(pool, pieces, 2 * self.workers)
+        except BaseException:
+            held.close()  # ends the workers in the middle of their work
+            raise
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+            held.close()
+            lifeline.close()
+
+
+def reduce_pieces(
+    pieces: Sequence[Piece],
+    *,
+    backend: Backend | None = None,
+    checkpoint: Checkpoint | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[Reduction, ...]:
+    """Reduce pieces; the result has the same bits whatever the backend.
+
+    Args:
+        pieces: The pieces.
+        backend: Where they are reduced; in this process if None.
+        checkpoint: Where finished pieces are kept and, if resumed, taken from.
+        progress: Called with ("reducing", samples done, samples in all, "samples").
+
+    Returns:
+        One reduction per piece, in order; :func:`robotid.pieces.join` gives the whole.
+
+    Raises:
+        DataError: If a row cannot be used.
+        WorkerError: If a worker ends before its work.
+    """
+    chosen = backend or SerialBackend()
+    found = {} if checkpoint is None else checkpoint.load(pieces)
+    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in found]
+    total = sum(piece.samples for piece in pieces)
+    done = sum(pieces[k].samples for k in found)
+    _log.info(
+        "reducing %d pieces (%d samples, %d pieces already kept) in %s",
+        len(pieces), total, len(found), chosen.description,
+    )  # fmt: skip
+    report = progress or _ignore
+    report("reducing", done, total, "samples")
+    with closing(chosen.run(missing)) as results:  # type: ignore[type-var]
+        for index, reduction in results if missing else ():
+            if checkpoint is not None:
+                checkpoint.save(index, pieces[index], reduction)
+            found[index] = reduction
+            done += pieces[index].samples
+            report("reducing", done, total, "samples")
+    return tuple(found[k] for k in range(len(pieces)))
+
+
+def choose_workers(pieces: Sequence[Piece], workers: int | None = None) -> int:
+    """Return how many worker processes to use.
+
+    Args:
+        pieces: The work.
+        workers: What the user asked for, or None.
+
+    Returns:
+        The number asked for; else one per core where the work pays their start, otherwise 1; never
+        more than there are pieces.
+
+    Raises:
+        SettingsError: If fewer than one is asked for.
+    """
+    if workers is not None and workers < 1:
+        raise SettingsError(f"workers is {workers}, wanted at least 1")
+    if workers is None:
+        is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS
+        workers = available_cores() if is_long else 1
+    return max(1, min(workers, len(pieces)))
+
+
+def _collect(
+    pool: ProcessPoolExecutor, pieces: Iterable[tuple[int, Piece]], most: int
+) -> Iterator[tuple[int, Reduction]]:
+    """Yield what the workers return, with at most so many pieces under way."""
+    waiting, level = iter(pieces), _log.getEffectiveLevel()
+    running: dict[Future[Outcome], tuple[int, Piece]] = {}
+    try:
+        while True:
+            for index, piece in islice(waiting, most - len(running)):
+                with _without_interrupt():  # a worker in its start knows no way to end quietly
+                    running[pool.submit(run_task, piece, level)] = index, piece
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                index, piece = running[future]
+                with _named(piece):
+                    outcome = future.result()
+                del running[future]
+                outcome.log()
+                yield index, outcome.reduction
+    except BrokenProcessPool as error:
+        names = [piece.name for _, piece in running.values()]
+        raise WorkerError(
+            "a worker process ended in the middle of its work (killed from outside, short of "
+            f"memory, or a script without the guard if __name__ == '__main__'); under way: {names}"
+        ) from error
+
+
+@contextmanager
+def _named(piece: Piece) -> Iterator[None]:
+    """Note on an error which piece it met."""
+    try:
+        yield
+    except BrokenProcessPool:
+        raise
+    except Exception as error:
+        error.add_note(f"while reducing {piece.name}")
+        raise
+
+
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back; processes started meanwhile never see it, they end with this one."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(lifeline: Connection) -> None:
+    """Set a worker up: one BLAS thread, deaf to Ctrl-C, gone when the lifeline is cut."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+
+
+def _end_with(lifeline: Connection) -> None:
+    try:
+        lifeline.recv()
+    finally:
+        os._exit(1)
+
+
+def _ignore(what: str, done: int, total: int, unit: str) -> None:
+    """Report to nobody."""
