@@ -3,14 +3,29 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeAlias
 
-__all__ = ["terminal_progress"]
+__all__ = ["ProgressCallback", "ignore_progress", "terminal_progress"]
+
+#: Called with what is being done, how many units are done, how many there are, and their name.
+ProgressCallback: TypeAlias = Callable[[str, int, int, str], None]
+
+
+def ignore_progress(what: str, done: int, total: int, unit: str) -> None:
+    """Take a report of progress and show nothing.
+
+    Args:
+        what: What is being done.
+        done: How many units are done.
+        total: How many there are.
+        unit: Their name.
+    """
 
 
 @contextmanager
 def terminal_progress(
     *, quiet: bool = False, force: bool = False
-) -> Iterator[Callable[[str, int, int, str], None] | None]:
+) -> Iterator[ProgressCallback | None]:
     """Show progress on the standard error stream while the context lasts, if it is a terminal.
 
     Args:

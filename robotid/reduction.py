@@ -10,14 +10,13 @@ import os
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection
-from typing import TypeAlias
 
 from threadpoolctl import threadpool_limits
 
@@ -25,19 +24,16 @@ from robotid.checkpoint import Checkpoint
 from robotid.exceptions import SettingsError, WorkerError
 from robotid.factors import available_cores
 from robotid.pieces import Piece, Reduction
+from robotid.progress import ProgressCallback, ignore_progress
 from robotid.task import Outcome, run_task
 
 __all__ = [
     "Backend",
     "ProcessBackend",
-    "ProgressCallback",
     "SerialBackend",
     "choose_workers",
     "reduce_pieces",
 ]
-
-#: Called with what is being done, how many units are done, how many there are, and the unit.
-ProgressCallback: TypeAlias = Callable[[str, int, int, str], None]
 
 _WORTH_WORKERS = 500_000  # samples from which workers pay their start, about a second each
 
@@ -172,7 +168,7 @@ def reduce_pieces(
         "reducing %d pieces (%d samples, %d pieces already kept) in %s",
         len(pieces), total, len(found), chosen.description,
     )  # fmt: skip
-    report = progress or _ignore
+    report = progress or ignore_progress
     report("reducing", done, total, "samples")
     with closing(chosen.run(missing)) as results:  # type: ignore[type-var]
         for index, reduction in results if missing else ():
@@ -270,7 +266,3 @@ def _end_with(lifeline: Connection) -> None:
         lifeline.recv()
     finally:
         os._exit(1)
-
-
-def _ignore(what: str, done: int, total: int, unit: str) -> None:
-    """Report to nobody."""

@@ -48,6 +48,8 @@ class RandomPiece(Piece):
             Path("/no/such/log.csv").read_bytes()
         if self.fault == "kill" or (self.fault == "kill once" and len(reduced(self)) == 1):
             os.kill(os.getpid(), signal.SIGKILL)
+        if self.fault == "meet":
+            meet(self.marks)
         rng = np.random.default_rng(self.seed)
         rows = rng.standard_normal((2, self.samples, len(NAMES) + 1))
         R = np.array([np.linalg.qr(part, mode="r") for part in rows])
@@ -59,6 +61,15 @@ def mark(piece):
     """Leave a file that says who reduced a piece."""
     path = Path(piece.marks) / f"{piece.seed:03d}-{os.getpid()}-{time.monotonic_ns()}"
     path.write_text(socket.gethostname())
+
+
+def meet(folder, seconds=3.0):
+    """Wait until another process reduces something, too."""
+    end = time.monotonic() + seconds
+    while len(workers_of(folder)) < 2:
+        if time.monotonic() > end:
+            raise DataError("alone")
+        time.sleep(0.01)
 
 
 def reduced(piece):

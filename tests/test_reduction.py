@@ -64,11 +64,15 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
         assert same_bits(join(found), join(serial))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
     assert os.getpid() in workers_of(tmp_path / "marks")
-    assert len(workers_of(tmp_path / "marks")) == 4
     total = sum(piece.samples for piece in pieces)
     assert calls[0] == ("reducing", 0, total, "samples")
     assert calls[-1] == ("reducing", total, total, "samples")
     assert len(calls) == 11
+
+
+def test_two_workers_work_at_the_same_time(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 2, faults={0: "meet", 1: "meet"}.items())
+    reduce_pieces(pieces, backend=ProcessBackend(2))
 
 
 def test_reductions_come_back_in_the_order_of_the_pieces(tmp_path):
