@@ -1,8 +1,9 @@
 """CSV files as tables of named columns."""
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -12,9 +13,11 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.log_source import Table
+from robotid.log_source import Place, RowReader, Table
 
 __all__ = ["open_csv", "write_csv"]
+
+_BLOCK = 4096  # lines read at a time
 
 
 def open_csv(path: Path) -> Table:
@@ -29,7 +32,8 @@ def open_csv(path: Path) -> Table:
     Raises:
         DataError: If there is no header, a cell is no number, or a row has another length.
     """
-    return Table(_csv_header(path)[0], partial(_read_csv, path))
+    names, separator = _csv_header(path)
+    return Table(names, partial(_read_csv, path), rows=_CsvRows(path, names, separator))
 
 
 def write_csv(table: Mapping[str, Array], path: Path) -> None:
@@ -46,6 +50,71 @@ def write_csv(table: Mapping[str, Array], path: Path) -> None:
         writer.writerows(row.tolist() for row in rows)
 
 
+@dataclass(frozen=True)
+class _CsvRows(RowReader):
+    """Rows of a CSV file; see :class:`robotid.log_source.RowReader`."""
+
+    path: Path
+    names: list[str]
+    separator: str
+
+    def count(self) -> int:
+        """Return the number of lines behind the first."""
+        with self.path.open("rb") as file:
+            blocks = iter(partial(file.read, 2**20), b"")
+            return sum(block.count(b"\n") for block in blocks) - 1
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        """Yield one column; see :meth:`RowReader.scan`."""
+        for lines, place, rows in self._blocks(Place(), None):
+            yield self._parse(lines, [name], place, 0, rows)[name], place
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        """Return some rows; see :meth:`RowReader.read`."""
+        parts = []
+        for lines, place, rows in self._blocks(near, stop):
+            start, end = max(first - place.row, 0), min(stop - place.row, rows)
+            if start < end:
+                parts.append(self._parse(lines, wanted, place, start, end))
+        return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+
+    def _blocks(self, near: Place, stop: int | None) -> Iterator[tuple[list[str], Place, int]]:
+        """Yield lines, blank ones among them, the place of the first and how many are rows."""
+        with self.path.open("rb") as file:
+            place = near
+            if near.offset == 0:
+                place = Place(0, 2, len(file.readline()))
+            file.seek(place.offset)
+            while stop is None or place.row < stop:
+                raw = list(islice(file, _BLOCK))
+                rows = len(raw) - sum(line.isspace() for line in raw)
+                if not raw:
+                    return
+                try:
+                    lines = [line.decode() for line in raw]
+                except UnicodeDecodeError as error:
+                    raise _not_utf8(self.path, error) from error
+                if rows:
+                    yield lines, place, rows
+                size = sum(map(len, raw))
+                place = Place(place.row + rows, place.line + len(raw), place.offset + size)
+
+    def _parse(
+        self, lines: Sequence[str], wanted: Sequence[str], place: Place, start: int, stop: int
+    ) -> dict[str, Array]:
+        """Return rows start to stop of some lines."""
+        columns = [self.names.index(name) for name in wanted]
+        count, where = len(self.names), self.path.name
+        rows = _whole_rows(lines, count, self.separator, where, place.line)
+        try:
+            values = np.loadtxt(islice(rows, start, stop), usecols=columns, **_how(self.separator))
+        except DataError:
+            raise
+        except ValueError as error:
+            raise _bad_cell(self.path, self.names, columns, self.separator) from error
+        return dict(zip(wanted, values.T, strict=True))
+
+
 @contextmanager
 def _open_csv(path: Path) -> Iterator[TextIO]:
     """Open a text file, whether or not it starts with a byte order mark."""
@@ -53,7 +122,16 @@ def _open_csv(path: Path) -> Iterator[TextIO]:
         with path.open(encoding="utf-8-sig") as file:
             yield file
     except UnicodeDecodeError as error:
-        raise DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8") from error
+        raise _not_utf8(path, error) from error
+
+
+def _not_utf8(path: Path, error: UnicodeDecodeError) -> DataError:
+    return DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8")
+
+
+def _how(separator: str) -> dict[str, Any]:
+    """Return how NumPy reads the cells."""
+    return {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
 
 
 def _csv_header(path: Path) -> tuple[list[str], str]:
@@ -80,9 +158,8 @@ def _read_csv(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
         first = list(islice(rows, 1))
         if not first:
             raise DataError(f"{path.name} has a header but no rows; record at least 2")
-        how: Any = {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
         try:
-            values = np.loadtxt(chain(first, rows), usecols=columns, **how)
+            values = np.loadtxt(chain(first, rows), usecols=columns, **_how(separator))
         except (DataError, UnicodeDecodeError):
             raise
         except ValueError as error:
@@ -90,9 +167,11 @@ def _read_csv(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
     return dict(zip(wanted, values.T, strict=True))
 
 
-def _whole_rows(lines: TextIO, count: int, separator: str, where: str) -> Iterator[str]:
+def _whole_rows(
+    lines: Iterable[str], count: int, separator: str, where: str, first: int = 2
+) -> Iterator[str]:
     """Yield the lines that are not blank, and refuse those with too few or too many cells."""
-    for number, line in enumerate(lines, start=2):
+    for number, line in enumerate(lines, start=first):
         if line.isspace():
             continue
         if line.count(separator) != count - 1:  # unless a separator stands in quotes

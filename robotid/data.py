@@ -48,7 +48,7 @@ class Log:
         _settle(self, where, {"q": self.q, "dq": self.v, "ddq": self.a, "tau": self.tau})
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
-        _require_increasing(self.t, where)
+        require_increasing(self.t, where)
 
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
         """Return the rows from start to end, both included.
@@ -142,6 +142,11 @@ class Trajectory:
         if self.rate is not None and not 0 < self.rate < np.inf:
             raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
 
+    @property
+    def squares(self) -> Array:
+        """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
+        return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
+
 
 def suggestion(name: str, known: Collection[str]) -> str:
     """Return the question whether the nearest known name was meant, or "" if none is near.
@@ -179,7 +184,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
     t = _frozen(owner.t)
     if t.ndim != 1:
         raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
-    _require_finite(t[:, None], t, ["time"], where)
+    require_finite(t[:, None], t, ["time"], where)
     settled = {"t": t}
     for name, values in arrays.items():
         if values is None:
@@ -190,7 +195,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
                 f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
                 f"for each time stamp, a column for each of the joints {list(joints)}"
             )
-        _require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
+        require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
         settled[{"dq": "v", "ddq": "a"}.get(name, name)] = array
     for name, array in settled.items():
         object.__setattr__(owner, name, array)
@@ -206,35 +211,58 @@ def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
     return array
 
 
-def _require_finite(values: Array, t: Array, names: Sequence[str], where: str) -> None:
-    """Refuse NaN and infinite values, naming the first."""
+def require_finite(
+    values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
+) -> None:
+    """Refuse NaN and infinite values, naming the first.
+
+    Args:
+        values: Shape (N, k).
+        t: Time stamps of the rows, shape (N,) [s].
+        names: Names of the k columns.
+        where: What the log is called.
+        first: Number in its file of the first row.
+
+    Raises:
+        DataError: If a value is not finite.
+    """
     if np.isfinite(values).all():
         return
     row, column = (int(i) for i in np.argwhere(~np.isfinite(values))[0])
     found = "NaN" if np.isnan(values[row, column]) else str(values[row, column])
     at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
     raise DataError(
-        f"{where}: {names[column]} is {found} at row {row}{at}; remove the row or mend the "
+        f"{where}: {names[column]} is {found} at row {first + row}{at}; remove the row or mend the "
         "recording",
         code="not_finite",
     )
 
 
-def _require_increasing(t: Array, where: str) -> None:
-    """Refuse time stamps that repeat or go back, naming the first."""
+def require_increasing(t: Array, where: str, first: int = 0) -> None:
+    """Refuse time stamps that repeat or go back, naming the first.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        where: What the log is called.
+        first: Number in its file of the first row.
+
+    Raises:
+        DataError: If a time stamp is not after the one before.
+    """
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back) == 0:
         return
     k = int(back[0]) + 1
+    row, now, before = first + k, _stamp(t[k]), _stamp(t[k - 1])
     if t[k] == t[k - 1]:
         raise DataError(
-            f"{where}: t must increase, but t[{k}] = {_stamp(t[k])} s is a duplicate time stamp, "
-            f"the same as t[{k - 1}]; remove one of the two rows",
+            f"{where}: t must increase, but t[{row}] = {now} s is a duplicate time stamp, "
+            f"the same as t[{row - 1}]; remove one of the two rows",
             code="duplicate_stamp",
         )
     raise DataError(
-        f"{where}: t must increase, but t[{k}] = {_stamp(t[k])} s follows t[{k - 1}] = "
-        f"{_stamp(t[k - 1])} s; sort the rows, or mend the recording",
+        f"{where}: t must increase, but t[{row}] = {now} s follows t[{row - 1}] = {before} s; "
+        "sort the rows, or mend the recording",
         code="stamp_order",
     )
 

@@ -18,19 +18,27 @@ from robotid.estimator_settings import (
 )
 from robotid.estimators import WLS, Estimate
 from robotid.exceptions import DataError
-from robotid.factors import Factors, compress, merge
+from robotid.factors import Factors
 from robotid.lumping import held_parameters
 from robotid.metrics import Metrics
 from robotid.model import RobotModel
 from robotid.parameters import pseudo_inertia
-from robotid.prior import prior_spread
-from robotid.problem import Problem, concatenate
-from robotid.regressor import build_problem, random_regressor
+from robotid.pieces import join
+from robotid.prior import spread_of
+from robotid.recordings import LoadedRecordings, Recordings
+from robotid.regressor import random_regressor
 from robotid.signals import SignalSettings
-from robotid.validation import Evaluation, Recording, evaluate, pool, prepare, shares_rows
+from robotid.validation import Evaluation, pool, prepare
 from robotid.verdict import Verdict, judge
 
-__all__ = ["ESTIMATORS", "EstimatorSettings", "Identification", "identify", "structural_mapping"]
+__all__ = [
+    "ESTIMATORS",
+    "EstimatorSettings",
+    "Identification",
+    "conclude",
+    "identify",
+    "structural_mapping",
+]
 
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
@@ -106,16 +114,12 @@ class Identification:
     @property
     def refitted(self) -> tuple[Evaluation, ...]:
         """Validation recordings that hold rows which were fitted: they show no prediction."""
-        fitted = [evaluation.recording.log for evaluation in self.identification]
-        return tuple(
-            e for e in self.validation if any(shares_rows(e.recording.log, log) for log in fitted)
-        )
+        return tuple(evaluation for evaluation in self.validation if evaluation.is_refitted)
 
     @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        refitted = self.refitted
-        kept = [e for e in self.validation if e not in refitted]
+        kept = [evaluation for evaluation in self.validation if not evaluation.is_refitted]
         return judge(
             self.metrics(),
             {e.recording.name: e.metrics["estimate"] for e in kept},
@@ -157,18 +161,40 @@ def identify(
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted = [prepare(model, log, settings) for log in logs]
     kept = [prepare(model, log, settings) for log in validation]
+    return conclude(model, LoadedRecordings(model, fitted, kept), choice)
+
+
+def conclude(
+    model: RobotModel, recordings: Recordings, choice: EstimatorSettings
+) -> Identification:
+    """Identify a robot's parameters from recordings, in memory or not.
+
+    Args:
+        model: The robot.
+        recordings: The recordings.
+        choice: Which estimator.
+
+    Returns:
+        The identification.
+
+    Raises:
+        DataError: If a row of a log cannot be used.
+        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        NotConvergedError: If a solver fails.
+    """
     mapping = structural_mapping(model)
-    factors = merge([compress(_problem(model, mapping, recording)) for recording in fitted])
-    share = min(_independent_share(recording) for recording in fitted)
+    reduction = join(recordings.reduce(mapping))
+    factors, share = reduction.factors, recordings.share
     prior = model.standard_parameters()
-    spread = prior_spread(model, [recording.trajectory for recording in fitted])
+    spread = spread_of(model, reduction.squares, reduction.samples)
     wls = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Prior(prior, spread, share, wls.sigma)
-    estimate = _run(choice, model, mapping, before, fitted, factors, wls)
+    estimate = _run(choice, model, mapping, before, recordings, factors, wls)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     wls_standard = mapping.to_standard(wls.theta, prior, spread)
     candidates = {"estimate": standard, "wls": wls_standard}
+    fitted, kept = recordings.evaluate(candidates, prior)
     is_base = estimate.names == mapping.base_names
     return Identification(
         model=model,
@@ -183,8 +209,8 @@ def identify(
         base=mapping.to_base(standard),
         # exact data leave a variance of rounding size, of either sign
         base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
-        identification=tuple(evaluate(model, r, candidates, prior) for r in fitted),
-        validation=tuple(evaluate(model, r, candidates, prior) for r in kept),
+        identification=fitted,
+        validation=kept,
     )
 
 
@@ -214,7 +240,7 @@ def _run(
     model: RobotModel,
     mapping: BaseMapping,
     prior: Prior,
-    recordings: Sequence[Recording],
+    recordings: Recordings,
     factors: Factors,
     wls: Estimate,
 ) -> Estimate:
@@ -222,20 +248,12 @@ def _run(
     estimator = make_estimator(choice, model, mapping, prior)
     if choice.name not in RECURSIVE:
         return estimator.fit(factors)
-    problems = [_problem(model, mapping, r, choice.needs_mass) for r in recordings]
-    estimate = estimator.fit(concatenate(problems))
+    estimate = estimator.fit(recordings.problem(mapping, with_mass=choice.needs_mass))
     if choice.name in ("prx", "gradient"):
         estimate = _with_spread(estimate, wls)
     if not choice.physical:
         return estimate
     return consistent_fit(choice, model, mapping, prior).project(estimate)
-
-
-def _problem(
-    model: RobotModel, mapping: BaseMapping, recording: Recording, with_mass: bool = False
-) -> Problem:
-    weight = recording.mask.astype(float)
-    return mapping.reduce(build_problem(model, recording.trajectory, weight, with_mass=with_mass))
 
 
 def _with_spread(estimate: Estimate, wls: Estimate) -> Estimate:
@@ -255,14 +273,6 @@ def _with_spread(estimate: Estimate, wls: Estimate) -> Estimate:
         undetermined=wls.undetermined,
         message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
     )
-
-
-def _independent_share(recording: Recording) -> float:
-    """Return the share of rows that are independent behind the filter: its band over Nyquist's."""
-    signals = recording.signals
-    if signals.cutoff is None or signals.rate is None:
-        return 1.0
-    return min(1.0, 2.0 * signals.cutoff / signals.rate)
 
 
 def _standard(

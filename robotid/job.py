@@ -11,8 +11,8 @@ from robotid.data import Log
 from robotid.estimator_settings import EstimatorSettings
 from robotid.exceptions import SettingsError
 from robotid.job_keys import KEYS, check_keys
-from robotid.log_files import read_log
-from robotid.log_source import LogSource
+from robotid.log_files import LogLayout, lay_out, read_log
+from robotid.log_source import LogSource, Table
 from robotid.model import GRAVITY, RobotModel
 from robotid.parameters import DRIVE_TERMS, Coupling
 from robotid.signals import SignalSettings
@@ -120,17 +120,32 @@ class Job:
         Raises:
             DataError: If the file cannot be used.
         """
-        return read_log(
-            entry.path,
-            model.joints,
-            gains=self.gains,
-            columns=self.columns,
-            start=entry.start,
-            end=entry.end,
-            units=self.units,
-            prismatic=tuple(model.layout.prismatic),
-            source=self.source,
-        )
+        return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
+
+    def lay_out(self, entry: LogEntry, model: RobotModel) -> tuple[LogLayout, Table]:
+        """Return which columns of a log's file are read, before any is.
+
+        Args:
+            entry: Which log.
+            model: The job's robot.
+
+        Returns:
+            The layout and the opened file.
+
+        Raises:
+            DataError: If the file cannot be used.
+        """
+        return lay_out(entry.path, **self._reading(model))
+
+    def _reading(self, model: RobotModel) -> dict[str, Any]:
+        return {
+            "joints": model.joints,
+            "gains": self.gains,
+            "columns": self.columns,
+            "units": self.units,
+            "prismatic": tuple(model.layout.prismatic),
+            "source": self.source,
+        }
 
     def to_settings(self) -> dict[str, Any]:
         """Return the job as plain values, in the shape of the job file, paths made absolute."""

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
-from robotid.data import Log, repeated, suggestion
+from robotid.data import Log, repeated, require_finite, require_increasing, suggestion
 from robotid.exceptions import DataError, SettingsError
-from robotid.log_source import LogSource, prefixes
+from robotid.log_source import LogSource, Table, prefixes
 from robotid.tables import open_table, write_columns
 from robotid.units import PER_SECOND, LogUnits, check_units
 
-__all__ = ["read_log", "write_log"]
+__all__ = ["LogLayout", "lay_out", "read_log", "write_log"]
 
 _NOUNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque or current"}
 _SI = LogUnits()
@@ -60,6 +60,123 @@ def read_log(
         SettingsError: If gains, columns or the source name what is not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
+    layout, table = lay_out(
+        path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic, source=source
+    )
+    log = layout.to_log(table.read(layout.wanted))
+    check_units(log, units, prismatic)
+    return log if start is None and end is None else log.window(start, end)
+
+
+@dataclass(frozen=True)
+class LogLayout:
+    """Which columns of a file make up a log, and how.
+
+    Attributes:
+        path: The file.
+        joints: Names of the joints, in the order wanted.
+        columns: Names in the file by quantity: "time", "q", "tau", and "dq" and "ddq" if complete.
+        factors: What makes each torque column a torque, by joint.
+        units: Units of the file.
+        prismatic: Names of joints that slide.
+        source: Where in the file.
+        notes: What the reader should know.
+    """
+
+    path: str
+    joints: tuple[str, ...]
+    columns: Mapping[str, Sequence[str]]
+    factors: tuple[float, ...]
+    units: LogUnits
+    prismatic: tuple[str, ...]
+    source: LogSource
+    notes: tuple[str, ...]
+
+    @property
+    def wanted(self) -> list[str]:
+        """Names of all columns to read."""
+        return [name for names in self.columns.values() for name in names]
+
+    def stamps(self, values: Array) -> Array:
+        """Return time stamps in seconds.
+
+        Args:
+            values: The time column.
+
+        Returns:
+            Its values in seconds, same shape.
+        """
+        return values / PER_SECOND[self.units.time or "s"]
+
+    def to_log(self, table: Mapping[str, Array], first: int = 0) -> Log:
+        """Return the log that columns of the file make up, in SI units.
+
+        Args:
+            table: The wanted columns by name.
+            first: Number in the file of their first row.
+
+        Returns:
+            The log.
+
+        Raises:
+            DataError: If a value is not finite, or time does not increase.
+        """
+        values = {
+            kind: np.stack([table[name] for name in names], axis=1)
+            for kind, names in self.columns.items()
+        }
+        if self.units.angle == "deg":
+            radians = [1.0 if joint in self.prismatic else np.pi / 180 for joint in self.joints]
+            turned = [kind for kind in ("q", "dq", "ddq") if kind in values]
+            values |= {kind: values[kind] * radians for kind in turned}
+        values["tau"] = values["tau"] * np.array(self.factors)
+        t = self.stamps(values["time"][:, 0])
+        for kind, array in values.items():
+            names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
+            require_finite(array, t, names, Path(self.path).name, first)
+            array.flags.writeable = False  # so that the log need not copy it
+        require_increasing(t, Path(self.path).name, first)
+        return Log(
+            t=t,
+            q=values["q"],
+            v=values.get("dq"),
+            a=values.get("ddq"),
+            tau=values["tau"],
+            joints=self.joints,
+            path=self.path,
+            notes=self.notes,
+        )
+
+
+def lay_out(
+    path: str | Path,
+    joints: Sequence[str],
+    *,
+    gains: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: LogUnits = _SI,
+    prismatic: Collection[str] = (),
+    source: LogSource = _WHOLE,
+) -> tuple[LogLayout, Table]:
+    """Return which columns of a file make up a log, before any is read.
+
+    Args:
+        path: The file.
+        joints: Names of the joints wanted, in the order wanted.
+        gains: As of :func:`read_log`.
+        columns: As of :func:`read_log`.
+        units: As of :func:`read_log`.
+        prismatic: As of :func:`read_log`.
+        source: As of :func:`read_log`.
+
+    Returns:
+        The layout and the opened table.
+
+    Raises:
+        DataError: If the file does not hold what is wanted.
+        SettingsError: If gains, columns or the source name what is not read.
+        MissingDependencyError: If a package that reads the file is not installed.
+    """
     file = Path(path)
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
@@ -68,27 +185,12 @@ def read_log(
         file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, [*opened.notes]
     )
     found = finder.find_all()  # names of columns by kind
-    wanted = [name for kind in found.values() for name in kind]
-    table = opened.read(wanted)
-    values = {kind: np.stack([table[name] for name in found[kind]], axis=1) for kind in found}
-    if units.angle == "deg":
-        radians = [1.0 if joint in prismatic else np.pi / 180 for joint in joints]
-        values |= {kind: values[kind] * radians for kind in ("q", "dq", "ddq") if kind in values}
-    values["tau"] = values["tau"] * finder.factors(found["tau"])
-    for array in values.values():
-        array.flags.writeable = False  # so that the log need not copy it
-    log = Log(
-        t=values["time"][:, 0] / PER_SECOND[units.time or "s"],
-        q=values["q"],
-        v=values.get("dq"),
-        a=values.get("ddq"),
-        tau=values["tau"],
-        joints=tuple(joints),
-        path=str(file),
-        notes=tuple(finder.notes),
-    )
-    check_units(log, units, prismatic)
-    return log if start is None and end is None else log.window(start, end)
+    factors = finder.factors(found["tau"])
+    layout = LogLayout(
+        str(file), tuple(joints), found, tuple(factors.tolist()), units, tuple(prismatic), source,
+        tuple(finder.notes),
+    )  # fmt: skip
+    return layout, opened
 
 
 def write_log(log: Log, path: str | Path) -> None:

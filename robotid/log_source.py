@@ -1,12 +1,13 @@
 """Where in a log file the signals are, and what each file format gives: named columns."""
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 
-__all__ = ["LogSource", "Table", "choose", "prefixes"]
+__all__ = ["LogSource", "Place", "RowReader", "Table", "choose", "prefixes"]
 
 _PREFIXES = {
     "q": ("q_", "position_"),
@@ -46,6 +47,54 @@ class LogSource:
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where in a file a row starts.
+
+    Attributes:
+        row: Number of the row.
+        line: Number of its line, of a text file.
+        offset: Bytes before it, of a text file.
+    """
+
+    row: int = 0
+    line: int = 0
+    offset: int = 0
+
+
+class RowReader(ABC):
+    """Reads rows of a file that need not fit into memory."""
+
+    @abstractmethod
+    def count(self) -> int:
+        """Return about how many rows there are, without reading them."""
+
+    @abstractmethod
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        """Yield one column, a block of rows at a time.
+
+        Args:
+            name: The column.
+
+        Yields:
+            Its values, a missing one as NaN, and the place of the first.
+        """
+
+    @abstractmethod
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        """Return some rows.
+
+        Args:
+            wanted: Names of the columns.
+            first: First row.
+            stop: Row after the last one.
+            near: A place that :meth:`scan` told, at or before the first row.
+
+        Returns:
+            The columns by name, each of shape (stop - first,); a missing value is NaN.
+        """
+
+
+@dataclass(frozen=True)
 class Table:
     """The columns of one file.
 
@@ -53,11 +102,13 @@ class Table:
         names: The columns, in the file's order.
         read: Returns some of them by name, each of shape (N,); a missing value is NaN.
         notes: What the reader should know.
+        rows: Reads the file row by row; None if its format is only read whole.
     """
 
     names: list[str]
     read: Callable[[Sequence[str]], dict[str, Array]]
     notes: tuple[str, ...] = ()
+    rows: RowReader | None = None
 
 
 def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:

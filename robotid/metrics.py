@@ -8,7 +8,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 
-__all__ = ["JointMetrics", "Metrics", "measure"]
+__all__ = ["JointMetrics", "Metrics", "TorqueSums", "measure"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,121 @@ class Metrics:
     pooled_rmse: float
 
 
+@dataclass(frozen=True, eq=False)
+class TorqueSums:
+    """What the metrics of a prediction are made of; sums of two recordings merge into both's.
+
+    Attributes:
+        rows: Number of rows used per joint, shape (n,), int.
+        mean: Mean of the measured torque over them, shape (n,) [N m, N].
+        spread: Sum of its squared distances from the mean, shape (n,).
+        torque: Sum of its squares, shape (n,).
+        residual: Sum of squared residuals of the prediction, shape (n,).
+        baselines: The same of other predictions, by name, each of shape (n,).
+    """
+
+    rows: Array
+    mean: Array
+    spread: Array
+    torque: Array
+    residual: Array
+    baselines: Mapping[str, Array]
+
+    @classmethod
+    def of(
+        cls, tau: Array, prediction: Array, mask: Array, baselines: Mapping[str, Array]
+    ) -> "TorqueSums":
+        """Return the sums over the rows used.
+
+        Args:
+            tau: Measured torque, shape (N, n) [N m, N].
+            prediction: Predicted torque, shape (N, n) [N m, N].
+            mask: Rows used, shape (N, n), bool.
+            baselines: Other predictions to compare with, by name, each of shape (N, n).
+
+        Returns:
+            The sums.
+        """
+        rows = mask.sum(axis=0)
+        mean = np.sum(tau, axis=0, where=mask) / np.maximum(rows, 1)
+
+        def squares(values: Array) -> Array:
+            total: Array = np.sum(values**2, axis=0, where=mask)
+            return total
+
+        return cls(
+            rows=rows,
+            mean=mean,
+            spread=squares(tau - mean),
+            torque=squares(tau),
+            residual=squares(tau - prediction),
+            baselines={name: squares(tau - torque) for name, torque in baselines.items()},
+        )
+
+    def merge(self, other: "TorqueSums") -> "TorqueSums":
+        """Return the sums over the rows of both.
+
+        Args:
+            other: Those of other rows of the same joints, with the same baselines.
+
+        Returns:
+            The sums.
+
+        References:
+            Chan, Golub, LeVeque (1983), Algorithms for Computing the Sample Variance, (2.1).
+        """
+        rows = self.rows + other.rows
+        share = other.rows / np.maximum(rows, 1)
+        step = other.mean - self.mean
+        return TorqueSums(
+            rows=rows,
+            mean=self.mean + share * step,
+            spread=self.spread + other.spread + step**2 * self.rows * share,
+            torque=self.torque + other.torque,
+            residual=self.residual + other.residual,
+            baselines={name: x + other.baselines[name] for name, x in self.baselines.items()},
+        )
+
+    def metrics(self, names: Sequence[str], units: Sequence[str]) -> Metrics:
+        """Return the metrics that the sums make up.
+
+        Args:
+            names: Names of the n joints.
+            units: Units of their torques.
+
+        Returns:
+            The metrics.
+
+        Raises:
+            DataError: If no row is used at all.
+        """
+        if not self.rows.any():
+            raise DataError(
+                "no row is left to measure the prediction with: no joint moves faster than "
+                "min_velocity; lower it, or give a log with motion"
+            )
+        per_joint = {name: self._joint(j, units[j]) for j, name in enumerate(names) if self.rows[j]}
+        return Metrics(per_joint, float(np.sqrt(self.residual.sum() / self.rows.sum())))
+
+    def _joint(self, j: int, unit: str) -> JointMetrics:
+        residual, spread = float(self.residual[j]), float(self.spread[j])
+        return JointMetrics(
+            rmse=float(np.sqrt(residual / self.rows[j])),
+            unit=unit,
+            relative_error_pct=self._relative_error(j, residual),
+            r2=1.0 - residual / spread if spread > 0 else 0.0,
+            rows=int(self.rows[j]),
+            baselines={
+                name: self._relative_error(j, float(squares[j]))
+                for name, squares in self.baselines.items()
+            },
+            better_than_constant=residual < spread,
+        )
+
+    def _relative_error(self, j: int, residual: float) -> float | None:
+        return 100.0 * float(np.sqrt(residual / self.torque[j])) if self.torque[j] > 0 else None
+
+
 def measure(
     tau: Array,
     prediction: Array,
@@ -72,35 +187,4 @@ def measure(
     Raises:
         DataError: If no row is used at all.
     """
-    if not mask.any():
-        raise DataError(
-            "no row is left to measure the prediction with: no joint moves faster than "
-            "min_velocity; lower it, or give a log with motion"
-        )
-    per_joint = {}
-    for j, (name, unit) in enumerate(zip(names, units, strict=True)):
-        rows = mask[:, j]
-        if rows.any():
-            others = {key: torque[rows, j] for key, torque in (baselines or {}).items()}
-            per_joint[name] = _joint(tau[rows, j], prediction[rows, j], others, unit)
-    squares = (tau - prediction)[mask] ** 2
-    return Metrics(per_joint, float(np.sqrt(squares.mean())))
-
-
-def _joint(tau: Array, prediction: Array, others: Mapping[str, Array], unit: str) -> JointMetrics:
-    residual = float(np.sum((tau - prediction) ** 2))
-    spread = float(np.sum((tau - tau.mean()) ** 2))
-    return JointMetrics(
-        rmse=float(np.sqrt(residual / len(tau))),
-        unit=unit,
-        relative_error_pct=_relative_error(tau, prediction),
-        r2=1.0 - residual / spread if spread > 0 else 0.0,
-        rows=len(tau),
-        baselines={key: _relative_error(tau, torque) for key, torque in others.items()},
-        better_than_constant=residual < spread,
-    )
-
-
-def _relative_error(tau: Array, prediction: Array) -> float | None:
-    size = float(np.linalg.norm(tau))
-    return 100.0 * float(np.linalg.norm(tau - prediction)) / size if size > 0 else None
+    return TorqueSums.of(tau, prediction, mask, baselines or {}).metrics(names, units)

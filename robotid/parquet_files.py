@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -11,9 +12,12 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
-from robotid.log_source import Table
+from robotid.log_source import Place, RowReader, Table
 
 __all__ = ["load_pyarrow", "open_parquet", "write_parquet"]
+
+_BATCH = 16384  # rows decoded at a time, where not all are wanted
+_BUFFER = 2**16  # bytes of each column read at a time there, not whole row groups
 
 
 def open_parquet(path: Path) -> Table:
@@ -31,7 +35,7 @@ def open_parquet(path: Path) -> Table:
     """
     with _open(path) as file:
         names = list(file.schema_arrow.names)
-    return Table(names, partial(_read, path))
+    return Table(names, partial(_read, path), rows=_ParquetRows(path))
 
 
 def write_parquet(table: Mapping[str, Array], path: Path) -> None:
@@ -69,12 +73,53 @@ def load_pyarrow(purpose: str) -> ModuleType:
     return package
 
 
+@dataclass(frozen=True)
+class _ParquetRows(RowReader):
+    """Rows of a Parquet file; see :class:`robotid.log_source.RowReader`."""
+
+    path: Path
+
+    def count(self) -> int:
+        """Return the number of rows."""
+        with _open(self.path) as file:
+            return int(file.metadata.num_rows)
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        """Yield one column; see :meth:`RowReader.scan`."""
+        row = 0
+        with _open(self.path, _BUFFER) as file:
+            _check_types(file, [name], self.path.name)
+            for batch in file.iter_batches(_BATCH, columns=[name]):
+                yield _to_numpy(batch.column(0)), Place(row)
+                row += batch.num_rows
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        """Return some rows; see :meth:`RowReader.read`."""
+        values = {name: np.empty(stop - first) for name in wanted}
+        with _open(self.path, _BUFFER) as file:
+            _check_types(file, wanted, self.path.name)
+            sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+            edges = np.cumsum([0, *sizes])
+            groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
+            row = int(edges[groups[0]])
+            for batch in file.iter_batches(_BATCH, row_groups=groups, columns=list(wanted)):
+                start, end = max(first - row, 0), min(stop - row, batch.num_rows)
+                if start < end:
+                    part = slice(row + start - first, row + end - first)
+                    for name, array in zip(batch.schema.names, batch.columns, strict=True):
+                        values[name][part] = _to_numpy(array.slice(start, end - start))
+                row += batch.num_rows
+                if row >= stop:
+                    break
+        return values
+
+
 @contextmanager
-def _open(path: Path) -> Iterator[Any]:
+def _open(path: Path, buffer: int = 0) -> Iterator[Any]:
     """Open a Parquet file; what is wrong with it is told in our words."""
     pa = load_pyarrow("reading Parquet")
     try:
-        with pa.parquet.ParquetFile(path) as file:
+        with pa.parquet.ParquetFile(path, buffer_size=buffer) as file:
             yield file
     except (pa.ArrowInvalid, OSError) as error:
         raise DataError(f"{path.name}: broken Parquet file ({error}); export it again") from error
@@ -82,11 +127,22 @@ def _open(path: Path) -> Iterator[Any]:
 
 def _read(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
     """Return the wanted columns of a Parquet file; null becomes NaN."""
-    types = load_pyarrow("reading Parquet").types
     with _open(path) as file:
-        for name in wanted:
-            kind = file.schema_arrow.field(name).type
-            if not (types.is_integer(kind) or types.is_floating(kind)):
-                raise DataError(f"{path.name}: {name} holds {kind}, wanted numbers; convert it")
+        _check_types(file, wanted, path.name)
         table = file.read(columns=list(wanted))
-    return {name: table.column(name).to_numpy().astype(np.float64, copy=False) for name in wanted}
+    return {name: _to_numpy(table.column(name)) for name in wanted}
+
+
+def _check_types(file: Any, wanted: Sequence[str], where: str) -> None:  # noqa: ANN401
+    """Refuse columns that do not hold numbers."""
+    types = load_pyarrow("reading Parquet").types
+    for name in wanted:
+        kind = file.schema_arrow.field(name).type
+        if not (types.is_integer(kind) or types.is_floating(kind)):
+            raise DataError(f"{where}: {name} holds {kind}, wanted numbers; convert it")
+
+
+def _to_numpy(column: Any) -> Array:  # noqa: ANN401
+    """Return a column of a table or of a batch; null becomes NaN."""
+    values: Array = column.to_numpy(zero_copy_only=False).astype(np.float64, copy=False)
+    return values

@@ -50,9 +50,7 @@ class Reduction:
         Raises:
             DataError: If a row is not finite.
         """
-        motion = (trajectory.tau, trajectory.v, trajectory.a)
-        squares = np.array([np.einsum("kj,kj->j", x, x) for x in motion])
-        return cls(compress(problem, threads=threads), squares, len(trajectory.t))
+        return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
 
     def to_arrays(self) -> dict[str, Array]:
         """Return the reduction as plain arrays by name, as for a checkpoint."""

@@ -10,7 +10,7 @@ from robotid.data import Trajectory
 from robotid.model import RobotModel
 from robotid.parameters import pseudo_inertia
 
-__all__ = ["prior_spread"]
+__all__ = ["prior_spread", "spread_of"]
 
 _SMALLEST_MASS = 0.1  # of the mean mass: a link may be that wrong even if its URDF says 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
@@ -31,7 +31,23 @@ def prior_spread(model: RobotModel, trajectories: Sequence[Trajectory]) -> Array
     Returns:
         Spreads, shape (p,), positive, SI units.
     """
-    return np.concatenate([_inertial_spread(model), _drive_spread(model, trajectories)])
+    squares = np.sum([trajectory.squares for trajectory in trajectories], axis=0)
+    return spread_of(model, squares, sum(len(trajectory.t) for trajectory in trajectories))
+
+
+def spread_of(model: RobotModel, squares: Array, samples: int) -> Array:
+    """Return the same from sums over the motions.
+
+    Args:
+        model: The robot, with the URDF's parameters.
+        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows).
+        samples: Number of samples.
+
+    Returns:
+        Spreads, shape (p,), positive, SI units.
+    """
+    rms = np.sqrt(squares / max(samples, 1))
+    return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
 
 
 def _inertial_spread(model: RobotModel) -> Array:
@@ -47,11 +63,9 @@ def _inertial_spread(model: RobotModel) -> Array:
     return spread.reshape(-1)
 
 
-def _drive_spread(model: RobotModel, trajectories: Sequence[Trajectory]) -> Array:
+def _drive_spread(model: RobotModel, rms: Array) -> Array:
     first = model.n_rows - len(model.joints)
-    tau = _rms([trajectory.tau[:, first:] for trajectory in trajectories])
-    v = _rms([trajectory.v[:, first:] for trajectory in trajectories])
-    a = _rms([trajectory.a[:, first:] for trajectory in trajectories])
+    tau, v, a = (_positive(row[first:]) for row in rms)
     carried = _carried_inertia(model)
     spread = {
         "armature": np.maximum(carried, tau / a),
@@ -67,9 +81,8 @@ def _drive_spread(model: RobotModel, trajectories: Sequence[Trajectory]) -> Arra
     return np.array(own + coupled)
 
 
-def _rms(parts: Sequence[Array]) -> Array:
+def _positive(rms: Array) -> Array:
     """Return the root mean square of each column, never 0."""
-    rms = np.sqrt(np.mean(np.concatenate(parts) ** 2, axis=0))
     floor = 1e-3 * rms.max() if rms.max() > 0 else 1.0
     bounded: Array = np.maximum(rms, floor)
     return bounded

@@ -108,8 +108,8 @@ def write_report(
 def _summary(found: Identification) -> str:
     verdict, fitted, kept = found.verdict, found.identification, found.validation
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
-    samples = sum(len(e.recording.trajectory.t) for e in fitted)
-    rows = sum(int(e.recording.mask.sum()) for e in fitted)
+    samples = sum(e.recording.extent.smooth for e in fitted)
+    rows = sum(e.recording.extent.rows_used for e in fitted)
     chains = sorted({_chain(e.recording.signals) for e in (*fitted, *kept)})
     said = (
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
@@ -214,6 +214,12 @@ def _torques(found: Identification) -> str:
     for k, evaluation in enumerate(shown):
         kind = "not fitted" if found.validation else "fitted"
         parts.append(f"<h3>{escape(evaluation.recording.name)}: {kind}</h3>\n")
+        if evaluation.recording.is_partial:
+            seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth
+            parts.append(
+                f"<p>A long log: {seen} of its {whole} samples are drawn, from its beginning, "
+                "middle and end; errors are of all.</p>\n"
+            )
         figures = "".join(
             _torque_figure(evaluation, row, name, unit, f"tau{k}-{row}", points)
             for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True))

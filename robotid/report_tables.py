@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid._typing import Array
 from robotid.estimator_settings import KEYS
 from robotid.identification import Identification
 from robotid.parameters import pseudo_inertia
@@ -226,14 +225,14 @@ def _signal_row(recording: Recording) -> list[Cell]:
 
 
 def _input_row(recording: Recording) -> list[Cell]:
-    t: Array = recording.log.t
+    extent = recording.extent
     return [
         code(str(recording.log.path)),
-        number(len(t), "d"),
-        number(float(1.0 / np.median(np.diff(t))), ".5g"),
-        number(float(t[0]), ".6g"),
-        number(float(t[-1]), ".6g"),
-        number(int(recording.trajectory.segment[-1]) + 1, "d"),
+        number(extent.samples, "d"),
+        number(extent.rate, ".5g"),
+        number(extent.start, ".6g"),
+        number(extent.end, ".6g"),
+        number(extent.segments, "d"),
         code(_sha256(str(recording.log.path))),
     ]
 

@@ -153,17 +153,17 @@ def _inputs(identification: Identification) -> list[dict[str, Any]]:
     for role in ("identification", "validation"):
         for evaluation in getattr(identification, role):
             recording = evaluation.recording
-            t = recording.log.t
+            extent = recording.extent
             inputs.append(
                 {
                     "role": role,
                     **_source(recording.log.path),
-                    "samples": len(t),
-                    "rate": float(1.0 / np.median(np.diff(t))),
-                    "start": float(t[0]),
-                    "end": float(t[-1]),
-                    "rows_used": int(recording.mask.sum()),
-                    "segments": int(recording.trajectory.segment[-1]) + 1,
+                    "samples": extent.samples,
+                    "rate": extent.rate,
+                    "start": extent.start,
+                    "end": extent.end,
+                    "rows_used": extent.rows_used,
+                    "segments": extent.segments,
                     "signals": dataclasses.asdict(recording.signals),
                 }
             )

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from robotid._typing import Array
@@ -32,7 +32,7 @@ def _without_topics(open_file: Callable[[Path], Table]) -> Callable[[Path, LogSo
         if source.topic is None:
             return table
         note = f"the topic {source.topic!r} is not used: {path.suffix} files have none"
-        return Table(table.names, table.read, (note,))
+        return replace(table, notes=(note,))
 
     return open_only
 

@@ -11,7 +11,7 @@ from robotid._typing import Array
 from robotid.data import Log
 from robotid.exceptions import DataError, SettingsError
 
-__all__ = ["PER_SECOND", "LogUnits", "check_units"]
+__all__ = ["PER_SECOND", "LogUnits", "check_reach", "check_units"]
 
 #: Divisors that turn a time unit into seconds.
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -65,7 +65,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
         _check_step(float(np.median(np.diff(log.t))), where)
         _check_clock(log, factor, where)
     if units.angle is None:
-        _check_reach(log, turns, where)
+        check_reach(log, units, prismatic)
         _check_degrees(log, np.where(turns, factor, np.nan), where)
     for j in np.flatnonzero(_is_near(factor, -1.0)):
         raise DataError(
@@ -100,14 +100,27 @@ def _check_clock(log: Log, factor: Array, where: str) -> None:
             )
 
 
-def _check_reach(log: Log, turns: NDArray[np.bool_], where: str) -> None:
-    """Refuse joints that turn too far for radians."""
+def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
+    """Refuse joints that turn too far for radians, unless the unit was stated.
+
+    Args:
+        log: The log, or rows of it.
+        units: The units that were stated.
+        prismatic: Names of the joints that slide.
+
+    Raises:
+        DataError: If a joint turns too far.
+    """
+    if units.angle is not None:
+        return
+    turns = np.array([name not in prismatic for name in log.joints])
     reach = np.where(turns, np.abs(log.q).max(axis=0), 0.0)  # (n,)
     j = int(np.argmax(reach))
     if reach[j] > _FARTHEST:
         raise DataError(
-            f"{where}: q_{log.joints[j]} reaches {reach[j]:.4g}, which looks like degrees (in "
-            f"radians {reach[j] / (2 * np.pi):.1f} turns). {_how_to_state('angle', 'deg', 'rad')}",
+            f"{Path(log.path).name or 'log'}: q_{log.joints[j]} reaches {reach[j]:.4g}, which "
+            f"looks like degrees (in radians {reach[j] / (2 * np.pi):.1f} turns). "
+            f"{_how_to_state('angle', 'deg', 'rad')}",
             code="angle_unit",
         )
 

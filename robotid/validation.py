@@ -2,50 +2,88 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.data import Log, Trajectory
-from robotid.metrics import Metrics, measure
+from robotid.metrics import Metrics, TorqueSums
 from robotid.model import RobotModel
 from robotid.regressor import build_problem
 from robotid.signals import SignalSettings, process, resolve, unwrap
 
 __all__ = [
     "Evaluation",
+    "Extent",
     "Recording",
+    "conclude_sums",
     "evaluate",
+    "is_shared",
     "pool",
     "predict",
+    "predict_all",
     "prepare",
     "row_mask",
+    "rows_in",
+    "sampled_every",
     "shares_rows",
+    "torque_sums",
 ]
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much of a log there is.
+
+    Attributes:
+        samples: Rows of the log.
+        rate: Their median rate [Hz].
+        start: First time stamp [s].
+        end: Last time stamp [s].
+        smooth: Samples of its trajectory.
+        rows_used: Torque rows of these that are used.
+        segments: Uninterrupted stretches of the trajectory.
+    """
+
+    samples: int
+    rate: float
+    start: float
+    end: float
+    smooth: int
+    rows_used: int
+    segments: int
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A log made ready for a model.
+    """A log made ready for a model. Of a long log, only some stretches are at hand.
 
     Attributes:
-        log: The raw log.
+        log: The raw log, or its first rows.
         signals: The settings it was processed with, everything automatic decided.
-        trajectory: The smooth motion, N samples.
+        trajectory: The smooth motion, N samples, or stretches of it.
         mask: Rows used, shape (N, n_rows), bool.
+        extent: How much of the whole log there is.
     """
 
     log: Log
     signals: SignalSettings
     trajectory: Trajectory
     mask: Array
+    extent: Extent
 
     @property
     def name(self) -> str:
         """Name of the log's file and the stretch of it, as ``run3.parquet 5-7.4 s``."""
         file = Path(self.log.path).name or "log"
-        return f"{file} {self.log.t[0]:.4g}-{self.log.t[-1]:.4g} s"
+        return f"{file} {self.extent.start:.4g}-{self.extent.end:.4g} s"
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether only stretches of the motion are at hand."""
+        return len(self.trajectory.t) < self.extent.smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +94,17 @@ class Evaluation:
         recording: The recording.
         torques: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N];
             among them the baselines "urdf" and "gravity_only".
-        metrics: Metrics by name of the parameters, without the baselines.
+        sums: What the metrics over the whole log are made of, by name of the parameters, without
+            the baselines.
+        metrics: Metrics over the whole log, likewise.
+        is_refitted: Whether it was kept apart, but holds rows that were fitted.
     """
 
     recording: Recording
     torques: Mapping[str, Array]
+    sums: Mapping[str, TorqueSums]
     metrics: Mapping[str, Metrics]
+    is_refitted: bool = False
 
 
 def prepare(model: RobotModel, log: Log, settings: SignalSettings) -> Recording:
@@ -83,7 +126,16 @@ def prepare(model: RobotModel, log: Log, settings: SignalSettings) -> Recording:
     resolved = resolve(log, settings)
     trajectory = process(log, resolved)
     mask = row_mask(model, trajectory, resolved.min_velocity)
-    return Recording(log, resolved, trajectory, mask)
+    extent = Extent(
+        samples=len(log.t),
+        rate=float(1.0 / np.median(np.diff(log.t))),
+        start=float(log.t[0]),
+        end=float(log.t[-1]),
+        smooth=len(trajectory.t),
+        rows_used=int(mask.sum()),
+        segments=int(trajectory.segment[-1]) + 1,
+    )
+    return Recording(log, resolved, trajectory, mask, extent)
 
 
 def shares_rows(one: Log, other: Log) -> bool:
@@ -97,12 +149,50 @@ def shares_rows(one: Log, other: Log) -> bool:
         Whether more than 2 % of 200 rows of positions and torques spread over the first are in
         the second; windows that meet share their common row, which counts for nothing.
     """
-    every = max(1, len(one.t) // 200)
-    sampled = np.hstack([one.q, one.tau])[::every]
-    likely = sampled[np.isin(sampled[:, 0], other.q[:, 0])]
-    rows = np.hstack([other.q, other.tau])[np.isin(other.q[:, 0], likely[:, 0])]
-    shared = sum(bool((rows == row).all(axis=1).any()) for row in likely)
-    return shared > max(1, 0.02 * len(sampled))
+    every = sampled_every(len(one.t))
+    return is_shared(rows_in(np.hstack([one.q, one.tau])[::every], other))
+
+
+def sampled_every(rows: int) -> int:
+    """Return how far apart the rows are that :func:`shares_rows` looks for.
+
+    Args:
+        rows: Rows of the log that they are of.
+
+    Returns:
+        Every so many rows.
+    """
+    return max(1, rows // 200)
+
+
+def rows_in(sampled: Array, log: Log) -> Array:
+    """Return which rows are in a log.
+
+    Args:
+        sampled: Positions and torques of m rows, shape (m, 2 n).
+        log: The log.
+
+    Returns:
+        Flags, shape (m,), bool.
+    """
+    found = np.isin(sampled[:, 0], log.q[:, 0])
+    likely = np.isin(log.q[:, 0], sampled[found, 0])
+    rows = np.hstack([log.q[likely], log.tau[likely]])
+    for k in np.flatnonzero(found):
+        found[k] = (rows == sampled[k]).all(axis=1).any()
+    return found
+
+
+def is_shared(found: Array) -> bool:
+    """Return whether so many rows are in another log that it holds the same recording.
+
+    Args:
+        found: Which of the rows looked for are in it, bool.
+
+    Returns:
+        Whether it does.
+    """
+    return int(found.sum()) > max(1, 0.02 * len(found))
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
@@ -166,21 +256,79 @@ def evaluate(
     Raises:
         DataError: If no row of the recording is used.
     """
-    trajectory = recording.trajectory
+    torques = predict_all(model, recording.trajectory, parameters, prior)
+    sums = torque_sums(recording.trajectory, recording.mask, torques, list(parameters))
+    return conclude_sums(model, recording, torques, sums)
+
+
+def predict_all(
+    model: RobotModel, trajectory: Trajectory, parameters: Mapping[str, Array], prior: Array
+) -> dict[str, Array]:
+    """Return the torques that parameters and the baselines predict.
+
+    Args:
+        model: The robot.
+        trajectory: N samples.
+        parameters: Standard parameters by name, each of shape (p,).
+        prior: Those of the URDF, shape (p,).
+
+    Returns:
+        Torques by name, each of shape (N, n_rows): those of the parameters, "urdf" and
+        "gravity_only".
+    """
     *torques, urdf = predict(model, [*parameters.values(), prior], trajectory)
     still = np.zeros_like(trajectory.v)
     (gravity,) = predict(
         model, [_without_drives(model, prior)], replace(trajectory, v=still, a=still)
     )
-    baselines = {"urdf": urdf, "gravity_only": gravity}
     predicted = dict(zip(parameters, torques, strict=True))
-    metrics = {
-        name: measure(
-            trajectory.tau, torque, recording.mask, model.row_names, model.row_units, baselines
-        )
-        for name, torque in predicted.items()
-    }
-    return Evaluation(recording, {**predicted, **baselines}, metrics)
+    return {**predicted, "urdf": urdf, "gravity_only": gravity}
+
+
+def torque_sums(
+    trajectory: Trajectory, mask: Array, torques: Mapping[str, Array], names: Sequence[str]
+) -> dict[str, TorqueSums]:
+    """Return what the metrics of predictions are made of.
+
+    Args:
+        trajectory: N samples.
+        mask: Rows used, shape (N, n_rows), bool.
+        torques: As of :func:`predict_all`.
+        names: Which of them to measure.
+
+    Returns:
+        The sums by name.
+    """
+    baselines = {key: torques[key] for key in ("urdf", "gravity_only")}
+    tau = trajectory.tau
+    return {name: TorqueSums.of(tau, torques[name], mask, baselines) for name in names}
+
+
+def conclude_sums(
+    model: RobotModel,
+    recording: Recording,
+    torques: Mapping[str, Array],
+    sums: Mapping[str, TorqueSums],
+    *,
+    is_refitted: bool = False,
+) -> Evaluation:
+    """Return the evaluation that predicted torques and their sums make up.
+
+    Args:
+        model: The robot.
+        recording: The recording.
+        torques: Torques predicted for its trajectory.
+        sums: Sums over the whole log.
+        is_refitted: Whether it was kept apart, but holds rows that were fitted.
+
+    Returns:
+        The evaluation.
+
+    Raises:
+        DataError: If no row of the recording is used.
+    """
+    metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
+    return Evaluation(recording, torques, sums, metrics, is_refitted)
 
 
 def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Metrics:
@@ -197,14 +345,8 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
     Raises:
         DataError: If no row of any recording is used.
     """
-    tau = np.concatenate([e.recording.trajectory.tau for e in evaluations])
-    mask = np.concatenate([e.recording.mask for e in evaluations])
-    torques = {
-        key: np.concatenate([e.torques[key] for e in evaluations])
-        for key in (name, "urdf", "gravity_only")
-    }
-    prediction = torques.pop(name)
-    return measure(tau, prediction, mask, model.row_names, model.row_units, torques)
+    together = reduce(TorqueSums.merge, [evaluation.sums[name] for evaluation in evaluations])
+    return together.metrics(model.row_names, model.row_units)
 
 
 def _without_drives(model: RobotModel, pi: Array) -> Array:

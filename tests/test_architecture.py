@@ -17,16 +17,17 @@ PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings job_keys lanes lapack log_source console progress work_flags",
-    2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
-    "compiled columns array_tables csv_files parquet_files bags",
-    3: "array_files estimators plant lumping prior rows log_checks channel_checks pieces",
-    4: "regressor excitation tables task checkpoint",
+    "innovations online_settings job_keys lanes lapack log_source console signal_settings "
+    "progress work_flags",
+    2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
+    "time_stamps compiled columns array_tables csv_files parquet_files bags",
+    3: "array_files estimators plant lumping prior rows log_checks signals pieces",
+    4: "regressor excitation tables channel_checks task checkpoint",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe reduction",
-    6: "identification closed_loop conversion explanations load_checks motion_checks cluster",
-    7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
-    "model_checks",
-    8: "report_page result inspection paper_errata doctor",
+    6: "recordings closed_loop conversion explanations load_checks motion_checks cluster",
+    7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
+    "model_checks long_logs",
+    8: "online report_page result inspection paper_errata doctor",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",
     11: "workflow",
