@@ -1,4 +1,4 @@
-"""Pieces reduced on the workers of a Dask cluster."""
+"""Work on pieces by the workers of a Dask cluster."""
 
 import logging
 import platform
@@ -12,9 +12,9 @@ from uuid import uuid4
 
 from robotid import __version__
 from robotid.exceptions import MissingDependencyError, WorkerError
-from robotid.pieces import Piece, Reduction
+from robotid.pieces import Piece
 from robotid.reduction import Backend
-from robotid.task import Outcome, run_task
+from robotid.task import Outcome, Work, run_task
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -28,10 +28,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ClusterBackend(Backend):
-    """Reduces pieces on a Dask cluster; the reductions come home as they are finished.
+    """Works on pieces on a Dask cluster; results come home as they are finished.
 
-    Logs and URDF must be reachable from every worker under the same path. A piece whose worker is
-    lost is reduced again by another one; a reduction counts once, by the index of its piece.
+    Logs must be reachable from every worker under the same path. A piece whose worker is lost is
+    done again by another one; a result counts once, by the index of its piece.
 
     Attributes:
         address: Address of the scheduler, as ``tcp://host:8786``.
@@ -46,14 +46,15 @@ class ClusterBackend(Backend):
         """What messages call it."""
         return f"the Dask cluster {self.address}, one BLAS thread per piece"
 
-    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
-        """Reduce pieces, at most two per thread of the cluster under way.
+    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+        """Work on pieces, at most two per thread of the cluster under way.
 
         Args:
+            work: What to do with a piece.
             pieces: Index and piece.
 
         Yields:
-            Index and reduction of each piece once, as they come.
+            Index and result of each piece once, as they come.
 
         Raises:
             DataError: If a row cannot be used.
@@ -64,7 +65,7 @@ class ClusterBackend(Backend):
         client = self._connect()
         try:
             _require_same_version(self.address, client)
-            yield from self._collect(client, pieces)
+            yield from self._collect(client, work, pieces)
         finally:
             client.close(timeout=5)
 
@@ -91,8 +92,8 @@ class ClusterBackend(Backend):
         return client
 
     def _collect(
-        self, client: "Client", pieces: Sequence[tuple[int, Piece]]
-    ) -> Iterator[tuple[int, Reduction]]:
+        self, client: "Client", work: Work, pieces: Sequence[tuple[int, Piece]]
+    ) -> Iterator[tuple[int, Any]]:
         from distributed import CancelledError, KilledWorker, as_completed
 
         waiting, level = iter(pieces), _log.getEffectiveLevel()
@@ -104,7 +105,9 @@ class ClusterBackend(Backend):
                 most = 2 * max(1, sum(client.nthreads().values()))
                 for index, piece in islice(waiting, max(0, most - len(running))):
                     key = f"robotid-{run}-{index}"
-                    future = client.submit(_run, piece, level, __version__, key=key, pure=False)
+                    future = client.submit(
+                        _run, work, piece, level, __version__, key=key, pure=False
+                    )
                     running[future.key] = index, piece, future
                     results.add(future)
                 if not running:
@@ -115,31 +118,31 @@ class ClusterBackend(Backend):
                     outcome: Outcome = future.result()
                 except KilledWorker as error:
                     raise WorkerError(
-                        f"the cluster lost every worker that reduced {piece.name} (killed, or "
+                        f"the cluster lost every worker that worked on {piece.name} (killed, or "
                         "short of memory)"
                     ) from error
                 except CancelledError as error:
                     raise WorkerError(
-                        f"the cluster {self.address} was lost while it reduced {piece.name}"
+                        f"the cluster {self.address} was lost while it worked on {piece.name}"
                     ) from error
                 except Exception as error:
-                    error.add_note(f"while reducing {piece.name}")
+                    error.add_note(f"while working on {piece.name}")
                     raise
                 del running[future.key]
                 future.release()
                 outcome.log()
-                yield index, outcome.reduction
+                yield index, outcome.result
         finally:
             if running and client.status == "running":
                 client.cancel([future for _, _, future in running.values()])
 
 
-def _run(piece: Piece, level: int, wanted: str) -> Outcome:
-    """Reduce a piece on a worker, and say on an error which host met it."""
+def _run(work: Work, piece: Piece, level: int, wanted: str) -> Outcome:
+    """Work on a piece on a worker, and say on an error which host met it."""
     if __version__ != wanted:  # a worker that joined after the start
         raise WorkerError(_wrong_version({socket.gethostname(): __version__}, wanted))
     try:
-        return run_task(piece, level)
+        return run_task(work, piece, level)
     except Exception as error:
         error.add_note(
             f"on the worker's host {socket.gethostname()!r}; logs must be readable there under the "

@@ -1,7 +1,7 @@
-"""Pieces to their reductions: in this process, in worker processes, or by another backend.
+"""Work on pieces: in this process, in worker processes, or by another backend.
 
-Every piece is reduced by itself with one BLAS thread, so its reduction has the same bits wherever
-it is made; the reductions come back in the order of the pieces.
+Every piece is worked on by itself with one BLAS thread, so what it comes down to has the same bits
+wherever that is done; results come back in the order of the pieces.
 """
 
 import logging
@@ -10,13 +10,15 @@ import os
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -25,13 +27,14 @@ from robotid.exceptions import SettingsError, WorkerError
 from robotid.factors import available_cores
 from robotid.pieces import Piece, Reduction
 from robotid.progress import ProgressCallback, ignore_progress
-from robotid.task import Outcome, run_task
+from robotid.task import Outcome, Work, reduce_piece, run_task
 
 __all__ = [
     "Backend",
     "ProcessBackend",
     "SerialBackend",
     "choose_workers",
+    "map_pieces",
     "reduce_pieces",
 ]
 
@@ -41,7 +44,7 @@ _log = logging.getLogger(__name__)
 
 
 class Backend(ABC):
-    """Where pieces are reduced."""
+    """Where pieces are worked on."""
 
     @property
     @abstractmethod
@@ -49,14 +52,15 @@ class Backend(ABC):
         """What messages call it, as ``2 worker processes``."""
 
     @abstractmethod
-    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
-        """Reduce pieces; closing the iterator ends the work.
+    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+        """Do the same with each of some pieces; closing the iterator ends it.
 
         Args:
+            work: What to do with a piece.
             pieces: Index and piece.
 
         Yields:
-            Index and reduction of each piece once, in any order.
+            Index and result of each piece once, in any order.
 
         Raises:
             DataError: If a row cannot be used.
@@ -65,31 +69,32 @@ class Backend(ABC):
 
 
 class SerialBackend(Backend):
-    """Reduces pieces one after the other in this process."""
+    """Works on pieces one after the other in this process."""
 
     @property
     def description(self) -> str:
         """What messages call it."""
         return "this process"
 
-    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
-        """Reduce pieces; see :meth:`Backend.run`.
+    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+        """Work on pieces; see :meth:`Backend.run`.
 
         Args:
+            work: What to do with a piece.
             pieces: Index and piece.
 
         Yields:
-            Index and reduction of each piece, in order.
+            Index and result of each piece, in order.
         """
         for index, piece in pieces:
             with threadpool_limits(limits=1, user_api="blas"), _named(piece):
-                reduction = piece.reduce()
-            yield index, reduction
+                result = work(piece, None)
+            yield index, result
 
 
 @dataclass(frozen=True)
 class ProcessBackend(Backend):
-    """Reduces pieces in worker processes, started anew, with one BLAS thread each.
+    """Works on pieces in worker processes, started anew, with one BLAS thread each.
 
     The workers end with the process that started them, however it ends.
 
@@ -108,14 +113,15 @@ class ProcessBackend(Backend):
         """What messages call it."""
         return f"{self.workers} worker processes, one BLAS thread each"
 
-    def run(self, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Reduction]]:
-        """Reduce pieces, at most two per worker under way; see :meth:`Backend.run`.
+    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+        """Work on pieces, at most two per worker under way; see :meth:`Backend.run`.
 
         Args:
+            work: What to do with a piece.
             pieces: Index and piece.
 
         Yields:
-            Index and reduction of each piece, as they come.
+            Index and result of each piece, as they come.
 
         Raises:
             DataError: If a row cannot be used.
@@ -127,7 +133,7 @@ class ProcessBackend(Backend):
             min(self.workers, len(pieces)), context, _start_worker, (lifeline,)
         )
         try:
-            yield from _collect(pool, pieces, 2 * self.workers)
+            yield from _collect(pool, work, pieces, 2 * self.workers)
         except BaseException:
             held.close()  # ends the workers in the middle of their work
             raise
@@ -159,25 +165,65 @@ def reduce_pieces(
         DataError: If a row cannot be used.
         WorkerError: If a worker ends before its work.
     """
-    chosen = backend or SerialBackend()
     found = {} if checkpoint is None else checkpoint.load(pieces)
-    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in found]
+    keep = None if checkpoint is None else partial(_keep, checkpoint, pieces)
+    try:
+        return map_pieces(
+            reduce_piece, pieces, "reducing", backend=backend, progress=progress,
+            found=found, keep=keep,
+        )  # fmt: skip
+    except BaseException as error:
+        if checkpoint is not None:
+            error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
+        raise
+
+
+def map_pieces(
+    work: Work,
+    pieces: Sequence[Piece],
+    what: str,
+    *,
+    backend: Backend | None = None,
+    progress: ProgressCallback | None = None,
+    found: Mapping[int, Any] | None = None,
+    keep: Callable[[int, Any], None] | None = None,
+) -> tuple[Any, ...]:
+    """Do the same with every piece.
+
+    Args:
+        work: What to do with a piece.
+        pieces: The pieces.
+        what: What the work is called.
+        backend: Where it is done; in this process if None.
+        progress: Called with (what, samples done, samples in all, "samples").
+        found: Results that are there already, by index of the piece.
+        keep: Called with index and result of each piece that is finished.
+
+    Returns:
+        One result per piece, in order.
+
+    Raises:
+        DataError: If a row cannot be used.
+        WorkerError: If a worker ends before its work.
+    """
+    chosen, report = backend or SerialBackend(), progress or ignore_progress
+    results = dict(found or {})
+    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in results]
     total = sum(piece.samples for piece in pieces)
-    done = sum(pieces[k].samples for k in found)
+    done = total - sum(piece.samples for _, piece in missing)
     _log.info(
-        "reducing %d pieces (%d samples, %d pieces already kept) in %s",
-        len(pieces), total, len(found), chosen.description,
+        "%s %d pieces, %d of them kept from before, %d samples in all: %s",
+        what, len(pieces), len(results), total, chosen.description,
     )  # fmt: skip
-    report = progress or ignore_progress
-    report("reducing", done, total, "samples")
-    with closing(chosen.run(missing)) as results:  # type: ignore[type-var]
-        for index, reduction in results if missing else ():
-            if checkpoint is not None:
-                checkpoint.save(index, pieces[index], reduction)
-            found[index] = reduction
+    report(what, done, total, "samples")
+    with closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
+        for index, result in finished if missing else ():
+            if keep is not None:
+                keep(index, result)
+            results[index] = result
             done += pieces[index].samples
-            report("reducing", done, total, "samples")
-    return tuple(found[k] for k in range(len(pieces)))
+            report(what, done, total, "samples")
+    return tuple(results[k] for k in range(len(pieces)))
 
 
 def choose_workers(pieces: Sequence[Piece], workers: int | None = None) -> int:
@@ -203,8 +249,8 @@ def choose_workers(pieces: Sequence[Piece], workers: int | None = None) -> int:
 
 
 def _collect(
-    pool: ProcessPoolExecutor, pieces: Iterable[tuple[int, Piece]], most: int
-) -> Iterator[tuple[int, Reduction]]:
+    pool: ProcessPoolExecutor, work: Work, pieces: Iterable[tuple[int, Piece]], most: int
+) -> Iterator[tuple[int, Any]]:
     """Yield what the workers return, with at most so many pieces under way."""
     waiting, level = iter(pieces), _log.getEffectiveLevel()
     running: dict[Future[Outcome], tuple[int, Piece]] = {}
@@ -212,7 +258,7 @@ def _collect(
         while True:
             for index, piece in islice(waiting, most - len(running)):
                 with _without_interrupt():  # a worker in its start knows no way to end quietly
-                    running[pool.submit(run_task, piece, level)] = index, piece
+                    running[pool.submit(run_task, work, piece, level)] = index, piece
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -221,13 +267,19 @@ def _collect(
                     outcome = future.result()
                 del running[future]
                 outcome.log()
-                yield index, outcome.reduction
+                yield index, outcome.result
     except BrokenProcessPool as error:
         names = [piece.name for _, piece in running.values()]
         raise WorkerError(
             "a worker process ended in the middle of its work (killed from outside, short of "
             f"memory, or a script without the guard if __name__ == '__main__'); under way: {names}"
         ) from error
+
+
+def _keep(
+    checkpoint: Checkpoint, pieces: Sequence[Piece], index: int, reduction: Reduction
+) -> None:
+    checkpoint.save(index, pieces[index], reduction)
 
 
 @contextmanager
@@ -238,7 +290,7 @@ def _named(piece: Piece) -> Iterator[None]:
     except BrokenProcessPool:
         raise
     except Exception as error:
-        error.add_note(f"while reducing {piece.name}")
+        error.add_note(f"while working on {piece.name}")
         raise
 
 

@@ -1,13 +1,18 @@
 """What a worker does with one piece, in whichever process or on whichever machine it runs."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 from threadpoolctl import threadpool_limits
 
 from robotid.pieces import Piece, Reduction
 
-__all__ = ["Outcome", "run_task"]
+__all__ = ["Outcome", "Work", "reduce_piece", "run_task"]
+
+#: What is done with a piece, given the number of threads or None for any; can be pickled.
+Work: TypeAlias = Callable[[Any, int | None], Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,11 +20,11 @@ class Outcome:
     """What a worker sends home.
 
     Attributes:
-        reduction: The reduction of its piece.
+        result: What it made of its piece.
         messages: Logger, level and text of what was logged meanwhile.
     """
 
-    reduction: Reduction
+    result: Any
     messages: tuple[tuple[str, int, str], ...]
 
     def log(self) -> None:
@@ -39,15 +44,32 @@ class _Memory(logging.Handler):
         self.messages.append((record.name, record.levelno, record.getMessage()))
 
 
-def run_task(piece: Piece, level: int) -> Outcome:
-    """Reduce a piece with one thread, and keep what is logged.
+def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
+    """Return what a piece comes down to.
 
     Args:
+        piece: The piece.
+        threads: As of :meth:`robotid.pieces.Piece.reduce`.
+
+    Returns:
+        The reduction.
+
+    Raises:
+        DataError: If a row cannot be used.
+    """
+    return piece.reduce(threads=threads)
+
+
+def run_task(work: Work, piece: Piece, level: int) -> Outcome:
+    """Work on a piece with one thread, and keep what is logged.
+
+    Args:
+        work: What to do with the piece.
         piece: The piece.
         level: Level from which on messages are kept.
 
     Returns:
-        The reduction, with the messages.
+        What the work returns, with the messages.
 
     Raises:
         DataError: If a row cannot be used.
@@ -58,8 +80,8 @@ def run_task(piece: Piece, level: int) -> Outcome:
     logger.setLevel(level)
     try:
         with threadpool_limits(limits=1, user_api="blas"):
-            reduction = piece.reduce(threads=1)
+            result = work(piece, 1)
     finally:
         logger.removeHandler(memory)
         logger.setLevel(before)
-    return Outcome(reduction, tuple(memory.messages))
+    return Outcome(result, tuple(memory.messages))

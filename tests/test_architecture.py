@@ -26,7 +26,7 @@ FLOORS = {
     5: "validation sidecar estimator_settings simulation dynamics log_files probe reduction",
     6: "recordings closed_loop conversion explanations load_checks motion_checks cluster",
     7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
-    "model_checks long_logs",
+    "model_checks long_logs work_plan",
     8: "online report_page result inspection paper_errata doctor",
     9: "report_tables paper_plots paper_page tracking",
     10: "report paper",

@@ -88,7 +88,7 @@ def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(tmp_path, backe
     with pytest.raises(DataError, match="row 7 is not finite") as caught:
         reduce_pieces(pieces, backend=backend)
     assert caught.value.code == "not_finite"
-    assert "while reducing random rows 3" in caught.value.__notes__
+    assert "while working on random rows 3" in caught.value.__notes__
 
 
 def test_a_worker_that_is_killed_is_an_error_that_names_what_was_under_way(tmp_path):
@@ -143,7 +143,8 @@ def test_ctrl_c_in_a_terminal_reaches_the_workers_too_and_shows_one_traceback(tm
     os.killpg(run.pid, signal.SIGINT)
     error = run.communicate(timeout=10)[1]
     assert error.count("Traceback") == 1  # of the script; workers say nothing
-    assert error.strip().endswith("KeyboardInterrupt")
+    assert "KeyboardInterrupt" in error
+    assert error.strip().endswith(".robotid-checkpoint: --resume uses them")
 
 
 def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
