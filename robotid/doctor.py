@@ -6,6 +6,7 @@ unless its code is ignored.
 
 import difflib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from robotid.log_checks import (
     check_standstill,
     check_static,
 )
+from robotid.long_jobs import is_long, survey_logs
 from robotid.model import RobotModel
 from robotid.model_checks import check_torque_delay, check_torques
 from robotid.motion_checks import check_excitation, check_repeated_motion
@@ -61,8 +63,9 @@ def examine(job: Job) -> tuple[Finding, ...]:
     """
     model = job.model()
     findings: list[Finding] = []
+    read = _look if is_long(job, (*job.identification, *job.validation)) else _read
     fitted, kept = (
-        _read(job, model, entries, findings) for entries in (job.identification, job.validation)
+        read(job, model, entries, findings) for entries in (job.identification, job.validation)
     )
     return _sorted([*findings, *diagnose(model, fitted, kept, job.signals)])
 
@@ -154,6 +157,23 @@ def _read(
         except DataError as error:
             findings.append(Finding(error.code, "error", entry.path.name, str(error)))
     return logs
+
+
+def _look(
+    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
+) -> list[Log]:
+    """Return windows of logs that are too long to be in memory."""
+    mapping, looks = structural_mapping(model), []
+    for entry in entries:
+        try:
+            (log,) = survey_logs(job, [entry], model, mapping)
+        except DataError as error:
+            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
+            continue
+        notes, name = log.head.notes, entry.path.name
+        findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
+        looks += [replace(look, notes=()) for look in log.looks]
+    return looks
 
 
 def _examine_log(

@@ -66,6 +66,7 @@ class Job:
         identification: Logs to fit.
         validation: Logs kept apart.
         ignore: Codes of the doctor's errors that the user knows better.
+        rows_in_memory: Rows of all logs together above which they are read in pieces.
     """
 
     urdf: Path
@@ -86,6 +87,13 @@ class Job:
     identification: tuple[LogEntry, ...] = ()
     validation: tuple[LogEntry, ...] = ()
     ignore: tuple[str, ...] = ()
+    rows_in_memory: int = 2**18
+
+    def __post_init__(self) -> None:
+        if self.rows_in_memory < 1:
+            raise SettingsError(
+                f"reduction: rows_in_memory is {self.rows_in_memory}, wanted a positive number"
+            )
 
     def model(self) -> RobotModel:
         """Return the robot.
@@ -193,6 +201,7 @@ class Job:
             "identification": [_entry_settings(entry) for entry in self.identification],
             "validation": [_entry_settings(entry) for entry in self.validation],
             "doctor": {"ignore": list(self.ignore)},
+            "reduction": {"rows_in_memory": self.rows_in_memory},
         }
 
 
@@ -274,6 +283,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             estimator=EstimatorSettings(**table.get("estimator", {})),
             dynamics=table.get("output", {}).get("dynamics", False),
             ignore=tuple(table.get("doctor", {}).get("ignore", ())),
+            rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**18),
             **entries,
         )
     except SettingsError as error:

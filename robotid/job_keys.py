@@ -53,6 +53,7 @@ KEYS: dict[str, Any] = {
         "physical": bool,
     },
     "output": {"dynamics": bool},
+    "reduction": {"rows_in_memory": int},
     "identification": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
     "validation": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
 }

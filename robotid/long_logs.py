@@ -32,7 +32,7 @@ from robotid.validation import row_mask
 
 __all__ = ["PIECE", "LogPiece", "LongLog", "survey"]
 
-#: Rows of a piece.
+#: Rows of a piece, if nothing else is said.
 PIECE = 65536
 _WINDOW = 25_000  # rows of each window that is looked at closely
 
@@ -90,11 +90,12 @@ class LogPiece(Piece):
         """Number of its rows."""
         return self.stop - self.first
 
-    def read(self) -> tuple[Log, Trajectory, Array]:
-        """Return its own raw rows, its smooth motion, and which joints' full turns were taken out.
+    def read(self) -> tuple[Array, Trajectory, Array]:
+        """Return its raw rows, its smooth motion, and which joints' full turns were taken out.
 
         Returns:
-            The log, the trajectory, of no samples if none is left, and flags, shape (n,), bool.
+            Positions and torques of its rows, shape (samples, 2 n); the trajectory, of no samples
+            if none is left; and flags, shape (n,), bool.
 
         Raises:
             DataError: If a row cannot be used.
@@ -109,7 +110,7 @@ class LogPiece(Piece):
             own=slice(self.first, self.stop),
         )
         rows = slice(self.first - self.span[0], self.stop - self.span[0])
-        own = replace(raw, t=raw.t[rows], q=raw.q[rows], tau=raw.tau[rows], v=None, a=None)
+        own = np.hstack([raw.q[rows], raw.tau[rows]])
         return own, trajectory, (log.q != raw.q).any(axis=0)
 
     def mask(self, trajectory: Trajectory) -> Array:
@@ -175,6 +176,27 @@ class LongLog:
     def path(self) -> str:
         """The file."""
         return self.header.layout.path
+
+    @property
+    def head(self) -> Log:
+        """The first rows, with the notes on the log."""
+        log = self.windows[0]
+        if len(self.windows) == 1:
+            return log
+        looks = ", ".join(f"{first}-{stop}" for first, stop in _close_looks(self.first, self.stop))
+        note = f"too long to be in memory at once; the doctor looked at rows {looks} only"
+        return replace(log, notes=(*log.notes, note))
+
+    @property
+    def looks(self) -> tuple[Log, ...]:
+        """The windows as logs of their own, named by their rows if they are not all rows."""
+        if len(self.windows) == 1:
+            return self.windows
+        ranges = _close_looks(self.first, self.stop)
+        return tuple(
+            replace(log, path=f"{log.path} rows {first}-{stop}", notes=())
+            for log, (first, stop) in zip(self.windows, ranges, strict=True)
+        )
 
 
 def survey(
@@ -334,4 +356,7 @@ def _cut(
         before = stamps.search(stamps.at(first) - reach) - SPLINE
         after = stamps.search(stamps.at(stop - 1) + reach) + SPLINE
         span = max(before, mine[0].first), min(after, mine[-1].stop)
+        if span[1] - span[0] < 2:  # a lonely row, with another one: a log has two
+            low = max(span[0] - 1, window[0])
+            span = low, low + 2
         yield LogPiece(header, first, stop, span, _near(places, span[0]), tuple(mine))

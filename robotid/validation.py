@@ -149,8 +149,8 @@ def shares_rows(one: Log, other: Log) -> bool:
         Whether more than 2 % of 200 rows of positions and torques spread over the first are in
         the second; windows that meet share their common row, which counts for nothing.
     """
-    every = sampled_every(len(one.t))
-    return is_shared(rows_in(np.hstack([one.q, one.tau])[::every], other))
+    rows, others = (np.hstack([log.q, log.tau]) for log in (one, other))
+    return is_shared(rows_in(rows[:: sampled_every(len(rows))], others))
 
 
 def sampled_every(rows: int) -> int:
@@ -165,21 +165,20 @@ def sampled_every(rows: int) -> int:
     return max(1, rows // 200)
 
 
-def rows_in(sampled: Array, log: Log) -> Array:
-    """Return which rows are in a log.
+def rows_in(sampled: Array, rows: Array) -> Array:
+    """Return which rows of positions and torques are among others.
 
     Args:
-        sampled: Positions and torques of m rows, shape (m, 2 n).
-        log: The log.
+        sampled: The rows, shape (m, 2 n).
+        rows: The others, shape (N, 2 n).
 
     Returns:
         Flags, shape (m,), bool.
     """
-    found = np.isin(sampled[:, 0], log.q[:, 0])
-    likely = np.isin(log.q[:, 0], sampled[found, 0])
-    rows = np.hstack([log.q[likely], log.tau[likely]])
+    found = np.isin(sampled[:, 0], rows[:, 0])
+    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
     for k in np.flatnonzero(found):
-        found[k] = (rows == sampled[k]).all(axis=1).any()
+        found[k] = (likely == sampled[k]).all(axis=1).any()
     return found
 
 

@@ -13,9 +13,11 @@ import numpy as np
 from robotid._typing import Array
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
-from robotid.exceptions import ModelError
-from robotid.identification import Identification, identify
+from robotid.exceptions import DataError, ModelError
+from robotid.identification import Identification, conclude, identify, structural_mapping
 from robotid.job import Job, LogEntry, job_from_settings
+from robotid.long_jobs import is_long, survey_logs
+from robotid.long_recordings import LongRecordings, evaluate_long
 from robotid.metrics import Metrics
 from robotid.model import RobotModel
 from robotid.report import write_report
@@ -55,16 +57,10 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
         SettingsError: If a setting does not fit.
     """
     model = job.model()
-    logs = [job.read(entry, model) for entry in job.identification]
-    kept = [job.read(entry, model) for entry in job.validation]
-    findings = [*_locked_findings(job, model), *_log_findings([*logs, *kept])]
-    diagnosis = diagnose(model, logs, kept, job.signals)
-    alarms = tuple(finding.message for finding in alarming(diagnosis, job.ignore))
-    findings += [finding for finding in diagnosis if finding.severity != "note"]
-    identification = identify(
-        model, logs, validation=kept, signals=job.signals, estimator=job.estimator
-    )
-    identification = replace(identification, alarms=alarms)
+    if is_long(job, (*job.identification, *job.validation)):
+        identification, findings = _identify_long(job, model)
+    else:
+        identification, findings = _identify(job, model)
     findings += _fit_findings(identification)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
@@ -85,6 +81,50 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
     finally:
         shutil.rmtree(partial)
     return identification, result
+
+
+def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding]]:
+    """Identify from logs in memory."""
+    logs = [job.read(entry, model) for entry in job.identification]
+    kept = [job.read(entry, model) for entry in job.validation]
+    diagnosis = diagnose(model, logs, kept, job.signals)
+    alarms = alarming(diagnosis, job.ignore)
+    identification = identify(
+        model, logs, validation=kept, signals=job.signals, estimator=job.estimator
+    )
+    return _with_alarms(job, model, identification, [*logs, *kept], diagnosis, alarms)
+
+
+def _identify_long(job: Job, model: RobotModel) -> tuple[Identification, list[Finding]]:
+    """Identify from logs that are read in pieces."""
+    mapping = structural_mapping(model)
+    logs = survey_logs(job, job.identification, model, mapping)
+    kept = survey_logs(job, job.validation, model, mapping)
+    if not logs:
+        raise DataError("no log was given; at least one is needed to identify anything")
+    fitted_looks, kept_looks = (
+        [look for log in some for look in log.looks] for some in (logs, kept)
+    )
+    diagnosis = diagnose(model, fitted_looks, kept_looks, job.signals)
+    alarms = alarming(diagnosis, job.ignore)
+    identification = conclude(model, LongRecordings(model, logs, kept), job.estimator)
+    heads = [log.head for log in (*logs, *kept)]
+    return _with_alarms(job, model, identification, heads, diagnosis, alarms)
+
+
+def _with_alarms(
+    job: Job,
+    model: RobotModel,
+    identification: Identification,
+    logs: Sequence[Log],
+    diagnosis: Sequence[Finding],
+    alarms: Sequence[Finding],
+) -> tuple[Identification, list[Finding]]:
+    """Return the identification with its alarms, and what is worth a word so far."""
+    findings = [*_locked_findings(job, model), *_log_findings(logs)]
+    findings += [finding for finding in diagnosis if finding.severity != "note"]
+    messages = tuple(finding.message for finding in alarms)
+    return replace(identification, alarms=messages), findings
 
 
 def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
@@ -115,10 +155,13 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     else:
         model, pi = source, _stated_parameters(result, source)
     prior = source.standard_parameters()
-    evaluations = []
-    for log in logs:
-        recording = prepare(model, job.read(LogEntry(Path(log)), model), job.signals)
-        evaluations.append(evaluate(model, recording, {"estimate": pi}, prior))
+    entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
+    if is_long(job, entries):
+        surveyed = survey_logs(job, entries, model, structural_mapping(model))
+        evaluations = [evaluate_long(log, parameters, prior) for log in surveyed]
+    else:
+        recordings = [prepare(model, job.read(entry, model), job.signals) for entry in entries]
+        evaluations = [evaluate(model, r, parameters, prior) for r in recordings]
     verdict = judge(
         Metrics({}, 0.0),
         {e.recording.name: e.metrics["estimate"] for e in evaluations},

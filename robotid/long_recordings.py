@@ -1,0 +1,280 @@
+"""Identification from logs larger than memory: one pass over the pieces reduces, one evaluates."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import chain
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.base_parameters import BaseMapping
+from robotid.data import Trajectory
+from robotid.long_logs import LogPiece, LongLog
+from robotid.metrics import TorqueSums
+from robotid.model import RobotModel
+from robotid.pieces import Piece, Reduction, reduce_in_turn
+from robotid.problem import Block, Problem
+from robotid.recordings import Recordings, base_problem, independent_share
+from robotid.signals import turns_note
+from robotid.smoothing import too_short
+from robotid.validation import (
+    Evaluation,
+    Extent,
+    Recording,
+    conclude_sums,
+    is_shared,
+    predict_all,
+    rows_in,
+    sampled_every,
+    torque_sums,
+)
+
+__all__ = ["LongRecordings", "evaluate_long"]
+
+_SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
+
+Reducer = Callable[[Sequence[Piece]], Sequence[Reduction]]
+
+
+@dataclass(frozen=True, eq=False)
+class LongRecordings(Recordings):
+    """Logs that are read in pieces, as often as needed.
+
+    Attributes:
+        model: The robot.
+        fitted: Logs to fit.
+        kept: Logs kept apart.
+        reducer: Reduces pieces, in order.
+    """
+
+    model: RobotModel
+    fitted: Sequence[LongLog]
+    kept: Sequence[LongLog]
+    reducer: Reducer = reduce_in_turn
+
+    @property
+    def share(self) -> float:
+        """See :attr:`robotid.recordings.Recordings.share`."""
+        return min(independent_share(log.header.signals) for log in self.fitted)
+
+    def reduce(self, mapping: BaseMapping) -> tuple[Reduction, ...]:
+        """See :meth:`robotid.recordings.Recordings.reduce`.
+
+        Args:
+            mapping: Standard to base parameters; that which the logs were surveyed with.
+
+        Returns:
+            One reduction per piece.
+
+        Raises:
+            DataError: If a row cannot be used, or no stretch of a log is long enough.
+        """
+        found = iter(self.reducer([piece for log in self.fitted for piece in log.pieces]))
+        reductions = []
+        for log in self.fitted:
+            own = [next(found) for _ in log.pieces]
+            if not any(reduction.samples for reduction in own):
+                raise too_short(log.path, len(log.stretches), log.header.signals)
+            reductions += own
+        return tuple(reductions)
+
+    def problem(self, mapping: BaseMapping, *, with_mass: bool = False) -> Problem:
+        """See :meth:`robotid.recordings.Recordings.problem`.
+
+        Args:
+            mapping: Standard to base parameters.
+            with_mass: Whether each sample also carries the regressor of its mass matrix.
+
+        Returns:
+            The base problem, in blocks only: each pass reads the logs anew.
+        """
+
+        def problems() -> Iterator[Problem]:
+            for piece in (piece for log in self.fitted for piece in log.pieces):
+                _, motion, _ = piece.read()
+                yield base_problem(
+                    self.model, mapping, motion, piece.mask(motion), with_mass=with_mass
+                )
+
+        def stream() -> Iterator[Block]:
+            return chain.from_iterable(problem.blocks() for problem in problems())
+
+        def mass_stream() -> Iterator[Array]:
+            for problem in problems():
+                yield from problem.mass_stream() if problem.mass_stream is not None else ()
+
+        return Problem(
+            stream,
+            mapping.base_names,
+            self.model.n_rows,
+            self.model.support()[:, mapping.independent],
+            mass_stream if with_mass else None,
+        )
+
+    def evaluate(
+        self, parameters: Mapping[str, Array], prior: Array
+    ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
+        """See :meth:`robotid.recordings.Recordings.evaluate`.
+
+        Args:
+            parameters: Standard parameters by name, each of shape (p,).
+            prior: Those of the URDF, shape (p,).
+
+        Returns:
+            Evaluations of the fitted logs, and of those kept apart.
+
+        Raises:
+            DataError: If no row of a log is used.
+        """
+        kept = [_score_log(log, parameters, prior) for log in self.kept]
+        sampled = [score.sampled for score in kept]
+        fitted = [_score_log(log, parameters, prior, sampled) for log in self.fitted]
+        again = [any(is_shared(score.found[k]) for score in fitted) for k in range(len(kept))]
+        return (
+            tuple(_conclude(*x) for x in zip(self.fitted, fitted, strict=True)),
+            tuple(
+                _conclude(log, score, is_refitted=is_refitted)
+                for log, score, is_refitted in zip(self.kept, kept, again, strict=True)
+            ),
+        )
+
+
+def evaluate_long(log: LongLog, parameters: Mapping[str, Array], prior: Array) -> Evaluation:
+    """Return how well parameters predict a log, piece by piece.
+
+    Args:
+        log: The log, surveyed with the model that predicts.
+        parameters: Standard parameters by name, each of shape (p,).
+        prior: Those of the URDF, shape (p,).
+
+    Returns:
+        The evaluation; the torques are those of the stretches that are kept for plots.
+
+    Raises:
+        DataError: If no row of the log is used.
+    """
+    return _conclude(log, _score_log(log, parameters, prior))
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """What is known of a log, or of its pieces so far.
+
+    Attributes:
+        sums: What the metrics are made of, by name of the parameters.
+        smooth: Samples.
+        used: Torque rows used.
+        segments: Numbers of the stretches that have samples.
+        turned: Joints whose full turns were taken out, shape (n,), bool.
+        shown: Motion, rows used and torques of a few stretches.
+        sampled: Raw rows spread over the log, shape (m, 2 n).
+        found: Which of the sampled rows of other logs are in this one, one array for each log.
+    """
+
+    sums: Mapping[str, TorqueSums]
+    smooth: int
+    used: int
+    segments: frozenset[int]
+    turned: Array
+    shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...]
+    sampled: Array
+    found: tuple[Array, ...]
+
+    def join(self, other: "_Score") -> "_Score":
+        """Return what is known with the pieces that follow."""
+        return _Score(
+            sums={name: x.merge(other.sums[name]) for name, x in self.sums.items()},
+            smooth=self.smooth + other.smooth,
+            used=self.used + other.used,
+            segments=self.segments | other.segments,
+            turned=self.turned | other.turned,
+            shown=self.shown + other.shown,
+            sampled=np.concatenate([self.sampled, other.sampled]),
+            found=tuple(one | two for one, two in zip(self.found, other.found, strict=True)),
+        )
+
+
+def _score_log(
+    log: LongLog,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    sought: Sequence[Array] = (),
+) -> _Score:
+    """Return what is known of a log."""
+    last = len(log.pieces) - 1
+    parts = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
+    return reduce(
+        _Score.join,
+        (
+            _score(piece, parameters, prior, sought, log, parts.get(k))
+            for k, piece in enumerate(log.pieces)
+        ),
+    )
+
+
+def _score(
+    piece: LogPiece,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    sought: Sequence[Array],
+    log: LongLog,
+    part: slice | None,
+) -> _Score:
+    """Return what is known of a piece, with the torques of a part of it."""
+    raw, motion, turned = piece.read()
+    model, mask = piece.header.model, piece.mask(motion)
+    names = [*parameters, "urdf", "gravity_only"]
+    torques = {name: np.empty((0, model.n_rows)) for name in names}
+    if len(motion.t):
+        torques = predict_all(model, motion, parameters, prior)
+    shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...] = ()
+    if part is not None and len(motion.t):
+        arrays = {key: getattr(motion, key)[part] for key in ("t", "q", "v", "a", "tau", "segment")}
+        kept = {name: torque[part] for name, torque in torques.items()}
+        shown = ((replace(motion, **arrays), mask[part], kept),)
+    every = sampled_every(log.stop - log.first)
+    rows = slice((log.first - piece.first) % every, None, every)
+    return _Score(
+        sums=torque_sums(motion, mask, torques, list(parameters)),
+        smooth=len(motion.t),
+        used=int(mask.sum()),
+        segments=frozenset(np.unique(motion.segment).tolist()),
+        turned=turned,
+        shown=shown,
+        sampled=raw[rows],
+        found=tuple(rows_in(sampled, raw) for sampled in sought),
+    )
+
+
+def _conclude(log: LongLog, score: _Score, *, is_refitted: bool = False) -> Evaluation:
+    """Return the evaluation of a log."""
+    header = log.header
+    if not score.smooth:
+        raise too_short(log.path, len(log.stretches), header.signals)
+    motions, masks, torques = zip(*score.shown, strict=True)
+    segments, number = [], 0
+    for motion in motions:  # what is shown never joins what is not beside it
+        segments.append(motion.segment - motion.segment[0] + number)
+        number = int(segments[-1][-1]) + 1
+    joined = {
+        key: np.concatenate([getattr(motion, key) for motion in motions])
+        for key in ("t", "q", "v", "a", "tau")
+    }
+    trajectory = replace(motions[0], **joined, segment=np.concatenate(segments))
+    extent = Extent(
+        samples=log.stop - log.first,
+        rate=1.0 / log.step,
+        start=log.start,
+        end=log.end,
+        smooth=score.smooth,
+        rows_used=score.used,
+        segments=len(score.segments),
+    )
+    names = [log.head.joints[j] for j in np.flatnonzero(score.turned)]
+    head = log.head
+    if names:
+        head = replace(head, notes=(*head.notes, turns_note(names)))
+    recording = Recording(head, header.signals, trajectory, np.concatenate(masks), extent)
+    predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
+    return conclude_sums(header.model, recording, predicted, score.sums, is_refitted=is_refitted)
