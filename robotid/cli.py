@@ -171,9 +171,14 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
+    from robotid.work_plan import WorkPlan
     from robotid.workflow import run_job
 
-    _, result = run_job(job_from_flags(options), options.out)
+    job = job_from_flags(options)
+    workers = job.workers if options.workers is None else options.workers
+    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+        plan = WorkPlan(workers, options.scheduler, options.resume, progress)
+        _, result = run_job(job, options.out, plan=plan)
     if options.json:
         print(json.dumps(result, allow_nan=False))
         return

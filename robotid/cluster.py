@@ -1,27 +1,22 @@
 """Work on pieces by the workers of a Dask cluster."""
 
 import logging
-import platform
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from robotid import __version__
 from robotid.exceptions import MissingDependencyError, WorkerError
-from robotid.pieces import Piece
 from robotid.reduction import Backend
-from robotid.task import Outcome, Work, run_task
+from robotid.task import Outcome, Work, Workload, run_task, versions
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
 __all__ = ["ClusterBackend"]
-
-_NUMERICS = ("numpy", "scipy", "pin", "numba")  # what the last bits come from
 
 _log = logging.getLogger(__name__)
 
@@ -46,7 +41,7 @@ class ClusterBackend(Backend):
         """What messages call it."""
         return f"the Dask cluster {self.address}, one BLAS thread per piece"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
         """Work on pieces, at most two per thread of the cluster under way.
 
         Args:
@@ -92,13 +87,13 @@ class ClusterBackend(Backend):
         return client
 
     def _collect(
-        self, client: "Client", work: Work, pieces: Sequence[tuple[int, Piece]]
+        self, client: "Client", work: Work, pieces: Sequence[tuple[int, Workload]]
     ) -> Iterator[tuple[int, Any]]:
         from distributed import CancelledError, KilledWorker, as_completed
 
         waiting, level = iter(pieces), _log.getEffectiveLevel()
         run = uuid4().hex
-        running: dict[object, tuple[int, Piece, Future[Any]]] = {}
+        running: dict[object, tuple[int, Workload, Future[Any]]] = {}
         results = as_completed(loop=client.loop)
         try:
             while True:
@@ -137,7 +132,7 @@ class ClusterBackend(Backend):
                 client.cancel([future for _, _, future in running.values()])
 
 
-def _run(work: Work, piece: Piece, level: int, wanted: str) -> Outcome:
+def _run(work: Work, piece: Workload, level: int, wanted: str) -> Outcome:
     """Work on a piece on a worker, and say on an error which host met it."""
     if __version__ != wanted:  # a worker that joined after the start
         raise WorkerError(_wrong_version({socket.gethostname(): __version__}, wanted))
@@ -152,20 +147,12 @@ def _run(work: Work, piece: Piece, level: int, wanted: str) -> Outcome:
 
 
 def _about() -> dict[str, str]:
-    """Return the versions on a machine that decide what a reduction is."""
-    found = {"host": socket.gethostname(), "robotid": __version__}
-    found["python"] = platform.python_version()
-    for name in _NUMERICS:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
+    return {"host": socket.gethostname(), **versions()}
 
 
 def _require_same_version(address: str, client: "Client") -> None:
     """Refuse workers with another robotid; warn of those whose last bits may differ."""
-    here = _about()
+    here = versions()
     workers: Mapping[str, Any] = client.run(_about, on_error="return")
     broken = {name: about for name, about in workers.items() if isinstance(about, BaseException)}
     if broken:
@@ -182,7 +169,7 @@ def _require_same_version(address: str, client: "Client") -> None:
     if others:
         raise WorkerError(_wrong_version(others, __version__))
     for name, about in workers.items():
-        differs = [key for key in ("python", *_NUMERICS) if about[key] != here[key]]
+        differs = [key for key in here if about[key] != here[key]]
         if differs:
             found = ", ".join(f"{key} {about[key]} (here {here[key]})" for key in differs)
             _log.warning(

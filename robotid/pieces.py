@@ -16,7 +16,7 @@ from robotid.exceptions import DataError
 from robotid.factors import Factors, compress, merge
 from robotid.problem import Problem
 
-__all__ = ["Piece", "Reduction", "join", "reduce_in_turn"]
+__all__ = ["Piece", "Reduction", "join"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,21 +124,6 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
     while len(level) > 1:
         level = [_join_neighbours(level[k : k + 2]) for k in range(0, len(level), 2)]
     return level[0]
-
-
-def reduce_in_turn(pieces: Sequence[Piece]) -> tuple[Reduction, ...]:
-    """Reduce pieces one after the other.
-
-    Args:
-        pieces: The pieces.
-
-    Returns:
-        One reduction per piece, in order; :func:`join` gives the whole.
-
-    Raises:
-        DataError: If a row cannot be used.
-    """
-    return tuple(piece.reduce() for piece in pieces)
 
 
 def _join_neighbours(reductions: Sequence[Reduction]) -> Reduction:

@@ -27,7 +27,7 @@ from robotid.exceptions import SettingsError, WorkerError
 from robotid.factors import available_cores
 from robotid.pieces import Piece, Reduction
 from robotid.progress import ProgressCallback, ignore_progress
-from robotid.task import Outcome, Work, reduce_piece, run_task
+from robotid.task import Outcome, Work, Workload, reduce_piece, run_task
 
 __all__ = [
     "Backend",
@@ -52,7 +52,7 @@ class Backend(ABC):
         """What messages call it, as ``2 worker processes``."""
 
     @abstractmethod
-    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
         """Do the same with each of some pieces; closing the iterator ends it.
 
         Args:
@@ -76,7 +76,7 @@ class SerialBackend(Backend):
         """What messages call it."""
         return "this process"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
         """Work on pieces; see :meth:`Backend.run`.
 
         Args:
@@ -113,7 +113,7 @@ class ProcessBackend(Backend):
         """What messages call it."""
         return f"{self.workers} worker processes, one BLAS thread each"
 
-    def run(self, work: Work, pieces: Sequence[tuple[int, Piece]]) -> Iterator[tuple[int, Any]]:
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
         """Work on pieces, at most two per worker under way; see :meth:`Backend.run`.
 
         Args:
@@ -180,7 +180,7 @@ def reduce_pieces(
 
 def map_pieces(
     work: Work,
-    pieces: Sequence[Piece],
+    pieces: Sequence[Workload],
     what: str,
     *,
     backend: Backend | None = None,
@@ -226,7 +226,7 @@ def map_pieces(
     return tuple(results[k] for k in range(len(pieces)))
 
 
-def choose_workers(pieces: Sequence[Piece], workers: int | None = None) -> int:
+def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
     """Return how many worker processes to use.
 
     Args:
@@ -249,11 +249,11 @@ def choose_workers(pieces: Sequence[Piece], workers: int | None = None) -> int:
 
 
 def _collect(
-    pool: ProcessPoolExecutor, work: Work, pieces: Iterable[tuple[int, Piece]], most: int
+    pool: ProcessPoolExecutor, work: Work, pieces: Iterable[tuple[int, Workload]], most: int
 ) -> Iterator[tuple[int, Any]]:
     """Yield what the workers return, with at most so many pieces under way."""
     waiting, level = iter(pieces), _log.getEffectiveLevel()
-    running: dict[Future[Outcome], tuple[int, Piece]] = {}
+    running: dict[Future[Outcome], tuple[int, Workload]] = {}
     try:
         while True:
             for index, piece in islice(waiting, most - len(running)):
@@ -283,7 +283,7 @@ def _keep(
 
 
 @contextmanager
-def _named(piece: Piece) -> Iterator[None]:
+def _named(piece: Workload) -> Iterator[None]:
     """Note on an error which piece it met."""
     try:
         yield

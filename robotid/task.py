@@ -1,15 +1,31 @@
 """What a worker does with one piece, in whichever process or on whichever machine it runs."""
 
 import logging
+import platform
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Protocol, TypeAlias
 
 from threadpoolctl import threadpool_limits
 
+from robotid import __version__
 from robotid.pieces import Piece, Reduction
 
-__all__ = ["Outcome", "Work", "reduce_piece", "run_task"]
+__all__ = ["Outcome", "Work", "Workload", "reduce_piece", "run_task", "versions"]
+
+
+class Workload(Protocol):
+    """Something to work on, as a piece of a log; can be pickled."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    @property
+    def samples(self) -> int:
+        """About how many samples it has, for progress."""
+
 
 #: What is done with a piece, given the number of threads or None for any; can be pickled.
 Work: TypeAlias = Callable[[Any, int | None], Any]
@@ -60,7 +76,7 @@ def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
     return piece.reduce(threads=threads)
 
 
-def run_task(work: Work, piece: Piece, level: int) -> Outcome:
+def run_task(work: Work, piece: Workload, level: int) -> Outcome:
     """Work on a piece with one thread, and keep what is logged.
 
     Args:
@@ -85,3 +101,18 @@ def run_task(work: Work, piece: Piece, level: int) -> Outcome:
         logger.removeHandler(memory)
         logger.setLevel(before)
     return Outcome(result, tuple(memory.messages))
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide what work on a piece gives, to the last bit.
+
+    Returns:
+        Version by name of the package; "none" if it is not installed.
+    """
+    found = {"robotid": __version__, "python": platform.python_version()}
+    for name in ("numpy", "scipy", "pin", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "none"
+    return found

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from robotid.checkpoint import Checkpoint
 from robotid.cluster import ClusterBackend
+from robotid.exceptions import SettingsError
 from robotid.pieces import Piece, Reduction
 from robotid.progress import ProgressCallback
 from robotid.reduction import (
@@ -17,9 +17,9 @@ from robotid.reduction import (
     map_pieces,
     reduce_pieces,
 )
-from robotid.task import Work
+from robotid.task import Work, Workload
 
-__all__ = ["WorkPlan", "file_identity"]
+__all__ = ["WorkPlan"]
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,16 @@ class WorkPlan:
     resume: bool = False
     progress: ProgressCallback | None = None
 
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise SettingsError(f"workers is {self.workers}, wanted at least 1")
+
     @property
     def is_asked_for(self) -> bool:
         """Whether anything but the default was asked for, which short logs have no use of."""
         return self.resume or self.scheduler is not None or (self.workers or 1) > 1
 
-    def backend(self, pieces: Sequence[Piece]) -> Backend:
+    def backend(self, pieces: Sequence[Workload]) -> Backend:
         """Return what works on pieces.
 
         Args:
@@ -80,7 +84,7 @@ class WorkPlan:
             pieces, backend=self.backend(pieces), checkpoint=checkpoint, progress=self.progress
         )
 
-    def map(self, work: Work, pieces: Sequence[Piece], what: str) -> tuple[Any, ...]:
+    def map(self, work: Work, pieces: Sequence[Workload], what: str) -> tuple[Any, ...]:
         """Do the same with every piece; see :func:`robotid.reduction.map_pieces`.
 
         Args:
@@ -96,23 +100,3 @@ class WorkPlan:
             WorkerError: If a worker ends before its work.
         """
         return map_pieces(work, pieces, what, backend=self.backend(pieces), progress=self.progress)
-
-
-def file_identity(path: str | Path) -> dict[str, Any]:
-    """Return what tells a file, or a folder of files, from others and from what it was before.
-
-    Args:
-        path: The file, or a folder as of a bag.
-
-    Returns:
-        Paths, sizes [bytes] and times of change [ns].
-
-    Raises:
-        OSError: If it does not exist.
-    """
-    whole = Path(path).resolve()
-    files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
-    return {
-        str(file): {"size": (about := file.stat()).st_size, "changed": about.st_mtime_ns}
-        for file in files
-    }

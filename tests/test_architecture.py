@@ -28,7 +28,7 @@ FLOORS = {
     7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs work_plan",
     8: "online report_page result inspection paper_errata long_recordings long_jobs",
-    9: "doctor report_tables paper_plots paper_page tracking",
+    9: "doctor report_tables paper_plots paper_page tracking checkpoint_inputs",
     10: "report paper",
     11: "workflow",
     12: "demo flags",
