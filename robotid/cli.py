@@ -2,12 +2,19 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 from robotid import __version__
-from robotid.console import print_files, print_inspection, print_result, print_table, print_verdict
+from robotid.console import (
+    print_error,
+    print_files,
+    print_inspection,
+    print_result,
+    print_table,
+    print_verdict,
+    shown_log,
+)
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.flags import (
     add_job_flags,
@@ -16,6 +23,8 @@ from robotid.flags import (
     job_from_flags,
     source_settings,
 )
+from robotid.progress import terminal_progress
+from robotid.work_flags import add_progress_flags, add_verbose_flag, add_work_flags
 
 __all__ = ["main"]
 
@@ -27,17 +36,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The words after ``robotid``; those of the process if None.
 
     Returns:
-        Exit code: 0 done, 1 the data or the model do not allow it, 2 wrong usage.
+        Exit code: 0 done, 1 the data or the model do not allow it, 2 wrong usage, 130 Ctrl-C.
     """
     options = _parser().parse_args(arguments)
     try:
-        options.run(options)
+        with shown_log(is_verbose=getattr(options, "verbose", False)):
+            options.run(options)
     except SettingsError as error:
-        print(f"robotid: {error}", file=sys.stderr)
+        print_error(error)
         return 2
     except (RobotIdError, OSError) as error:
-        print(f"robotid: {error}", file=sys.stderr)
+        print_error(error)
         return 1
+    except KeyboardInterrupt as error:
+        print_error(error, "interrupted")
+        return 130
     return 0
 
 
@@ -58,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--out", default="robotid-paper", metavar="DIR", help="folder to write to")
     paper.add_argument("--json", action="store_true", help="print paper.json")
     paper.add_argument("--quick", action="store_true", help="few iterations and motions: a try-out")
+    add_progress_flags(paper)
     paper.set_defaults(run=_paper)
 
     inspect = commands.add_parser("inspect", help="joints, parameters and faults of a URDF")
@@ -74,6 +88,9 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("--out", default="robotid-out", metavar="DIR", help="folder to write to")
     identify.add_argument("--json", action="store_true", help="print result.json")
     add_job_flags(identify)
+    add_work_flags(identify)
+    add_progress_flags(identify)
+    add_verbose_flag(identify)
     identify.set_defaults(run=_identify)
 
     track = commands.add_parser("track", help="run over a log as if live: history, step changes")
@@ -82,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--out", default="robotid-track", metavar="DIR", help="folder to write to")
     track.add_argument("--json", action="store_true", help="print track.json")
     add_log_flags(track.add_argument_group("the log"))
+    add_verbose_flag(track)
     track.set_defaults(run=_track, validate=[], estimator=None)
 
     doctor = commands.add_parser(
@@ -91,6 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     doctor.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
     add_job_flags(doctor)
+    add_verbose_flag(doctor)
     doctor.set_defaults(run=_doctor)
 
     validate = commands.add_parser("validate", help="measure a result's prediction on other logs")
@@ -128,20 +147,13 @@ def _paper(options: argparse.Namespace) -> None:
     from robotid.paper_simulation import PaperSettings
 
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
-    progress = _overwrite if sys.stderr.isatty() else None
-    result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
-    if progress is not None:
-        _overwrite("")
+    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+        result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
     if options.json:
         print(json.dumps(result, allow_nan=False))
         return
     _print_paper(result)
     print(f"\nwritten to {options.out}: paper.html, paper.json, figures as PNG and SVG")
-
-
-def _overwrite(line: str) -> None:
-    """Show a line of progress in place of the one before."""
-    print(f"\r{line:72}", end="" if line else "\r", file=sys.stderr, flush=True)
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -159,9 +171,14 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
+    from robotid.work_plan import WorkPlan
     from robotid.workflow import run_job
 
-    _, result = run_job(job_from_flags(options), options.out)
+    job = job_from_flags(options)
+    workers = job.workers if options.workers is None else options.workers
+    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+        plan = WorkPlan(workers, options.scheduler, options.resume, progress)
+        _, result = run_job(job, options.out, plan=plan)
     if options.json:
         print(json.dumps(result, allow_nan=False))
         return

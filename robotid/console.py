@@ -1,10 +1,67 @@
 """Results as text on a terminal."""
 
-from collections.abc import Sequence
+import logging
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["print_files", "print_inspection", "print_result", "print_table", "print_verdict"]
+__all__ = [
+    "print_error",
+    "print_files",
+    "print_inspection",
+    "print_result",
+    "print_table",
+    "print_verdict",
+    "shown_log",
+]
+
+
+def print_error(error: BaseException, words: str = "") -> None:
+    """Print an error in one line on the standard error stream, with what was noted on its way.
+
+    Args:
+        error: The error.
+        words: What to say of it, if it does not say so itself.
+    """
+    notes = getattr(error, "__notes__", ())
+    print("robotid:", "; ".join([words or str(error), *notes]), file=sys.stderr)
+
+
+@contextmanager
+def shown_log(*, is_verbose: bool) -> Iterator[None]:
+    """Show warnings of the logger "robotid" on the standard error stream while the context lasts.
+
+    Args:
+        is_verbose: Whether to show what is merely worth knowing, too.
+
+    Yields:
+        Nothing.
+    """
+    logger, handler = logging.getLogger("robotid"), _EachOnce()
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO if is_verbose else logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
+class _EachOnce(logging.Handler):
+    """Prints a message where the standard error stream then is, but not again what it said."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if text not in self._said:
+            self._said.add(text)
+            print(f"robotid: {text}", file=sys.stderr)
 
 
 def print_result(result: dict[str, Any]) -> None:

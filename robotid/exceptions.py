@@ -1,6 +1,7 @@
 """The errors of the package: each keeps its facts as attributes and says what to do next."""
 
 from collections.abc import Sequence
+from typing import Any
 
 __all__ = [
     "DataError",
@@ -10,11 +11,15 @@ __all__ = [
     "RankDeficientError",
     "RobotIdError",
     "SettingsError",
+    "WorkerError",
 ]
 
 
 class RobotIdError(Exception):
-    """Base class of all errors that robotid raises on purpose."""
+    """Base class of all errors that robotid raises on purpose; they travel between processes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore, (type(self), self.args, vars(self))
 
 
 class ModelError(RobotIdError, ValueError):
@@ -67,6 +72,10 @@ class NotConvergedError(RobotIdError):
         super().__init__(f"{message} (status: {status})")
 
 
+class WorkerError(RobotIdError):
+    """A worker process or a cluster could not do its part."""
+
+
 class MissingDependencyError(RobotIdError, ImportError):
     """An optional package is not installed.
 
@@ -79,3 +88,12 @@ class MissingDependencyError(RobotIdError, ImportError):
         super().__init__(
             f"{purpose} needs {package}, which is not installed: pip install robotid[{extra}]"
         )
+
+
+def _restore(
+    kind: type[RobotIdError], args: tuple[Any, ...], facts: dict[str, Any]
+) -> RobotIdError:
+    """Return an error as it was, without the arguments that its message was made of."""
+    error = kind.__new__(kind, *args)
+    vars(error).update(facts)
+    return error

@@ -20,7 +20,7 @@ from robotid.exceptions import DataError
 from robotid.lapack import Triangle
 from robotid.problem import Problem, RowSource
 
-__all__ = ["Factors", "compress", "compress_stretches", "gather", "merge"]
+__all__ = ["Factors", "available_cores", "compress", "compress_stretches", "gather", "merge"]
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -207,7 +207,7 @@ def compress_stretches(
         for start in range(0, source.samples, length)
     ]
     is_parallel = all(source.is_parallel for source in problem.sources)
-    workers = (_cores() if is_parallel else 1) if threads is None else threads
+    workers = (available_cores() if is_parallel else 1) if threads is None else threads
     if min(workers, len(parts)) <= 1:
         return tuple(_compress(part, 1) for part in parts)
     with ThreadPoolExecutor(min(workers, len(parts))) as pool:
@@ -260,6 +260,13 @@ def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
     """
     edges = np.linspace(0, len(stretches), min(count, len(stretches)) + 1).round().astype(int)
     return tuple(merge(stretches[i:j]) for i, j in pairwise(edges))
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _compress(problem: Problem, threads: int | None) -> Factors:
@@ -326,7 +333,7 @@ def _fold_sources(
 def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
     """Yield the factors of each part of a source in order."""
     starts = range(0, source.samples, _PART)
-    workers = (_cores() if source.is_parallel else 1) if threads is None else threads
+    workers = (available_cores() if source.is_parallel else 1) if threads is None else threads
     if min(workers, len(starts)) <= 1:
         yield from (_fold_part(source, start) for start in starts)
         return
@@ -340,13 +347,6 @@ def _fold_part(source: RowSource, start: int) -> list[Array]:
         for triangle, rows in zip(triangles, block, strict=True):
             triangle.fold(rows)
     return [triangle.R for triangle in triangles]
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _triangle(rows: Array) -> Array:

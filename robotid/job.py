@@ -67,6 +67,7 @@ class Job:
         validation: Logs kept apart.
         ignore: Codes of the doctor's errors that the user knows better.
         rows_in_memory: Rows of all logs together above which they are read in pieces.
+        workers: Processes that work on the pieces; None for one per core where that is long.
     """
 
     urdf: Path
@@ -88,12 +89,15 @@ class Job:
     validation: tuple[LogEntry, ...] = ()
     ignore: tuple[str, ...] = ()
     rows_in_memory: int = 2**18
+    workers: int | None = None
 
     def __post_init__(self) -> None:
         if self.rows_in_memory < 1:
             raise SettingsError(
                 f"reduction: rows_in_memory is {self.rows_in_memory}, wanted a positive number"
             )
+        if self.workers is not None and self.workers < 1:
+            raise SettingsError(f"reduction: workers is {self.workers}, wanted at least 1")
 
     def model(self) -> RobotModel:
         """Return the robot.
@@ -201,7 +205,10 @@ class Job:
             "identification": [_entry_settings(entry) for entry in self.identification],
             "validation": [_entry_settings(entry) for entry in self.validation],
             "doctor": {"ignore": list(self.ignore)},
-            "reduction": {"rows_in_memory": self.rows_in_memory},
+            "reduction": {
+                "rows_in_memory": self.rows_in_memory,
+                **({"workers": self.workers} if self.workers is not None else {}),
+            },
         }
 
 
@@ -284,6 +291,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             dynamics=table.get("output", {}).get("dynamics", False),
             ignore=tuple(table.get("doctor", {}).get("ignore", ())),
             rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**18),
+            workers=table.get("reduction", {}).get("workers"),
             **entries,
         )
     except SettingsError as error:

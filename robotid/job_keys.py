@@ -64,7 +64,7 @@ KEYS: dict[str, Any] = {
         "physical": bool,
     },
     "output": {"dynamics": bool},
-    "reduction": {"rows_in_memory": int},
+    "reduction": {"rows_in_memory": int, "workers": int},
     "identification": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
     "validation": [{"log": str, "start": _NUMBER, "end": _NUMBER}],
 }

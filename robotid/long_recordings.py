@@ -1,19 +1,20 @@
 """Identification from logs larger than memory: one pass over the pieces reduces, one evaluates."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import reduce
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
 from itertools import chain
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
+from robotid.checkpoint import Checkpoint
 from robotid.data import Trajectory
 from robotid.long_logs import LogPiece, LongLog
 from robotid.metrics import TorqueSums
 from robotid.model import RobotModel
-from robotid.pieces import Piece, Reduction, reduce_in_turn
+from robotid.pieces import Reduction
 from robotid.problem import Block, Problem
 from robotid.recordings import Recordings, base_problem, independent_share
 from robotid.signals import turns_note
@@ -29,12 +30,11 @@ from robotid.validation import (
     sampled_every,
     torque_sums,
 )
+from robotid.work_plan import WorkPlan
 
 __all__ = ["LongRecordings", "evaluate_long"]
 
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
-
-Reducer = Callable[[Sequence[Piece]], Sequence[Reduction]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,15 @@ class LongRecordings(Recordings):
         model: The robot.
         fitted: Logs to fit.
         kept: Logs kept apart.
-        reducer: Reduces pieces, in order.
+        plan: Who works on the pieces.
+        checkpoint: Where reductions are kept until the run is complete.
     """
 
     model: RobotModel
     fitted: Sequence[LongLog]
     kept: Sequence[LongLog]
-    reducer: Reducer = reduce_in_turn
+    plan: WorkPlan = field(default_factory=WorkPlan)
+    checkpoint: Checkpoint | None = None
 
     @property
     def share(self) -> float:
@@ -70,7 +72,8 @@ class LongRecordings(Recordings):
         Raises:
             DataError: If a row cannot be used, or no stretch of a log is long enough.
         """
-        found = iter(self.reducer([piece for log in self.fitted for piece in log.pieces]))
+        pieces = [piece for log in self.fitted for piece in log.pieces]
+        found = iter(self.plan.reduce(pieces, checkpoint=self.checkpoint))
         reductions = []
         for log in self.fitted:
             own = [next(found) for _ in log.pieces]
@@ -127,9 +130,9 @@ class LongRecordings(Recordings):
         Raises:
             DataError: If no row of a log is used.
         """
-        kept = [_score_log(log, parameters, prior) for log in self.kept]
+        kept = _score_logs(self.kept, parameters, prior, self.plan)
         sampled = [score.sampled for score in kept]
-        fitted = [_score_log(log, parameters, prior, sampled) for log in self.fitted]
+        fitted = _score_logs(self.fitted, parameters, prior, self.plan, sampled)
         again = [any(is_shared(score.found[k]) for score in fitted) for k in range(len(kept))]
         return (
             tuple(_conclude(*x) for x in zip(self.fitted, fitted, strict=True)),
@@ -140,13 +143,20 @@ class LongRecordings(Recordings):
         )
 
 
-def evaluate_long(log: LongLog, parameters: Mapping[str, Array], prior: Array) -> Evaluation:
+def evaluate_long(
+    log: LongLog,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    *,
+    plan: WorkPlan | None = None,
+) -> Evaluation:
     """Return how well parameters predict a log, piece by piece.
 
     Args:
         log: The log, surveyed with the model that predicts.
         parameters: Standard parameters by name, each of shape (p,).
         prior: Those of the URDF, shape (p,).
+        plan: Who works on the pieces; this process if None.
 
     Returns:
         The evaluation; the torques are those of the stretches that are kept for plots.
@@ -154,7 +164,8 @@ def evaluate_long(log: LongLog, parameters: Mapping[str, Array], prior: Array) -
     Raises:
         DataError: If no row of the log is used.
     """
-    return _conclude(log, _score_log(log, parameters, prior))
+    (score,) = _score_logs([log], parameters, prior, plan or WorkPlan())
+    return _conclude(log, score)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,33 +206,57 @@ class _Score:
         )
 
 
-def _score_log(
-    log: LongLog,
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A piece, and what is kept of it: raw rows spread over it, and a stretch for plots."""
+
+    piece: LogPiece
+    sampled: slice
+    shown: slice | None
+
+    @property
+    def name(self) -> str:
+        return self.piece.name
+
+    @property
+    def samples(self) -> int:
+        return self.piece.samples
+
+
+def _score_logs(
+    logs: Sequence[LongLog],
     parameters: Mapping[str, Array],
     prior: Array,
+    plan: WorkPlan,
     sought: Sequence[Array] = (),
-) -> _Score:
-    """Return what is known of a log."""
+) -> list[_Score]:
+    """Return what is known of each log."""
+    parts = [_parts(log) for log in logs]
+    work = partial(_score, parameters=parameters, prior=prior, sought=sought)
+    scores = iter(plan.map(work, list(chain.from_iterable(parts)), "evaluating"))
+    return [reduce(_Score.join, [next(scores) for _ in own]) for own in parts]
+
+
+def _parts(log: LongLog) -> list[_Part]:
     last = len(log.pieces) - 1
-    parts = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
-    return reduce(
-        _Score.join,
-        (
-            _score(piece, parameters, prior, sought, log, parts.get(k))
-            for k, piece in enumerate(log.pieces)
-        ),
-    )
+    shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
+    every = sampled_every(log.stop - log.first)
+    return [
+        _Part(piece, slice((log.first - piece.first) % every, None, every), shown.get(k))
+        for k, piece in enumerate(log.pieces)
+    ]
 
 
 def _score(
-    piece: LogPiece,
+    whole: _Part,
+    threads: int | None,
+    *,
     parameters: Mapping[str, Array],
     prior: Array,
     sought: Sequence[Array],
-    log: LongLog,
-    part: slice | None,
 ) -> _Score:
     """Return what is known of a piece, with the torques of a part of it."""
+    piece, part = whole.piece, whole.shown
     raw, motion, turned = piece.read()
     model, mask = piece.header.model, piece.mask(motion)
     names = [*parameters, "urdf", "gravity_only"]
@@ -233,8 +268,6 @@ def _score(
         arrays = {key: getattr(motion, key)[part] for key in ("t", "q", "v", "a", "tau", "segment")}
         kept = {name: torque[part] for name, torque in torques.items()}
         shown = ((replace(motion, **arrays), mask[part], kept),)
-    every = sampled_every(log.stop - log.first)
-    rows = slice((log.first - piece.first) % every, None, every)
     return _Score(
         sums=torque_sums(motion, mask, torques, list(parameters)),
         smooth=len(motion.t),
@@ -242,7 +275,7 @@ def _score(
         segments=frozenset(np.unique(motion.segment).tolist()),
         turned=turned,
         shown=shown,
-        sampled=raw[rows],
+        sampled=raw[whole.sampled],
         found=tuple(rows_in(sampled, raw) for sampled in sought),
     )
 

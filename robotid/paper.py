@@ -26,6 +26,7 @@ from robotid.paper_simulation import (
 )
 from robotid.paper_trajectories import RandomRuns, random_runs
 from robotid.procedure import LoopSettings
+from robotid.progress import ProgressCallback, ignore_progress
 from robotid.report_plots import STYLE, svg_element
 
 __all__ = ["run_paper"]
@@ -48,7 +49,7 @@ def run_paper(
     folder: str | Path,
     *,
     settings: PaperSettings | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
     """Run the paper's simulation with its three models, and write what it gives.
 
@@ -58,7 +59,7 @@ def run_paper(
         folder: Where to write paper.json, paper.html and the figures as PNG and SVG; made if it is
             missing.
         settings: How much is simulated; the defaults if None.
-        progress: Called with a line of text as the work goes on.
+        progress: Called with the part of the work, iterations done, at most, and their name.
 
     Returns:
         The content of paper.json.
@@ -67,30 +68,39 @@ def run_paper(
         Tzvetkova, section VI.
     """
     chosen = settings or PaperSettings()
-    say = progress or _be_quiet
+    report = progress or ignore_progress
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    studies = [study_model(name, chosen, progress=_counter(name, say)) for name in MODELS]
-    near = _trajectories(chosen, "beside", 0.05, chosen.patience, say)
-    exact = _trajectories(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), say)
+    studies = [
+        study_model(name, chosen, progress=_counter(name, chosen.iterations, report))
+        for name in MODELS
+    ]
+    near = _trajectories(chosen, "beside", 0.05, chosen.patience, report)
+    exact = _trajectories(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), report)
     drift = energy_drift()
     content = _content(chosen, studies, near, exact, drift)
-    say("drawing")
+    report("drawing", 0, 1, "pages")
     _write(target, content, _figures(studies, near, drift))
     return content
 
 
 def _trajectories(
-    settings: PaperSettings, where: str, reach: float, most: int, say: Callable[[str], None]
+    settings: PaperSettings, where: str, reach: float, most: int, report: ProgressCallback
 ) -> dict[str, RandomRuns]:
     """Return the random motions of each model; each model meets other ones."""
     found = {}
     for k, name in enumerate(MODELS):
         rng = np.random.default_rng([settings.seed, k, int(reach > 0)])
-        counter = _counter(f"{name}, {settings.runs} motions from {where} the program", say)
+        what = f"{name}, {settings.runs} motions from {where} the program"
         dynamics, P = paper_arm(name)
         found[name] = random_runs(
-            dynamics, P, settings.runs, most, rng, reach=reach, progress=counter
+            dynamics,
+            P,
+            settings.runs,
+            most,
+            rng,
+            reach=reach,
+            progress=_counter(what, most, report),
         )
     return found
 
@@ -215,9 +225,5 @@ def _write(target: Path, content: Mapping[str, Any], figures: Mapping[str, Any])
         shutil.rmtree(beside, ignore_errors=True)
 
 
-def _counter(what: str, say: Callable[[str], None]) -> Callable[[int], None]:
-    return lambda number: say(f"{what}: iteration {number}")
-
-
-def _be_quiet(_: str) -> None:
-    pass
+def _counter(what: str, most: int, report: ProgressCallback) -> Callable[[int], None]:
+    return lambda number: report(what, number, most, "iterations")

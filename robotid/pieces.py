@@ -16,7 +16,7 @@ from robotid.exceptions import DataError
 from robotid.factors import Factors, compress, merge
 from robotid.problem import Problem
 
-__all__ = ["Piece", "Reduction", "join", "reduce_in_turn"]
+__all__ = ["Piece", "Reduction", "join"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +114,8 @@ class Piece(ABC):
 def join(reductions: Sequence[Reduction]) -> Reduction:
     """Return what all the rows of several reductions come down to.
 
+    Neighbours are joined, then their neighbours, and so on: the order never depends on timing.
+
     Args:
         reductions: At least one; all with the same columns and joints.
 
@@ -125,23 +127,18 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
     """
     if not reductions:
         raise DataError("no reduction was given; at least one log is needed")
+    level = list(reductions)
+    while len(level) > 1:
+        level = [_join_neighbours(level[k : k + 2]) for k in range(0, len(level), 2)]
+    return level[0]
+
+
+def _join_neighbours(reductions: Sequence[Reduction]) -> Reduction:
+    """Return what one or two reductions come down to."""
+    if len(reductions) == 1:
+        return reductions[0]
     return Reduction(
         merge([r.factors for r in reductions]),
         np.sum([r.squares for r in reductions], axis=0),
         sum(r.samples for r in reductions),
     )
-
-
-def reduce_in_turn(pieces: Sequence[Piece]) -> tuple[Reduction, ...]:
-    """Reduce pieces one after the other.
-
-    Args:
-        pieces: The pieces.
-
-    Returns:
-        One reduction per piece, in order; :func:`join` gives the whole.
-
-    Raises:
-        DataError: If a row cannot be used.
-    """
-    return tuple(piece.reduce() for piece in pieces)

@@ -1,5 +1,6 @@
 """A job from its files to the folder of results; and validation of a result on other logs."""
 
+import logging
 import os
 import shutil
 import tempfile
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from robotid._typing import Array
+from robotid.checkpoint import Checkpoint
+from robotid.checkpoint_inputs import checkpoint_inputs
 from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
@@ -32,13 +35,18 @@ from robotid.sidecar import load_identified
 from robotid.urdf import write_urdf
 from robotid.validation import evaluate, prepare
 from robotid.verdict import Finding, judge
+from robotid.work_plan import WorkPlan
 
 __all__ = ["run_job", "validate_result"]
+
+_log = logging.getLogger(__name__)
 
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is worth a word
 
 
-def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any]]:
+def run_job(
+    job: Job, folder: str | Path, *, plan: WorkPlan | None = None
+) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     Every file is made in a folder of its own first and put in place when all are complete.
@@ -46,6 +54,7 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
     Args:
         job: What to do.
         folder: Where to write; made if it is missing.
+        plan: Who works on long logs; as the job says, in this process, if None.
 
     Returns:
         The identification and the content of result.json.
@@ -56,14 +65,22 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
         NotConvergedError: If a solver fails.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         SettingsError: If a setting does not fit.
+        WorkerError: If a worker ends before its work.
     """
-    model = job.model()
+    model, target = job.model(), Path(folder)
+    chosen = plan or WorkPlan(job.workers or 1)
+    checkpoint: Checkpoint | None = None
     if is_long(job, (*job.identification, *job.validation)):
-        identification, findings = _identify_long(job, model)
+        identification, findings, checkpoint = _identify_long(job, model, target, chosen)
     else:
+        if chosen.is_asked_for:
+            _log.warning(
+                "the logs have no more than %d rows and are read at once: workers, scheduler and "
+                "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
+                job.rows_in_memory,
+            )
         identification, findings = _identify(job, model)
     findings += _fit_findings(identification)
-    target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=".robotid-", dir=target))
     try:
@@ -81,6 +98,8 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
             os.replace(made, target / made.name)
     finally:
         shutil.rmtree(partial)
+    if checkpoint is not None:
+        checkpoint.remove()
     return identification, result
 
 
@@ -96,8 +115,10 @@ def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding
     return _with_alarms(job, model, identification, [*logs, *kept], diagnosis, alarms)
 
 
-def _identify_long(job: Job, model: RobotModel) -> tuple[Identification, list[Finding]]:
-    """Identify from logs that are read in pieces."""
+def _identify_long(
+    job: Job, model: RobotModel, folder: Path, plan: WorkPlan
+) -> tuple[Identification, list[Finding], Checkpoint]:
+    """Identify from logs that are read in pieces; finished ones are kept in the folder."""
     mapping = structural_mapping(model)
     logs = survey_logs(job, job.identification, model, mapping)
     kept = survey_logs(job, job.validation, model, mapping)
@@ -108,9 +129,12 @@ def _identify_long(job: Job, model: RobotModel) -> tuple[Identification, list[Fi
     )
     diagnosis = diagnose(model, fitted_looks, kept_looks, job.signals)
     alarms = alarming(diagnosis, job.ignore)
-    identification = conclude(model, LongRecordings(model, logs, kept), job.estimator)
+    pieces = [piece for log in logs for piece in log.pieces]
+    checkpoint = Checkpoint.open(folder, checkpoint_inputs(job), pieces, resume=plan.resume)
+    recordings = LongRecordings(model, logs, kept, plan, checkpoint)
+    identification = conclude(model, recordings, job.estimator)
     heads = [log.head for log in (*logs, *kept)]
-    return _with_alarms(job, model, identification, heads, diagnosis, alarms)
+    return *_with_alarms(job, model, identification, heads, diagnosis, alarms), checkpoint
 
 
 def _with_alarms(

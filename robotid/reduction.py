@@ -1,0 +1,320 @@
+"""Work on pieces: in this process, in worker processes, or by another backend.
+
+Every piece is worked on by itself with one BLAS thread, so what it comes down to has the same bits
+wherever that is done; results come back in the order of the pieces.
+"""
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from multiprocessing.connection import Connection
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from robotid.checkpoint import Checkpoint
+from robotid.exceptions import SettingsError, WorkerError
+from robotid.factors import available_cores
+from robotid.pieces import Piece, Reduction
+from robotid.progress import ProgressCallback, ignore_progress
+from robotid.task import Outcome, Work, Workload, reduce_piece, run_task
+
+__all__ = [
+    "Backend",
+    "ProcessBackend",
+    "SerialBackend",
+    "choose_workers",
+    "map_pieces",
+    "reduce_pieces",
+]
+
+_WORTH_WORKERS = 500_000  # samples from which workers pay their start, about a second each
+
+_log = logging.getLogger(__name__)
+
+
+class Backend(ABC):
+    """Where pieces are worked on."""
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """What messages call it, as ``2 worker processes``."""
+
+    @abstractmethod
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+        """Do the same with each of some pieces; closing the iterator ends it.
+
+        Args:
+            work: What to do with a piece.
+            pieces: Index and piece.
+
+        Yields:
+            Index and result of each piece once, in any order.
+
+        Raises:
+            DataError: If a row cannot be used.
+            WorkerError: If a worker ends before its work.
+        """
+
+
+class SerialBackend(Backend):
+    """Works on pieces one after the other in this process."""
+
+    @property
+    def description(self) -> str:
+        """What messages call it."""
+        return "this process"
+
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+        """Work on pieces; see :meth:`Backend.run`.
+
+        Args:
+            work: What to do with a piece.
+            pieces: Index and piece.
+
+        Yields:
+            Index and result of each piece, in order.
+        """
+        for index, piece in pieces:
+            with threadpool_limits(limits=1, user_api="blas"), _named(piece):
+                result = work(piece, None)
+            yield index, result
+
+
+@dataclass(frozen=True)
+class ProcessBackend(Backend):
+    """Works on pieces in worker processes, started anew, with one BLAS thread each.
+
+    The workers end with the process that started them, however it ends.
+
+    Attributes:
+        workers: Number of processes, at least 1.
+    """
+
+    workers: int
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise SettingsError(f"workers is {self.workers}, wanted at least 1")
+
+    @property
+    def description(self) -> str:
+        """What messages call it."""
+        return f"{self.workers} worker processes, one BLAS thread each"
+
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+        """Work on pieces, at most two per worker under way; see :meth:`Backend.run`.
+
+        Args:
+            work: What to do with a piece.
+            pieces: Index and piece.
+
+        Yields:
+            Index and result of each piece, as they come.
+
+        Raises:
+            DataError: If a row cannot be used.
+            WorkerError: If a worker ends before its work.
+        """
+        context = multiprocessing.get_context("spawn")
+        lifeline, held = context.Pipe(duplex=False)
+        pool = ProcessPoolExecutor(
+            min(self.workers, len(pieces)), context, _start_worker, (lifeline,)
+        )
+        try:
+            yield from _collect(pool, work, pieces, 2 * self.workers)
+        except BaseException:
+            held.close()  # ends the workers in the middle of their work
+            raise
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+            held.close()
+            lifeline.close()
+
+
+def reduce_pieces(
+    pieces: Sequence[Piece],
+    *,
+    backend: Backend | None = None,
+    checkpoint: Checkpoint | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[Reduction, ...]:
+    """Reduce pieces; the result has the same bits whatever the backend.
+
+    Args:
+        pieces: The pieces.
+        backend: Where they are reduced; in this process if None.
+        checkpoint: Where finished pieces are kept and, if resumed, taken from.
+        progress: Called with ("reducing", samples done, samples in all, "samples").
+
+    Returns:
+        One reduction per piece, in order; :func:`robotid.pieces.join` gives the whole.
+
+    Raises:
+        DataError: If a row cannot be used.
+        WorkerError: If a worker ends before its work.
+    """
+    found = {} if checkpoint is None else checkpoint.load(pieces)
+    keep = None if checkpoint is None else partial(_keep, checkpoint, pieces)
+    try:
+        return map_pieces(
+            reduce_piece, pieces, "reducing", backend=backend, progress=progress,
+            found=found, keep=keep,
+        )  # fmt: skip
+    except BaseException as error:
+        if checkpoint is not None:
+            error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
+        raise
+
+
+def map_pieces(
+    work: Work,
+    pieces: Sequence[Workload],
+    what: str,
+    *,
+    backend: Backend | None = None,
+    progress: ProgressCallback | None = None,
+    found: Mapping[int, Any] | None = None,
+    keep: Callable[[int, Any], None] | None = None,
+) -> tuple[Any, ...]:
+    """Do the same with every piece.
+
+    Args:
+        work: What to do with a piece.
+        pieces: The pieces.
+        what: What the work is called.
+        backend: Where it is done; in this process if None.
+        progress: Called with (what, samples done, samples in all, "samples").
+        found: Results that are there already, by index of the piece.
+        keep: Called with index and result of each piece that is finished.
+
+    Returns:
+        One result per piece, in order.
+
+    Raises:
+        DataError: If a row cannot be used.
+        WorkerError: If a worker ends before its work.
+    """
+    chosen, report = backend or SerialBackend(), progress or ignore_progress
+    results = dict(found or {})
+    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in results]
+    total = sum(piece.samples for piece in pieces)
+    done = total - sum(piece.samples for _, piece in missing)
+    _log.info(
+        "%s %d pieces, %d of them kept from before, %d samples in all: %s",
+        what, len(pieces), len(results), total, chosen.description,
+    )  # fmt: skip
+    report(what, done, total, "samples")
+    with closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
+        for index, result in finished if missing else ():
+            if keep is not None:
+                keep(index, result)
+            results[index] = result
+            done += pieces[index].samples
+            report(what, done, total, "samples")
+    return tuple(results[k] for k in range(len(pieces)))
+
+
+def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
+    """Return how many worker processes to use.
+
+    Args:
+        pieces: The work.
+        workers: What the user asked for, or None.
+
+    Returns:
+        The number asked for; else one per core where the work pays their start, otherwise 1; never
+        more than there are pieces.
+
+    Raises:
+        SettingsError: If fewer than one is asked for.
+    """
+    if workers is not None and workers < 1:
+        raise SettingsError(f"workers is {workers}, wanted at least 1")
+    if workers is None:
+        is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS
+        workers = available_cores() if is_long else 1
+    return max(1, min(workers, len(pieces)))
+
+
+def _collect(
+    pool: ProcessPoolExecutor, work: Work, pieces: Iterable[tuple[int, Workload]], most: int
+) -> Iterator[tuple[int, Any]]:
+    """Yield what the workers return, with at most so many pieces under way."""
+    waiting, level = iter(pieces), _log.getEffectiveLevel()
+    running: dict[Future[Outcome], tuple[int, Workload]] = {}
+    try:
+        while True:
+            for index, piece in islice(waiting, most - len(running)):
+                with _without_interrupt():  # a worker in its start knows no way to end quietly
+                    running[pool.submit(run_task, work, piece, level)] = index, piece
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                index, piece = running[future]
+                with _named(piece):
+                    outcome = future.result()
+                del running[future]
+                outcome.log()
+                yield index, outcome.result
+    except BrokenProcessPool as error:
+        names = [piece.name for _, piece in running.values()]
+        raise WorkerError(
+            "a worker process ended in the middle of its work (killed from outside, short of "
+            f"memory, or a script without the guard if __name__ == '__main__'); under way: {names}"
+        ) from error
+
+
+def _keep(
+    checkpoint: Checkpoint, pieces: Sequence[Piece], index: int, reduction: Reduction
+) -> None:
+    checkpoint.save(index, pieces[index], reduction)
+
+
+@contextmanager
+def _named(piece: Workload) -> Iterator[None]:
+    """Note on an error which piece it met."""
+    try:
+        yield
+    except BrokenProcessPool:
+        raise
+    except Exception as error:
+        error.add_note(f"while working on {piece.name}")
+        raise
+
+
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back; processes started meanwhile never see it, they end with this one."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(lifeline: Connection) -> None:
+    """Set a worker up: one BLAS thread, deaf to Ctrl-C, gone when the lifeline is cut."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+
+
+def _end_with(lifeline: Connection) -> None:
+    try:
+        lifeline.recv()
+    finally:
+        os._exit(1)
