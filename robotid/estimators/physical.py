@@ -44,8 +44,8 @@ class Consistent(Estimator):
         sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
     subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
-    coefficients >= 0, and the further constraints. The noise levels sigma_j come from weighted
-    least squares.
+    coefficients >= 0, and the further constraints. The noise levels sigma_j are those of the fit
+    without the inequalities, from weighted least squares onwards.
 
     Attributes:
         layout: The standard parameters.
@@ -122,8 +122,9 @@ class Consistent(Estimator):
             NotConvergedError: If the cone solver does not solve it.
         """
         factors = as_factors(data)
-        wls = self.noise_fit(factors)
-        rows = self.rows(factors, wls.sigma)
+        wls = self._wls(factors)
+        sigma = self.noise(factors, wls.sigma)
+        rows = self.rows(factors, sigma)
         solution, covariance = self.minimise(rows)
         details = self._details(solution.x)
         if self.check:
@@ -132,7 +133,7 @@ class Consistent(Estimator):
             theta=solution.x,
             covariance=covariance,
             names=self.layout.names,
-            sigma=wls.sigma,
+            sigma=sigma,
             rank=wls.rank,
             condition=wls.condition,
             undetermined=self.undetermined(covariance, factors.names),
@@ -178,17 +179,18 @@ class Consistent(Estimator):
             details=self._details(solution.x),
         )
 
-    def noise_fit(self, factors: Factors) -> Estimate:
-        """Return the weighted least squares fit that the noise levels come from.
+    def noise(self, factors: Factors, sigma: Array | None = None) -> Array:
+        """Return the noise level of each joint, by the fit without the inequalities.
 
         Args:
             factors: The factors, of base parameters.
+            sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
 
         Returns:
-            The estimate; directions that the data leave open keep the prior.
+            Noise levels, shape (n,) [N m or N]; see :meth:`Programme.noise`.
         """
-        prior = self.K @ self.prior
-        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
+        start = self._wls(factors).sigma if sigma is None else sigma
+        return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
         """Return the rows [R d] with |R K pi - d|^2 the weighted squares of the residual.
@@ -278,6 +280,11 @@ class Consistent(Estimator):
     @property
     def _held(self) -> Array:
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
+
+    def _wls(self, factors: Factors) -> Estimate:
+        """Return weighted least squares; directions that the data leave open keep the prior."""
+        prior = self.K @ self.prior
+        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""
