@@ -58,8 +58,8 @@ class Consistent(Estimator):
         prior_weight: Weight of the prior [-].
         independent_share: Share of the rows that count as independent, 2 cutoff / rate.
         max_iterations: Bound on the iterations of the cone solver.
-        metric: How the distance from the prior is measured: "euclidean", "entropic" or
-            "riemannian"; see :func:`robotid.estimators.priors.make_penalty`.
+        metric: How the distance from the prior is measured: "riemannian",
+            "euclidean" or "entropic"; see :func:`robotid.estimators.priors.make_penalty`.
         constraints: Bounds beside physical consistency.
         solver: "clarabel" or "scs".
         choice: How ``prior_weight`` was chosen, if it was.
@@ -80,7 +80,7 @@ class Consistent(Estimator):
     prior_weight: float = 1.0
     independent_share: float = 1.0
     max_iterations: int = 200
-    metric: str = "euclidean"
+    metric: str = "riemannian"
     constraints: Constraints = field(default_factory=Constraints)
     solver: str = "clarabel"
     check: bool = False
@@ -140,6 +140,7 @@ class Consistent(Estimator):
             converged=True,
             n_iter=solution.n_iter,
             message=solution.message,
+            prior_std=self.spread_before,
             details=details,
         )
 
@@ -176,6 +177,7 @@ class Consistent(Estimator):
             undetermined=self.undetermined(covariance, estimate.names),
             n_iter=estimate.n_iter + solution.n_iter,
             message=f"{estimate.message}; made physically possible, {solution.message}",
+            prior_std=self.spread_before,
             details=self._details(solution.x),
         )
 
@@ -260,6 +262,13 @@ class Consistent(Estimator):
     def penalty(self) -> Penalty:
         """The penalty on the distance from the prior."""
         return self.programme.penalty
+
+    @property
+    def spread_before(self) -> Array:
+        """Standard deviation of each parameter by the prior alone, shape (p,)."""
+        covariance = self.programme.prior_covariance(self.prior_weight)
+        spread: Array = np.sqrt(np.diag(covariance))
+        return spread
 
     def undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the base parameters about which the data say next to nothing.
