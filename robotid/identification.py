@@ -45,6 +45,7 @@ __all__ = [
 
 _GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
+_KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
 
 
@@ -105,7 +106,7 @@ class Identification:
     @property
     def sources(self) -> tuple[str, ...]:
         """Where each standard parameter comes from: "data", "mixed" or "prior"."""
-        share = self.standard_error / self.prior_std
+        share = self.standard_error / np.maximum(self.prior_std, _KNOWN)
         names = np.where(
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
@@ -232,7 +233,7 @@ def conclude(
         estimate=estimate,
         wls=wls,
         prior=prior,
-        prior_std=spread,
+        prior_std=spread if estimate.prior_std is None else estimate.prior_std,
         standard=standard,
         standard_error=np.sqrt(np.maximum(np.diag(covariance), 0.0)),
         base=mapping.to_base(standard),

@@ -224,4 +224,5 @@ def test_fewer_independent_rows_widen_the_errors(make, ur5, rng):
     wide = replace(estimator, independent_share=0.25).fit(case.problem)
     narrow = estimator.fit(case.problem)
     ratio = np.sqrt(np.diag(case.covariance(wide)) / np.diag(case.covariance(narrow)))
-    assert 1.5 < np.median(ratio) <= 2.0001
+    # the consistent fit also finds the noise larger: fewer rows are left to tell it
+    assert 1.5 < np.median(ratio) <= (2.1 if isinstance(estimator, Consistent) else 2.0001)

@@ -152,7 +152,7 @@ class Cone:
             if row @ x + constant < tolerance:
                 gradients.append(row[None])
                 labels.append(label)
-        slopes = self.S.reshape(self.n_matrices, _ENTRIES, -1)
+        slopes = self.S.reshape(self.n_matrices, _ENTRIES, len(x))
         for matrix, slope, label in zip(
             self.matrices(x), slopes, self.labels[len(self.h) :], strict=True
         ):

@@ -30,6 +30,7 @@ class Estimate:
         converged: Whether the iteration ended by its own criterion.
         n_iter: Number of iterations.
         message: What the estimator says of its run.
+        prior_std: Standard deviation of each parameter before the data, shape (c,), or None.
         details: How it was fitted, plain values by name: prior, constraints, solver.
     """
 
@@ -43,6 +44,7 @@ class Estimate:
     converged: bool
     n_iter: int
     message: str
+    prior_std: Array | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -44,8 +44,8 @@ class Consistent(Estimator):
         sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
 
     subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
-    coefficients >= 0, and the further constraints. The noise levels sigma_j come from weighted
-    least squares.
+    coefficients >= 0, and the further constraints. The noise levels sigma_j are those of the fit
+    without the inequalities, from weighted least squares onwards.
 
     Attributes:
         layout: The standard parameters.
@@ -58,8 +58,8 @@ class Consistent(Estimator):
         prior_weight: Weight of the prior [-].
         independent_share: Share of the rows that count as independent, 2 cutoff / rate.
         max_iterations: Bound on the iterations of the cone solver.
-        metric: How the distance from the prior is measured: "euclidean", "entropic" or
-            "riemannian"; see :func:`robotid.estimators.priors.make_penalty`.
+        metric: How the distance from the prior is measured: "riemannian",
+            "euclidean" or "entropic"; see :func:`robotid.estimators.priors.make_penalty`.
         constraints: Bounds beside physical consistency.
         solver: "clarabel" or "scs".
         choice: How ``prior_weight`` was chosen, if it was.
@@ -80,7 +80,7 @@ class Consistent(Estimator):
     prior_weight: float = 1.0
     independent_share: float = 1.0
     max_iterations: int = 200
-    metric: str = "euclidean"
+    metric: str = "riemannian"
     constraints: Constraints = field(default_factory=Constraints)
     solver: str = "clarabel"
     check: bool = False
@@ -122,8 +122,9 @@ class Consistent(Estimator):
             NotConvergedError: If the cone solver does not solve it.
         """
         factors = as_factors(data)
-        wls = self.noise_fit(factors)
-        rows = self.rows(factors, wls.sigma)
+        wls = self._wls(factors)
+        sigma = self.noise(factors, wls.sigma)
+        rows = self.rows(factors, sigma)
         solution, covariance = self.minimise(rows)
         details = self._details(solution.x)
         if self.check:
@@ -132,13 +133,14 @@ class Consistent(Estimator):
             theta=solution.x,
             covariance=covariance,
             names=self.layout.names,
-            sigma=wls.sigma,
+            sigma=sigma,
             rank=wls.rank,
             condition=wls.condition,
             undetermined=self.undetermined(covariance, factors.names),
             converged=True,
             n_iter=solution.n_iter,
             message=solution.message,
+            prior_std=self.spread_before,
             details=details,
         )
 
@@ -175,20 +177,22 @@ class Consistent(Estimator):
             undetermined=self.undetermined(covariance, estimate.names),
             n_iter=estimate.n_iter + solution.n_iter,
             message=f"{estimate.message}; made physically possible, {solution.message}",
+            prior_std=self.spread_before,
             details=self._details(solution.x),
         )
 
-    def noise_fit(self, factors: Factors) -> Estimate:
-        """Return the weighted least squares fit that the noise levels come from.
+    def noise(self, factors: Factors, sigma: Array | None = None) -> Array:
+        """Return the noise level of each joint, by the fit without the inequalities.
 
         Args:
             factors: The factors, of base parameters.
+            sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
 
         Returns:
-            The estimate; directions that the data leave open keep the prior.
+            Noise levels, shape (n,) [N m or N]; see :meth:`Programme.noise`.
         """
-        prior = self.K @ self.prior
-        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
+        start = self._wls(factors).sigma if sigma is None else sigma
+        return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
         """Return the rows [R d] with |R K pi - d|^2 the weighted squares of the residual.
@@ -259,6 +263,13 @@ class Consistent(Estimator):
         """The penalty on the distance from the prior."""
         return self.programme.penalty
 
+    @property
+    def spread_before(self) -> Array:
+        """Standard deviation of each parameter by the prior alone, shape (p,)."""
+        covariance = self.programme.prior_covariance(self.prior_weight)
+        spread: Array = np.sqrt(np.diag(covariance))
+        return spread
+
     def undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the base parameters about which the data say next to nothing.
 
@@ -278,6 +289,11 @@ class Consistent(Estimator):
     @property
     def _held(self) -> Array:
         return np.zeros(self.layout.n_inertial) if self.held is None else self.held
+
+    def _wls(self, factors: Factors) -> Estimate:
+        """Return weighted least squares; directions that the data leave open keep the prior."""
+        prior = self.K @ self.prior
+        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""

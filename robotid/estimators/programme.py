@@ -10,6 +10,7 @@ from robotid.estimators.cones import Cone, Subspace
 from robotid.estimators.priors import Penalty
 from robotid.estimators.solvers import ConeSolution, least_squares
 from robotid.exceptions import NotConvergedError
+from robotid.factors import Factors
 
 __all__ = ["Programme"]
 
@@ -20,6 +21,8 @@ _ROUGH = 0.1  # ... and at which it goes on to a smaller weight, in units of the
 _HEAVY = 100.0  # weight at which a fit stays near its prior, from which Newton's method sets out
 _DECADE = 10.0
 _HALVINGS = 40
+_NOISE_STEPS, _NOISE_SETTLED = 20, 1e-3  # a noise level need not be known better
+_LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +124,42 @@ class Programme:
         directions = scipy.linalg.solve_triangular(L, (A @ basis).T, trans="T").T
         return directions, rows[:, -1] - A @ nearest
 
+    def noise(self, factors: Factors, sigma: Array, share: float, weight: float) -> Array:
+        """Return the noise level of each joint by the fit without the inequalities.
+
+        sigma_j^2 = |tau_j - W_j pi|^2 / (rows_j - spent_j / share): rows behind a filter repeat
+        each other, so that few of them are spent soon; spent_j counts the parameters that the
+        rows of joint j determine beside the prior, the trace of their leverage.
+
+        Args:
+            factors: The factors, of base parameters.
+            sigma: Noise levels to start from, shape (n,) [N m or N].
+            share: Share of the rows that count as independent [-].
+            weight: Weight of the penalty [-].
+
+        Returns:
+            Noise levels, shape (n,) [N m or N], at least those of the start.
+        """
+        n, size, _ = factors.R.shape
+        A, r = self.whitened(factors.R.reshape(n * size, size))
+        A, r = A.reshape(n, size, -1), r.reshape(n, size)
+        least, rows, p = sigma, np.maximum(factors.rows, 1), A.shape[2]
+        for _ in range(_NOISE_STEPS):
+            root = (np.sqrt(share) / sigma)[:, None, None]
+            stacked = np.vstack([(A * root).reshape(-1, p), np.sqrt(weight) * np.eye(p)])
+            right = np.concatenate([(r * root[:, 0]).reshape(-1), np.zeros(p)])
+            triangle = scipy.linalg.qr(np.column_stack([stacked, right]), mode="r")[0][:p]
+            inverse = scipy.linalg.solve_triangular(triangle[:, :-1], np.eye(p))
+            residual = r - A @ (inverse @ triangle[:, -1])
+            spent = ((A @ inverse * root) ** 2).sum(axis=(1, 2))
+            freedom = np.maximum(rows - spent / share, _LEAST_FREEDOM * rows)
+            updated = np.maximum(np.sqrt((residual**2).sum(axis=1) / freedom), least)
+            change = float(np.max(np.abs(updated / sigma - 1.0)))
+            sigma = updated
+            if change < _NOISE_SETTLED:
+                break
+        return sigma
+
     def prior_covariance(self, weight: float) -> Array:
         """Return the covariance that the prior alone gives.
 
@@ -143,15 +182,18 @@ class Programme:
         is_exact: bool = False,
     ) -> tuple[ConeSolution, Array, int]:
         """Go from a point of the cone to the minimum at a weight; return also R and the steps."""
-        pi, value = start.x, self.objective(rows, start.x, weight)
+        pi, value, before = start.x, self.objective(rows, start.x, weight), np.inf
         for step in range(1, _STEPS + 1):
             solution, R = self._expanded(rows, weight, pi, is_exact)
             direction = solution.x - pi
             decrease = float(np.sum((R @ self.space.basis.T @ (direction / self.scale)) ** 2))
             share, lower = self._along(rows, weight, pi, direction, value)
             pi, value = pi + share * direction, lower
-            if decrease <= tolerance or share == 0:  # then nothing is left but rounding
+            # steps that no longer shrink are as short as the solver can tell
+            is_stuck = decrease <= _NEAR * (1.0 + value) and decrease > 0.5 * before
+            if decrease <= tolerance or share == 0 or is_stuck:
                 return replace(solution, x=pi), R, step
+            before = decrease
         raise NotConvergedError(
             f"the fit still changes after {_STEPS} Newton steps at a prior weight of {weight:g}; "
             "use the 'euclidean' prior or a larger weight",

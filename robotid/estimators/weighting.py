@@ -37,7 +37,7 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
         DataError: If "cv" has fewer than two stretches.
         NotConvergedError: If a fit does not converge.
     """
-    sigma = fit.noise_fit(merge(stretches)).sigma
+    sigma = fit.noise(merge(stretches))
     lightest = _LIGHTEST if fit.penalty.is_quadratic else _LIGHTEST_ENTROPIC
     if how == "cv":
         return _search(lambda w: held_out_error(fit, stretches, sigma, w), how, lightest)
