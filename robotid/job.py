@@ -87,7 +87,7 @@ class Job:
     identification: tuple[LogEntry, ...] = ()
     validation: tuple[LogEntry, ...] = ()
     ignore: tuple[str, ...] = ()
-    rows_in_memory: int = 2**18
+    rows_in_memory: int = 2**17
 
     def __post_init__(self) -> None:
         if self.rows_in_memory < 1:
@@ -283,7 +283,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             estimator=EstimatorSettings(**table.get("estimator", {})),
             dynamics=table.get("output", {}).get("dynamics", False),
             ignore=tuple(table.get("doctor", {}).get("ignore", ())),
-            rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**18),
+            rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**17),
             **entries,
         )
     except SettingsError as error:

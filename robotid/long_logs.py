@@ -33,8 +33,8 @@ from robotid.validation import row_mask
 __all__ = ["PIECE", "LogPiece", "LongLog", "survey"]
 
 #: Rows of a piece, if nothing else is said.
-PIECE = 65536
-_WINDOW = 25_000  # rows of each window that is looked at closely
+PIECE = 16384
+_WINDOW = 20_000  # rows of each window that is looked at closely
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class LogPiece(Piece):
 
     @property
     def name(self) -> str:
-        """What messages call it, as ``run3.parquet rows 0-65536``."""
+        """What messages call it, as ``run3.parquet rows 0-16384``."""
         return f"{Path(self.header.layout.path).name} rows {self.first}-{self.stop}"
 
     @property

@@ -1,9 +1,9 @@
 """Identification from logs larger than memory: one pass over the pieces reduces, one evaluates."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from robotid.data import Trajectory
 from robotid.long_logs import LogPiece, LongLog
 from robotid.metrics import TorqueSums
 from robotid.model import RobotModel
-from robotid.pieces import Piece, Reduction, reduce_in_turn
+from robotid.pieces import Piece, Reduction, join_stretches, reduce_in_turn
 from robotid.problem import Block, Problem
 from robotid.recordings import Recordings, base_problem, independent_share
 from robotid.signals import turns_note
@@ -34,7 +34,11 @@ __all__ = ["LongRecordings", "evaluate_long"]
 
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
 
-Reducer = Callable[[Sequence[Piece]], Sequence[Reduction]]
+_STRETCHES = 64  # of each log whose factors are kept apart
+_FACTORS = 2**26  # bytes of them all, if that leaves each log a few
+_FEW = 8
+
+Reducer = Callable[[Sequence[Piece]], Iterable[Reduction]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +49,7 @@ class LongRecordings(Recordings):
         model: The robot.
         fitted: Logs to fit.
         kept: Logs kept apart.
-        reducer: Reduces pieces, in order.
+        reducer: Reduces pieces, one after the other as they are asked for, in order.
     """
 
     model: RobotModel
@@ -65,15 +69,18 @@ class LongRecordings(Recordings):
             mapping: Standard to base parameters; that which the logs were surveyed with.
 
         Returns:
-            One reduction per piece.
+            One reduction per stretch of neighbouring pieces of a log.
 
         Raises:
             DataError: If a row cannot be used, or no stretch of a log is long enough.
         """
         found = iter(self.reducer([piece for log in self.fitted for piece in log.pieces]))
         reductions = []
+        size = 8 * self.model.n_rows * (len(mapping.independent) + 1) ** 2 * len(self.fitted)
+        most = max(_FEW, min(_STRETCHES, _FACTORS // size))
         for log in self.fitted:
-            own = [next(found) for _ in log.pieces]
+            count = len(log.pieces)
+            own = join_stretches(islice(found, count), count, most)
             if not any(reduction.samples for reduction in own):
                 raise too_short(log.path, len(log.stretches), log.header.signals)
             reductions += own
