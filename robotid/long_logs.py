@@ -24,7 +24,7 @@ from robotid.pieces import Piece, Reduction
 from robotid.recordings import base_problem
 from robotid.rows import COMPILED, choose_engine
 from robotid.signals import SignalSettings, decide, unwrap, velocity_lag
-from robotid.smoothing import SPLINE, Stretch, memory, process_stretches
+from robotid.smoothing import SPLINE, Stretch, filter_reach, process_stretches
 from robotid.tables import open_table
 from robotid.time_stamps import TimeStamps
 from robotid.units import check_reach, check_units
@@ -348,7 +348,7 @@ def _cut(
     length: int,
 ) -> Iterator[LogPiece]:
     """Yield pieces of so many rows each, and which rows are to be read with each."""
-    reach = memory(header.signals)
+    reach = filter_reach(header.signals)
     begins = [stretch.first for stretch in stretches]
     for first in range(*window, length):
         stop = min(first + length, window[1])
