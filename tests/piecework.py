@@ -53,7 +53,9 @@ class RandomPiece(Piece):
         rng = np.random.default_rng(self.seed)
         rows = rng.standard_normal((2, self.samples, len(NAMES) + 1))
         R = np.array([np.linalg.qr(part, mode="r") for part in rows])
-        factors = Factors(R, np.full(2, self.samples), NAMES)
+        own = np.arange(len(NAMES))
+        rows = np.full(2, self.samples)
+        factors = Factors(tuple(np.asfortranarray(R_j) for R_j in R), (own, own), rows, NAMES)
         return Reduction(factors, rng.random((3, 2)), self.samples)
 
 
