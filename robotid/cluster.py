@@ -3,7 +3,6 @@
 import logging
 import socket
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -21,20 +20,20 @@ __all__ = ["ClusterBackend"]
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class ClusterBackend(Backend):
     """Works on pieces on a Dask cluster; results come home as they are finished.
 
     Logs must be reachable from every worker under the same path. A piece whose worker is lost is
     done again by another one; a result counts once, by the index of its piece.
 
-    Attributes:
+    Args:
         address: Address of the scheduler, as ``tcp://host:8786``.
         patience: How long to wait for the scheduler and its first worker [s].
     """
 
-    address: str
-    patience: float = 30.0
+    def __init__(self, address: str, *, patience: float = 30.0) -> None:
+        self.address, self.patience = address, patience
+        self._client: Client | None = None
 
     @property
     def description(self) -> str:
@@ -57,12 +56,20 @@ class ClusterBackend(Backend):
             WorkerError: If the cluster cannot be reached, its robotid is of another version, or it
                 loses the workers that try the same piece over and over.
         """
-        client = self._connect()
         try:
-            _require_same_version(self.address, client)
-            yield from self._collect(client, work, pieces)
-        finally:
-            client.close(timeout=5)
+            if self._client is None:
+                self._client = self._connect()
+                _require_same_version(self.address, self._client)
+            yield from self._collect(self._client, work, pieces)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the cluster; the next work comes back to it."""
+        if self._client is not None:
+            self._client.close(timeout=5)
+            self._client = None
 
     def _connect(self) -> "Client":
         try:

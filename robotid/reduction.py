@@ -11,14 +11,14 @@ import signal
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, Self
 
 from threadpoolctl import threadpool_limits
 
@@ -44,7 +44,17 @@ _log = logging.getLogger(__name__)
 
 
 class Backend(ABC):
-    """Where pieces are worked on."""
+    """Where pieces are worked on; a context manager, which lets its workers go at its end."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let the workers go; the next work starts them anew."""
 
     @property
     @abstractmethod
@@ -71,6 +81,9 @@ class Backend(ABC):
 class SerialBackend(Backend):
     """Works on pieces one after the other in this process."""
 
+    def close(self) -> None:
+        """Do nothing; there are no workers."""
+
     @property
     def description(self) -> str:
         """What messages call it."""
@@ -92,21 +105,25 @@ class SerialBackend(Backend):
             yield index, result
 
 
-@dataclass(frozen=True)
 class ProcessBackend(Backend):
     """Works on pieces in worker processes, started anew, with one BLAS thread each.
 
-    The workers end with the process that started them, however it ends.
+    The workers wait for more work until :meth:`close`; an error or the end of the process that
+    started them, however it ends, ends them at once.
 
-    Attributes:
+    Args:
         workers: Number of processes, at least 1.
+
+    Raises:
+        SettingsError: If it is less.
     """
 
-    workers: int
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise SettingsError(f"workers is {self.workers}, wanted at least 1")
+    def __init__(self, workers: int) -> None:
+        if workers < 1:
+            raise SettingsError(f"workers is {workers}, wanted at least 1")
+        self.workers = workers
+        self._pool: ProcessPoolExecutor | None = None
+        self._lifeline: tuple[Connection, Connection] | None = None
 
     @property
     def description(self) -> str:
@@ -127,20 +144,31 @@ class ProcessBackend(Backend):
             DataError: If a row cannot be used.
             WorkerError: If a worker ends before its work.
         """
-        context = multiprocessing.get_context("spawn")
-        lifeline, held = context.Pipe(duplex=False)
-        pool = ProcessPoolExecutor(
-            min(self.workers, len(pieces)), context, _start_worker, (lifeline,)
-        )
         try:
-            yield from _collect(pool, work, pieces, 2 * self.workers)
+            yield from _collect(self._pool or self._start(), work, pieces, 2 * self.workers)
         except BaseException:
-            held.close()  # ends the workers in the middle of their work
+            self._cut_lifeline()  # ends the workers in the middle of their work
+            self.close()
             raise
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-            held.close()
-            lifeline.close()
+
+    def close(self) -> None:
+        """Let the workers go; the next work starts them anew."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+        self._cut_lifeline()
+
+    def _start(self) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")
+        self._lifeline = context.Pipe(duplex=False)
+        lifeline, _ = self._lifeline
+        self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (lifeline,))
+        return self._pool
+
+    def _cut_lifeline(self) -> None:
+        for end in reversed(self._lifeline or ()):
+            end.close()
+        self._lifeline = None
 
 
 def reduce_pieces(
@@ -254,18 +282,25 @@ def _collect(
     """Yield what the workers return, with at most so many pieces under way."""
     waiting, level = iter(pieces), _log.getEffectiveLevel()
     running: dict[Future[Outcome], tuple[int, Workload]] = {}
+    finished: SimpleQueue[Future[Outcome] | None] = SimpleQueue()
     try:
-        while True:
-            for index, piece in islice(waiting, most - len(running)):
-                with _without_interrupt():  # a worker in its start knows no way to end quietly
-                    running[pool.submit(run_task, work, piece, level)] = index, piece
-            if not running:
-                return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                index, piece = running[future]
+        with _interrupts_to(lambda: finished.put(None)) as interrupt:
+            while True:
+                for index, piece in islice(waiting, most - len(running)):
+                    with _unheard_interrupts():
+                        future = pool.submit(run_task, work, piece, level)
+                    running[future] = index, piece
+                    future.add_done_callback(finished.put)
+                if not running:
+                    return
+                done = finished.get()
+                if done is None:
+                    interrupt()
+                    continue
+                index, piece = running[done]
                 with _named(piece):
-                    outcome = future.result()
-                del running[future]
+                    outcome = done.result()
+                del running[done]
                 outcome.log()
                 yield index, outcome.result
     except BrokenProcessPool as error:
@@ -295,8 +330,26 @@ def _named(piece: Workload) -> Iterator[None]:
 
 
 @contextmanager
-def _without_interrupt() -> Iterator[None]:
-    """Hold Ctrl-C back; processes started meanwhile never see it, they end with this one."""
+def _interrupts_to(notify: Callable[[], None]) -> Iterator[Callable[[], None]]:
+    """Let Ctrl-C call ``notify`` and nothing else, as long as the context lasts.
+
+    In the middle of the pool's own functions it would leave locks that nobody opens. Yields what
+    does what Ctrl-C was to do, to be called where that harms nothing.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield lambda: None
+        return
+    signal.signal(signal.SIGINT, lambda *_: notify())
+    try:
+        yield lambda: before(signal.SIGINT, None)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _unheard_interrupts() -> Iterator[None]:
+    """Hold Ctrl-C back; workers started meanwhile never see it: they end with this process."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

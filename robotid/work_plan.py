@@ -1,8 +1,9 @@
 """Who works on the pieces of long logs, what is shown of it, and what is kept if it is cut off."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Self
 
 from robotid.checkpoint import Checkpoint
 from robotid.cluster import ClusterBackend
@@ -22,9 +23,11 @@ from robotid.task import Work, Workload
 __all__ = ["WorkPlan"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class WorkPlan:
     """How work on pieces is done; it never changes a result.
+
+    As a context manager, it keeps its workers for more work until the context ends.
 
     Attributes:
         workers: Worker processes; None for one per core where the work is long.
@@ -37,6 +40,8 @@ class WorkPlan:
     scheduler: str | None = None
     resume: bool = False
     progress: ProgressCallback | None = None
+    _kept: Backend | None = field(default=None, init=False, repr=False)
+    _keeps: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
@@ -47,18 +52,28 @@ class WorkPlan:
         """Whether anything but the default was asked for, which short logs have no use of."""
         return self.resume or self.scheduler is not None or (self.workers or 1) > 1
 
-    def backend(self, pieces: Sequence[Workload]) -> Backend:
-        """Return what works on pieces.
+    def __enter__(self) -> Self:
+        self._keeps = True
+        return self
 
-        Args:
-            pieces: The pieces.
+    def __exit__(self, *_: object) -> None:
+        self._keeps = False
+        if self._kept is not None:
+            self._kept.close()
+            self._kept = None
 
-        Returns:
-            The cluster, worker processes, or this process.
+    @contextmanager
+    def _backend(self, pieces: Sequence[Workload]) -> Iterator[Backend]:
+        """Yield the cluster, worker processes, or this process."""
+        backend = self._kept or self._choose(pieces)
+        if self._keeps and not isinstance(backend, SerialBackend):
+            self._kept = backend
+            yield backend
+            return
+        with backend:
+            yield backend
 
-        Raises:
-            SettingsError: If fewer than one worker is asked for.
-        """
+    def _choose(self, pieces: Sequence[Workload]) -> Backend:
         if self.scheduler is not None:
             return ClusterBackend(self.scheduler)
         workers = choose_workers(pieces, self.workers)
@@ -80,9 +95,10 @@ class WorkPlan:
             DataError: If a row cannot be used.
             WorkerError: If a worker ends before its work.
         """
-        return reduce_pieces(
-            pieces, backend=self.backend(pieces), checkpoint=checkpoint, progress=self.progress
-        )
+        with self._backend(pieces) as backend:
+            return reduce_pieces(
+                pieces, backend=backend, checkpoint=checkpoint, progress=self.progress
+            )
 
     def map(self, work: Work, pieces: Sequence[Workload], what: str) -> tuple[Any, ...]:
         """Do the same with every piece; see :func:`robotid.reduction.map_pieces`.
@@ -99,4 +115,5 @@ class WorkPlan:
             DataError: If a row cannot be used.
             WorkerError: If a worker ends before its work.
         """
-        return map_pieces(work, pieces, what, backend=self.backend(pieces), progress=self.progress)
+        with self._backend(pieces) as backend:
+            return map_pieces(work, pieces, what, backend=backend, progress=self.progress)

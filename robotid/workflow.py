@@ -131,8 +131,9 @@ def _identify_long(
     alarms = alarming(diagnosis, job.ignore)
     pieces = [piece for log in logs for piece in log.pieces]
     checkpoint = Checkpoint.open(folder, checkpoint_inputs(job), pieces, resume=plan.resume)
-    recordings = LongRecordings(model, logs, kept, plan, checkpoint)
-    identification = conclude(model, recordings, job.estimator)
+    with plan:
+        recordings = LongRecordings(model, logs, kept, plan, checkpoint)
+        identification = conclude(model, recordings, job.estimator)
     heads = [log.head for log in (*logs, *kept)]
     return *_with_alarms(job, model, identification, heads, diagnosis, alarms), checkpoint
 

@@ -112,7 +112,8 @@ def main(folder, workers, *words):
     pieces = pieces_in(Path(folder) / "marks", pause=0.15)
     checkpoint = Checkpoint.open(folder, {"inputs": "these"}, pieces, resume="resume" in words)
     backend = ProcessBackend(int(workers)) if int(workers) > 1 else SerialBackend()
-    found = reduce_pieces(pieces, backend=backend, checkpoint=checkpoint)
+    with backend:
+        found = reduce_pieces(pieces, backend=backend, checkpoint=checkpoint)
     with open(Path(folder) / "joined.npz", "wb") as file:
         np.savez(file, **join(found).to_arrays())
     checkpoint.remove()

@@ -30,9 +30,8 @@ def address():
 def test_a_cluster_reduces_to_the_same_bits(address, tmp_path):
     pieces = pieces_in(tmp_path / "marks", 12, pause=0.02)
     calls = []
-    found = reduce_pieces(
-        pieces, backend=ClusterBackend(address), progress=lambda *call: calls.append(call)
-    )
+    with ClusterBackend(address) as backend:
+        found = reduce_pieces(pieces, backend=backend, progress=lambda *call: calls.append(call))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(12), 1)
     assert len(workers_of(tmp_path / "marks") - {os.getpid()}) == 2
     serial = reduce_pieces(pieces)
@@ -44,7 +43,8 @@ def test_a_cluster_reduces_to_the_same_bits(address, tmp_path):
 
 def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(address, tmp_path):
     pieces = pieces_in(tmp_path / "marks", 12, pause=0.05, faults={5: "kill once"}.items())
-    found = reduce_pieces(pieces, backend=ClusterBackend(address))
+    with ClusterBackend(address) as backend:
+        found = reduce_pieces(pieces, backend=backend)
     assert len(reduced(pieces[5])) == 2
     assert join(found).samples == sum(piece.samples for piece in pieces)
     serial = reduce_pieces(pieces_in(tmp_path / "other", 12))

@@ -59,7 +59,8 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
     calls = []
     serial = reduce_pieces(pieces, progress=lambda *call: calls.append(call))
     for workers in (1, 2):
-        found = reduce_pieces(pieces, backend=ProcessBackend(workers))
+        with ProcessBackend(workers) as backend:
+            found = reduce_pieces(pieces, backend=backend)
         assert all(map(same_bits, found, serial))
         assert same_bits(join(found), join(serial))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
@@ -72,13 +73,25 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
 
 def test_two_workers_work_at_the_same_time(tmp_path):
     pieces = pieces_in(tmp_path / "marks", 2, faults={0: "meet", 1: "meet"}.items())
-    reduce_pieces(pieces, backend=ProcessBackend(2))
+    with ProcessBackend(2) as backend:
+        reduce_pieces(pieces, backend=backend)
+
+
+def test_workers_wait_for_more_work_and_end_when_they_are_let_go(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 4)
+    with ProcessBackend(1) as backend:
+        once, again = (reduce_pieces(pieces, backend=backend) for _ in range(2))
+        (worker,) = workers_of(tmp_path / "marks")
+        assert is_running(worker)
+    assert not is_running(worker)
+    assert all(map(same_bits, once, again))
 
 
 def test_reductions_come_back_in_the_order_of_the_pieces(tmp_path):
     pieces = pieces_in(tmp_path / "marks", 4)
     late = [type(pieces[0])(0, pieces[0].marks, pause=0.5), *pieces[1:]]
-    found = reduce_pieces(late, backend=ProcessBackend(2))
+    with ProcessBackend(2) as backend:
+        found = reduce_pieces(late, backend=backend)
     assert [r.samples for r in found] == [100, 101, 102, 103]
 
 
