@@ -285,10 +285,8 @@ class Consistent(Estimator):
         """
         KS = self.K * self.prior_std / np.sqrt(self.prior_weight)  # K times the prior's root
         before = (KS**2).sum(axis=1)
-        A = rows[:, :-1] @ KS
-        S = np.eye(len(A)) + A @ A.T
-        gain = scipy.linalg.solve(S, A @ KS.T, assume_a="pos")
-        after = before - np.einsum("kb,kb->b", A @ KS.T, gain)
+        _, s, Vt = np.linalg.svd(rows[:, :-1] @ KS, full_matrices=False)
+        after = before - (KS @ Vt.T) ** 2 @ (s**2 / (1.0 + s**2))
         owners = np.array([name.rsplit(".", 1)[0] for name in self.layout.names])
         is_free = ~np.isin(owners, self.constraints.pinned)
         is_open = (after > _PRIOR_LED**2 * before) & self.K[:, is_free].any(axis=1)
