@@ -66,8 +66,8 @@ class EstimatorSettings:
         name: "ols", "wls", "consistent", "log_cholesky", "rls", "kalman", "prx" or "gradient".
         margin: Of "consistent" and ``physical``: smallest eigenvalue of a body's pseudo-inertia
             relative to its prior size [-].
-        prior: Of the same: metric of the distance from the URDF's values, "riemannian",
-            "euclidean" or "entropic".
+        prior: Of the same: metric of the distance from the URDF's values, "euclidean",
+            "riemannian" or "entropic".
         prior_weight: Of the same: weight of the URDF's values [-], or how it is chosen from the
             fitted logs: "cv" (stretches held out in turn) or "evidence".
         solver: Of the same: "clarabel" or "scs".
@@ -100,7 +100,7 @@ class EstimatorSettings:
     seed: int = 0
     step_size: float = 1.0
     physical: bool = False
-    prior: str = "riemannian"
+    prior: str = "euclidean"
     solver: str = "clarabel"
     check: bool = False
     constraints: Mapping[str, Any] = dataclass_field(default_factory=dict)

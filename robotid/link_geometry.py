@@ -106,7 +106,7 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
         planes = ConvexHull(points).equations  # n^T x + o <= 0
     except QhullError:  # all points in one plane
         return box_half_spaces(points)
-    planes = np.unique(np.round(planes, 9), axis=0)
+    planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
     if len(planes) <= _MOST_FACES:
         return planes[:, :3], -planes[:, 3]
     k = np.arange(_MOST_FACES) + 0.5

@@ -10,6 +10,7 @@ from robotid.exceptions import DataError
 from robotid.identification import Identification
 from robotid.metrics import JointMetrics, Metrics
 from robotid.parameters import INERTIAL_TERMS
+from robotid.report_consistency import consistency_notes
 from robotid.report_page import code, number, page, percent, table, text
 from robotid.report_plots import plot_body, plot_torque
 from robotid.report_tables import (
@@ -52,6 +53,7 @@ _ESTIMATORS = {
     "gradient": "normalised gradient steps, sample by sample (gradient)",
     "consistent": "weighted least squares that keeps every body physically possible and leaves "
     "the URDF's value where the data say nothing (consistent)",
+    "log_cholesky": "the consistent fit without a cone, in log-Cholesky parameters (log_cholesky)",
 }
 
 
@@ -82,7 +84,7 @@ def write_report(
         "drives": drive_table(identification),
         "base": base_table(identification),
         "standard": _standard(identification),
-        "consistency": consistency_table(identification),
+        "consistency": consistency_table(identification) + consistency_notes(identification),
         "open": open_section(identification),
         "warnings": _warnings(identification, findings),
         "settings": settings_tables(identification),

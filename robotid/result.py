@@ -238,6 +238,9 @@ def _consistency(identification: Identification) -> dict[str, Any]:
         "total_mass": float(J[:, 3, 3].sum()),
         "mass_matrix": dataclasses.asdict(identification.mass_matrix),
         "fit": dict(identification.estimate.details),
+        "sources": {
+            kind: identification.sources.count(kind) for kind in ("data", "mixed", "prior")
+        },
     }
 
 

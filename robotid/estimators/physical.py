@@ -58,8 +58,8 @@ class Consistent(Estimator):
         prior_weight: Weight of the prior [-].
         independent_share: Share of the rows that count as independent, 2 cutoff / rate.
         max_iterations: Bound on the iterations of the cone solver.
-        metric: How the distance from the prior is measured: "riemannian",
-            "euclidean" or "entropic"; see :func:`robotid.estimators.priors.make_penalty`.
+        metric: How the distance from the prior is measured: "euclidean",
+            "riemannian" or "entropic"; see :func:`robotid.estimators.priors.make_penalty`.
         constraints: Bounds beside physical consistency.
         solver: "clarabel" or "scs".
         choice: How ``prior_weight`` was chosen, if it was.
@@ -80,7 +80,7 @@ class Consistent(Estimator):
     prior_weight: float = 1.0
     independent_share: float = 1.0
     max_iterations: int = 200
-    metric: str = "riemannian"
+    metric: str = "euclidean"
     constraints: Constraints = field(default_factory=Constraints)
     solver: str = "clarabel"
     check: bool = False
@@ -136,7 +136,7 @@ class Consistent(Estimator):
             sigma=sigma,
             rank=wls.rank,
             condition=wls.condition,
-            undetermined=self.undetermined(covariance, factors.names),
+            undetermined=self.undetermined(rows, factors.names),
             converged=True,
             n_iter=solution.n_iter,
             message=solution.message,
@@ -174,7 +174,7 @@ class Consistent(Estimator):
             theta=solution.x,
             covariance=covariance,
             names=self.layout.names,
-            undetermined=self.undetermined(covariance, estimate.names),
+            undetermined=self.undetermined(rows, estimate.names),
             n_iter=estimate.n_iter + solution.n_iter,
             message=f"{estimate.message}; made physically possible, {solution.message}",
             prior_std=self.spread_before,
@@ -270,20 +270,26 @@ class Consistent(Estimator):
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
-    def undetermined(self, covariance: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
+    def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the base parameters about which the data say next to nothing.
 
+        They are those whose spread the data shrink by less than a tenth, whatever the metric of
+        the prior.
+
         Args:
-            covariance: Of the standard parameters, shape (p, p).
+            rows: Information, shape (k, b + 1), as of :meth:`rows`.
             base_names: Names of the base parameters.
 
         Returns:
             Their names.
         """
-        prior = self.programme.prior_covariance(self.prior_weight)
-        before = np.einsum("bi,ij,bj->b", self.K, prior, self.K)
-        after = np.einsum("bi,ij,bj->b", self.K, covariance, self.K)
-        is_open = (after > _PRIOR_LED**2 * before) & (before > 0)
+        KS = self.K * self.prior_std / np.sqrt(self.prior_weight)  # K times the prior's root
+        before = (KS**2).sum(axis=1)
+        _, s, Vt = np.linalg.svd(rows[:, :-1] @ KS, full_matrices=False)
+        after = before - (KS @ Vt.T) ** 2 @ (s**2 / (1.0 + s**2))
+        owners = np.array([name.rsplit(".", 1)[0] for name in self.layout.names])
+        is_free = ~np.isin(owners, self.constraints.pinned)
+        is_open = (after > _PRIOR_LED**2 * before) & self.K[:, is_free].any(axis=1)
         return tuple(np.array(base_names)[is_open].tolist())
 
     @property

@@ -1,0 +1,143 @@
+"""The weight of the prior chosen from the data: brute force, closed form, what it is good for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from synthetic import exact_log, truth
+
+from robotid.estimator_settings import EstimatorSettings
+from robotid.estimators import Consistent
+from robotid.estimators.weighting import choose_weight, held_out_error, log_evidence
+from robotid.exceptions import DataError, SettingsError
+from robotid.factors import compress, cut, merge
+from robotid.identification import identify, structural_mapping
+from robotid.prior import prior_spread
+from robotid.regressor import build_problem
+from robotid.signals import SignalSettings, process
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+
+
+@pytest.fixture
+def case(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+    problem = mapping.reduce(build_problem(ur5, trajectory))
+    prior = ur5.standard_parameters()
+    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+    return fit, problem
+
+
+def test_stretches_of_several_logs_make_the_number_wanted(case):
+    _, problem = case
+    assert len(cut(problem, 1)) == 1
+    assert len(cut(problem, 6)) == 6
+    assert len(cut(problem, 6, 2)) == 3
+    whole, parts = compress(problem), merge(cut(problem, 6))
+    np.testing.assert_array_equal(whole.rows, parts.rows)
+    theta = np.arange(58.0)
+    np.testing.assert_allclose(parts.residual_squares(theta), whole.residual_squares(theta))
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
+def test_the_evidence_is_the_density_of_the_data(case, metric):
+    fit, problem = case
+    fit = replace(fit, metric=metric)
+    rows = fit.rows(compress(problem), NOISE)
+    C = np.linalg.inv(0.5 * fit.penalty.hessian(fit.penalty.centre))
+    D, d = rows[:, :-1] @ fit.K, rows[:, -1]
+    stated, expected = [], []
+    for weight in (0.01, 1.0, 30.0):
+        S = np.eye(len(d)) + D @ C @ D.T / weight
+        mean = D @ fit.penalty.centre
+        expected.append(scipy.stats.multivariate_normal(mean, S).logpdf(d))
+        stated.append(log_evidence(fit, rows, weight))
+    np.testing.assert_allclose(np.diff(stated), np.diff(expected), rtol=1e-6, atol=1e-4)
+
+
+def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
+    # parameters drawn around the prior with a tenth of its spread: weight 100
+    fit, _ = case
+    fit = replace(fit, metric="euclidean")
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(8):
+        pi = fit.prior + 0.1 * fit.prior_std * rng.standard_normal(len(fit.prior))
+        D = rng.standard_normal((58, 58)) @ fit.K / fit.prior_std.mean()
+        rows = np.zeros((58, 59))
+        rows[:, :-1] = D @ np.linalg.pinv(fit.K)
+        rows[:, -1] = rows[:, :-1] @ (fit.K @ pi) + 1e-3 * rng.standard_normal(58)
+        weights = 10.0 ** np.arange(-1.0, 5.0, 0.25)
+        values = [log_evidence(fit, 1e3 * rows, weight) for weight in weights]
+        found.append(np.log10(weights[int(np.argmax(values))]))
+    assert np.mean(found) == pytest.approx(2.0, abs=0.2)
+
+
+def test_the_held_out_error_is_that_of_a_loop_by_hand(case):
+    fit, problem = case
+    stretches = cut(problem, 3)
+    total, count = 0.0, 0
+    for k in range(3):
+        others = [s for i, s in enumerate(stretches) if i != k]
+        rows = fit.rows(merge(others), NOISE)
+        pi = replace(fit, prior_weight=2.0).minimise(rows)[0].x
+        W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
+        part = slice(200 * 6 * k, 200 * 6 * (k + 1))
+        residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
+        total, count = total + (residual**2).sum(), count + residual.size
+    error = held_out_error(fit, stretches, NOISE, 2.0)
+    # it is computed to the solver's tolerance only
+    assert error == pytest.approx(np.sqrt(total / count), rel=2e-4)
+
+
+def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    for how in ("cv", "evidence"):
+        settings = EstimatorSettings(prior_weight=how)
+        found = identify(ur5, [log], signals=EXACT, estimator=settings)
+        prior = found.estimate.details["prior"]
+        assert prior["chosen_by"] == how
+        weights, scores = np.array(prior["curve"]).T
+        assert prior["weight"] == weights[np.argmin(scores)]
+        assert (np.diff(weights) > 0).all()
+        assert len(weights) >= 12
+
+
+def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
+    fit, problem = case
+    stretches = cut(problem, 4)
+    true = fit.fit(compress(problem)).theta
+    for how in ("cv", "evidence"):
+        good = choose_weight(replace(fit, prior=true), stretches, how).weight
+        bad = choose_weight(fit, stretches, how).weight
+        assert good >= 30 * bad, how
+
+
+def test_one_stretch_is_too_few(case):
+    fit, problem = case
+    with pytest.raises(DataError, match="cannot be chosen from 1 stretch"):
+        choose_weight(fit, [compress(problem)], "cv")
+
+
+def test_an_unknown_way_is_refused():
+    with pytest.raises(SettingsError, match="prior_weight is 'best', wanted a positive number or"):
+        EstimatorSettings(prior_weight="best")
+
+
+def test_poor_excitation_is_predicted_better_than_by_wls(ur5, rng):
+    # 2 s of motion, then a new one
+    pi = truth(ur5)
+    short = exact_log(ur5, pi, rng, samples=100, noise=NOISE)
+    new = exact_log(ur5, pi, rng, noise=NOISE)
+    for settings in (EstimatorSettings(), EstimatorSettings(prior_weight="cv")):
+        found = identify(ur5, [short], validation=[new], signals=EXACT, estimator=settings)
+        measured = found.validation[0].metrics
+        ours, wls = (
+            np.array([m.rmse for m in measured[name].per_joint.values()])
+            for name in ("estimate", "wls")
+        )
+        assert (ours < wls).all()
+        assert ours.sum() < 0.6 * wls.sum()
