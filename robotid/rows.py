@@ -21,11 +21,11 @@ from robotid.compiled import (
     work_per_sample,
 )
 from robotid.data import Trajectory
-from robotid.exceptions import MissingDependencyError
+from robotid.exceptions import DataError, MissingDependencyError
 from robotid.model import RobotModel
 from robotid.problem import RowSource
 
-__all__ = ["BLOCK", "COMPILED", "TrajectoryRows", "choose_engine"]
+__all__ = ["BLOCK", "COMPILED", "TrajectoryRows", "choose_engine", "trajectory_rows"]
 
 BLOCK = 512  # samples per block: fits in the cache with 100 columns
 COMPILED = "compiled by Numba"
@@ -175,6 +175,37 @@ class TrajectoryRows(RowSource):
         if self.engine == COMPILED:
             return CompiledWriter(self.model, self._tree, self._plan, out)
         return _PinocchioWriter(self.model, self._plan, out)
+
+
+def trajectory_rows(
+    model: RobotModel, trajectory: Trajectory, weight: Array | None, compiled: bool | None
+) -> TrajectoryRows:
+    """Return all rows of a trajectory with all standard parameters.
+
+    Args:
+        model: The robot; the trajectory's joints must be its joints, in its order.
+        trajectory: N samples.
+        weight: Weight of each row, shape (N, n_rows); None: all 1.
+        compiled: As of :func:`choose_engine`.
+
+    Returns:
+        The rows.
+
+    Raises:
+        DataError: If joints or shapes do not fit the model.
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
+    """
+    if trajectory.joints != model.joints:
+        raise DataError(
+            f"the trajectory has the joints {list(trajectory.joints)}, the model has "
+            f"{list(model.joints)}; read the log with joints=model.joints"
+        )
+    shape = (len(trajectory.t), model.n_rows)
+    weights = np.broadcast_to(1.0, shape) if weight is None else weight
+    if weights.shape != shape:
+        raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
+    kept, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
+    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine)
 
 
 class _PinocchioWriter:

@@ -21,7 +21,7 @@ FLOORS = {
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags",
     3: "array_files estimators plant lumping prior rows log_checks channel_checks",
-    4: "regressor excitation tables",
+    4: "regressor excitation tables prediction",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
     6: "identification closed_loop conversion explanations load_checks motion_checks",
     7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
@@ -37,7 +37,7 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
     "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior", "rows",
-    "compiled",
+    "compiled", "prediction",
 }  # fmt: skip
 NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 
