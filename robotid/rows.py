@@ -216,13 +216,17 @@ class _PinocchioWriter:
         self._model, self._plan, self._out = model, plan, out
         self._data = model.pin_model.createData()
         size = 10 * (model.pin_model.njoints - 1)
-        self._raw = np.empty((out.shape[1], nv, size))
         self._map = None if np.array_equal(G, np.eye(nv)) else G
         # tau = G^T tau_pinocchio: row j gathers those of Pinocchio's rows that it drives
-        self._sources = [
-            [(G[r, j], size * r + plan.inertial[j]) for r in np.flatnonzero(G[:, j])]
-            for j in range(model.n_rows)
-        ]
+        wanted, end = [], 0
+        self._sources: list[tuple[Array, float, slice, bool]] = []
+        for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
+            for k, r in enumerate(np.flatnonzero(G[:, j])):
+                wanted.append(size * r + columns)
+                part = slice(end, end := end + len(columns))
+                self._sources.append((places, G[r, j], part, k > 0))
+        self._wanted = np.concatenate(wanted)
+        self._raw = np.empty((out.shape[1], end))
 
     def load(self, q: Array, v: Array, a: Array, tau: Array, weights: Array | None) -> None:
         """Take the samples of the next blocks; see :meth:`CompiledWriter.load`."""
@@ -251,12 +255,12 @@ class _PinocchioWriter:
             self._raw, np.ascontiguousarray(self._model.configurations(q)), v, a, strict=False
         )
         for raw_k, q_k, v_k, a_k in instants:
-            raw_k[:] = regressor(model, data, q_k, v_k, a_k)
-        raw = self._raw[: len(q)].reshape(len(q), -1)
-        for places, sources in zip(self._plan.places, self._sources, strict=True):
-            for k, (ratio, index) in enumerate(sources):
-                part = raw[:, index].T if ratio == 1.0 else ratio * raw[:, index].T
-                self._out[places, : len(q)] = (self._out[places, : len(q)] + part) if k else part
+            # only what is wanted, before the regressor leaves the cache; no bound is checked
+            regressor(model, data, q_k, v_k, a_k).take(self._wanted, None, raw_k, "clip")
+        out, raw = self._out[:, : len(q)], self._raw[: len(q)].T
+        for places, ratio, part, is_added in self._sources:
+            values = raw[part] if ratio == 1.0 else ratio * raw[part]
+            out[places] = out[places] + values if is_added else values
 
 
 def _block_length(columns: int) -> int:
