@@ -219,12 +219,12 @@ class _PinocchioWriter:
         self._map = None if np.array_equal(G, np.eye(nv)) else G
         # tau = G^T tau_pinocchio: row j gathers those of Pinocchio's rows that it drives
         wanted, end = [], 0
-        self._sources: list[tuple[Array, float, slice, bool]] = []
+        self._sources: list[tuple[Array | slice, float, slice, bool]] = []
         for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
             for k, r in enumerate(np.flatnonzero(G[:, j])):
                 wanted.append(size * r + columns)
                 part = slice(end, end := end + len(columns))
-                self._sources.append((places, G[r, j], part, k > 0))
+                self._sources.append((_as_slice(places), G[r, j], part, k > 0))
         self._wanted = np.concatenate(wanted)
         self._raw = np.empty((out.shape[1], end))
 
@@ -249,6 +249,7 @@ class _PinocchioWriter:
 
     def _write_inertial(self, q: Array, v: Array, a: Array) -> None:
         regressor, model, data = pin.computeJointTorqueRegressor, self._model.pin_model, self._data
+        wanted = self._wanted
         if self._map is not None:
             v, a = v @ self._map.T, a @ self._map.T
         instants = zip(
@@ -256,11 +257,18 @@ class _PinocchioWriter:
         )
         for raw_k, q_k, v_k, a_k in instants:
             # only what is wanted, before the regressor leaves the cache; no bound is checked
-            regressor(model, data, q_k, v_k, a_k).take(self._wanted, None, raw_k, "clip")
+            regressor(model, data, q_k, v_k, a_k).take(wanted, None, raw_k, "clip")
         out, raw = self._out[:, : len(q)], self._raw[: len(q)].T
         for places, ratio, part, is_added in self._sources:
             values = raw[part] if ratio == 1.0 else ratio * raw[part]
             out[places] = out[places] + values if is_added else values
+
+
+def _as_slice(places: Array) -> Array | slice:
+    """Return a run of consecutive places as a slice, which is written to faster."""
+    if len(places) and (np.diff(places) == 1).all():
+        return slice(int(places[0]), int(places[-1]) + 1)
+    return places
 
 
 def _block_length(columns: int) -> int:
