@@ -14,7 +14,7 @@ from robotid.data import Trajectory
 from robotid.exceptions import DataError
 from robotid.model import RobotModel
 from robotid.problem import Block, Problem
-from robotid.rows import BLOCK, TrajectoryRows, choose_engine
+from robotid.rows import BLOCK, trajectory_rows
 
 __all__ = [
     "InstantRegressor",
@@ -184,16 +184,8 @@ def build_problem(
         DataError: If joints or shapes do not fit the model.
         MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
     """
-    if trajectory.joints != model.joints:
-        raise DataError(
-            f"the trajectory has the joints {list(trajectory.joints)}, the model has "
-            f"{list(model.joints)}; read the log with joints=model.joints"
-        )
-    shape = (len(trajectory.t), model.n_rows)
-    weights = np.broadcast_to(1.0, shape) if weight is None else weight
-    if weights.shape != shape:
-        raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
-
+    source = trajectory_rows(model, trajectory, weight, compiled)
+    shape, weights = source.weights.shape, source.weights
     length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
 
     def stream() -> Iterator[Block]:
@@ -208,12 +200,8 @@ def build_problem(
         for start in range(0, shape[0], length):
             yield mass_regressor(model, trajectory.q[start : start + length])
 
-    support = model.support()
-    kept = np.arange(len(model.layout.names))
-    engine = choose_engine(model, shape[0], compiled)
-    source = TrajectoryRows(model, trajectory, weights, support, kept, engine)
     masses = mass_stream if with_mass else None
-    return Problem(stream, model.layout.names, model.n_rows, support, masses, (source,))
+    return Problem(stream, model.layout.names, model.n_rows, source.support, masses, (source,))
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:

@@ -21,11 +21,11 @@ from robotid.compiled import (
     work_per_sample,
 )
 from robotid.data import Trajectory
-from robotid.exceptions import MissingDependencyError
+from robotid.exceptions import DataError, MissingDependencyError
 from robotid.model import RobotModel
 from robotid.problem import RowSource
 
-__all__ = ["BLOCK", "COMPILED", "TrajectoryRows", "choose_engine"]
+__all__ = ["BLOCK", "COMPILED", "TrajectoryRows", "choose_engine", "trajectory_rows"]
 
 BLOCK = 512  # samples per block: fits in the cache with 100 columns
 COMPILED = "compiled by Numba"
@@ -174,6 +174,37 @@ class TrajectoryRows(RowSource):
         return _PinocchioWriter(self.model, self._plan, out)
 
 
+def trajectory_rows(
+    model: RobotModel, trajectory: Trajectory, weight: Array | None, compiled: bool | None
+) -> TrajectoryRows:
+    """Return all rows of a trajectory with all standard parameters.
+
+    Args:
+        model: The robot; the trajectory's joints must be its joints, in its order.
+        trajectory: N samples.
+        weight: Weight of each row, shape (N, n_rows); None: all 1.
+        compiled: As of :func:`choose_engine`.
+
+    Returns:
+        The rows.
+
+    Raises:
+        DataError: If joints or shapes do not fit the model.
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
+    """
+    if trajectory.joints != model.joints:
+        raise DataError(
+            f"the trajectory has the joints {list(trajectory.joints)}, the model has "
+            f"{list(model.joints)}; read the log with joints=model.joints"
+        )
+    shape = (len(trajectory.t), model.n_rows)
+    weights = np.broadcast_to(1.0, shape) if weight is None else weight
+    if weights.shape != shape:
+        raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
+    kept, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
+    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine)
+
+
 class _PinocchioWriter:
     """Writes the inertial columns with Pinocchio's own function, sample by sample."""
 
@@ -182,13 +213,17 @@ class _PinocchioWriter:
         self._model, self._plan, self._out = model, plan, out
         self._data = model.pin_model.createData()
         size = 10 * (model.pin_model.njoints - 1)
-        self._raw = np.empty((out.shape[1], nv, size))
         self._map = None if np.array_equal(G, np.eye(nv)) else G
         # tau = G^T tau_pinocchio: row j gathers those of Pinocchio's rows that it drives
-        self._sources = [
-            [(G[r, j], size * r + plan.inertial[j]) for r in np.flatnonzero(G[:, j])]
-            for j in range(model.n_rows)
-        ]
+        wanted, end = [], 0
+        self._sources: list[tuple[Array | slice, float, slice, bool]] = []
+        for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
+            for k, r in enumerate(np.flatnonzero(G[:, j])):
+                wanted.append(size * r + columns)
+                part = slice(end, end := end + len(columns))
+                self._sources.append((_as_slice(places), G[r, j], part, k > 0))
+        self._wanted = np.concatenate(wanted)
+        self._raw = np.empty((out.shape[1], end))
 
     def load(self, q: Array, v: Array, a: Array, tau: Array, weights: Array | None) -> None:
         """Take the samples of the next blocks; see :meth:`CompiledWriter.load`."""
@@ -211,18 +246,26 @@ class _PinocchioWriter:
 
     def _write_inertial(self, q: Array, v: Array, a: Array) -> None:
         regressor, model, data = pin.computeJointTorqueRegressor, self._model.pin_model, self._data
+        wanted = self._wanted
         if self._map is not None:
             v, a = v @ self._map.T, a @ self._map.T
         instants = zip(
             self._raw, np.ascontiguousarray(self._model.configurations(q)), v, a, strict=False
         )
         for raw_k, q_k, v_k, a_k in instants:
-            raw_k[:] = regressor(model, data, q_k, v_k, a_k)
-        raw = self._raw[: len(q)].reshape(len(q), -1)
-        for places, sources in zip(self._plan.places, self._sources, strict=True):
-            for k, (ratio, index) in enumerate(sources):
-                part = raw[:, index].T if ratio == 1.0 else ratio * raw[:, index].T
-                self._out[places, : len(q)] = (self._out[places, : len(q)] + part) if k else part
+            # only what is wanted, before the regressor leaves the cache; no bound is checked
+            regressor(model, data, q_k, v_k, a_k).take(wanted, None, raw_k, "clip")
+        out, raw = self._out[:, : len(q)], self._raw[: len(q)].T
+        for places, ratio, part, is_added in self._sources:
+            values = raw[part] if ratio == 1.0 else ratio * raw[part]
+            out[places] = out[places] + values if is_added else values
+
+
+def _as_slice(places: Array) -> Array | slice:
+    """Return a run of consecutive places as a slice, which is written to faster."""
+    if len(places) and (np.diff(places) == 1).all():
+        return slice(int(places[0]), int(places[-1]) + 1)
+    return places
 
 
 def _block_length(columns: int) -> int:

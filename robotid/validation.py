@@ -11,7 +11,7 @@ from robotid._typing import Array
 from robotid.data import Log, Trajectory
 from robotid.metrics import Metrics, TorqueSums
 from robotid.model import RobotModel
-from robotid.regressor import build_problem
+from robotid.prediction import predict
 from robotid.signals import SignalSettings, process, resolve, unwrap
 
 __all__ = [
@@ -216,26 +216,6 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
         w = v[:, rows] @ np.array([ratio for _, ratio in coupling.ratios])
         mask[:, [first + row for row in rows]] &= (np.abs(w) >= min_velocity)[:, None]
     return mask
-
-
-def predict(model: RobotModel, parameters: Sequence[Array], trajectory: Trajectory) -> list[Array]:
-    """Return the torque that each of several parameter vectors predicts.
-
-    Args:
-        model: The robot.
-        parameters: Vectors of standard parameters, each of shape (p,).
-        trajectory: N samples of q, v, a.
-
-    Returns:
-        Torques, one array of shape (N, n_rows) per vector [N m, N].
-
-    Raises:
-        DataError: If the trajectory's joints are not the model's.
-    """
-    stacked = np.column_stack(list(parameters))  # (p, k)
-    rows = [W @ stacked for W, _, _ in build_problem(model, trajectory).blocks()]
-    torques = np.concatenate(rows).reshape(len(trajectory.t), model.n_rows, -1)
-    return [torques[:, :, k] for k in range(stacked.shape[1])]
 
 
 def evaluate(

@@ -23,7 +23,7 @@ FLOORS = {
     "time_stamps compiled columns array_tables csv_files parquet_files bags",
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
-    "constraint_settings task checkpoint",
+    "constraint_settings task checkpoint prediction",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe mass_matrix "
     "reduction",
     6: "recordings closed_loop conversion explanations load_checks motion_checks cluster",
@@ -41,7 +41,7 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
     "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior", "rows",
-    "compiled", "link_geometry", "mass_matrix",
+    "compiled", "link_geometry", "mass_matrix", "prediction",
 }  # fmt: skip
 NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 
