@@ -55,7 +55,8 @@ def near(model, rng):
     J = pseudo_inertia(model.standard_parameters()[:size])
     deform = np.array([scipy.linalg.expm(0.1 * rng.standard_normal((4, 4))) for _ in J])
     deform[:, 3, :3] = 0.0  # an affine map of the body's points
-    pi[:size] = inertial_from_pseudo_inertia(deform @ J @ deform.transpose(0, 2, 1)).reshape(-1)
+    deformed = deform @ J @ deform.transpose(0, 2, 1)
+    pi[:size] = np.concatenate([inertial_from_pseudo_inertia(J_i) for J_i in deformed])
     return pi
 
 
