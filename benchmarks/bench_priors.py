@@ -23,7 +23,7 @@ from robotid.data import Log
 from robotid.estimator_settings import EstimatorSettings, Prior, make_estimator
 from robotid.estimators import WLS
 from robotid.excitation import random_fourier
-from robotid.factors import cut, merge
+from robotid.factors import compress_stretches, merge
 from robotid.identification import structural_mapping
 from robotid.job import read_job
 from robotid.prior import prior_spread
@@ -164,7 +164,8 @@ def compare(model, signals, train, test, names):
     stretches = []
     for r in recordings:
         problem = mapping.reduce(build_problem(model, r.trajectory, r.mask.astype(float)))
-        stretches += cut(problem, STRETCHES, len(recordings))
+        length = -(-len(r.trajectory.t) * len(recordings) // STRETCHES)
+        stretches += compress_stretches(problem, length)
     factors = merge(stretches)
     spread = prior_spread(model, [r.trajectory for r in recordings])
     resolved = recordings[0].signals

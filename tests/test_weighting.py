@@ -11,7 +11,7 @@ from robotid.estimator_settings import EstimatorSettings
 from robotid.estimators import Consistent
 from robotid.estimators.weighting import choose_weight, held_out_error, log_evidence
 from robotid.exceptions import DataError, SettingsError
-from robotid.factors import compress, cut, merge
+from robotid.factors import compress, compress_stretches, gather, merge
 from robotid.identification import identify, structural_mapping
 from robotid.prior import prior_spread
 from robotid.regressor import build_problem
@@ -31,15 +31,18 @@ def case(ur5, rng):
     return fit, problem
 
 
-def test_stretches_of_several_logs_make_the_number_wanted(case):
+def cut(problem, count):
+    return compress_stretches(problem, -(-problem.sources[0].samples // count))
+
+
+def test_neighbours_are_gathered_in_order(case):
     _, problem = case
-    assert len(cut(problem, 1)) == 1
-    assert len(cut(problem, 6)) == 6
-    assert len(cut(problem, 6, 2)) == 3
-    whole, parts = compress(problem), merge(cut(problem, 6))
-    np.testing.assert_array_equal(whole.rows, parts.rows)
-    theta = np.arange(58.0)
-    np.testing.assert_allclose(parts.residual_squares(theta), whole.residual_squares(theta))
+    parts = cut(problem, 10)
+    folds = gather(parts, 3)
+    assert [int(fold.rows[0]) for fold in folds] == [180, 240, 180]
+    whole, theta = compress(problem), np.arange(58.0)
+    np.testing.assert_allclose(merge(folds).residual_squares(theta), whole.residual_squares(theta))
+    assert len(gather(parts, 20)) == 10
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
