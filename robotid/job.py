@@ -88,7 +88,7 @@ class Job:
     identification: tuple[LogEntry, ...] = ()
     validation: tuple[LogEntry, ...] = ()
     ignore: tuple[str, ...] = ()
-    rows_in_memory: int = 2**18
+    rows_in_memory: int = 2**17
     workers: int | None = None
 
     def __post_init__(self) -> None:
@@ -290,7 +290,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             estimator=EstimatorSettings(**table.get("estimator", {})),
             dynamics=table.get("output", {}).get("dynamics", False),
             ignore=tuple(table.get("doctor", {}).get("ignore", ())),
-            rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**18),
+            rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**17),
             workers=table.get("reduction", {}).get("workers"),
             **entries,
         )

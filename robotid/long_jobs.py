@@ -12,7 +12,7 @@ from robotid.tables import count_rows
 
 __all__ = ["is_long", "survey_logs"]
 
-_PIECES = 4  # pieces that the rows in memory are cut into: smoothing a piece takes some room
+_PIECES = 8  # pieces that the rows in memory are cut into: smoothing a piece takes some room
 _SHORTEST = 256  # rows of a piece
 
 
@@ -49,7 +49,7 @@ def survey_logs(
         mapping: Standard to base parameters.
 
     Returns:
-        The logs, cut into pieces of a fixed number of rows: a quarter of those in memory.
+        The logs, cut into pieces of a fixed number of rows: an eighth of those in memory.
 
     Raises:
         DataError: If a file cannot be used.

@@ -24,7 +24,7 @@ from robotid.pieces import Piece, Reduction
 from robotid.recordings import base_problem
 from robotid.rows import COMPILED, choose_engine
 from robotid.signals import SignalSettings, decide, unwrap, velocity_lag
-from robotid.smoothing import SPLINE, Stretch, memory, process_stretches
+from robotid.smoothing import SPLINE, Stretch, filter_reach, process_stretches
 from robotid.tables import open_table
 from robotid.time_stamps import TimeStamps
 from robotid.units import check_reach, check_units
@@ -33,8 +33,8 @@ from robotid.validation import row_mask
 __all__ = ["PIECE", "LogPiece", "LongLog", "survey"]
 
 #: Rows of a piece, if nothing else is said.
-PIECE = 65536
-_WINDOW = 25_000  # rows of each window that is looked at closely
+PIECE = 16384
+_WINDOW = 20_000  # rows of each window that is looked at closely
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class LogPiece(Piece):
 
     @property
     def name(self) -> str:
-        """What messages call it, as ``run3.parquet rows 0-65536``."""
+        """What messages call it, as ``run3.parquet rows 0-16384``."""
         return f"{Path(self.header.layout.path).name} rows {self.first}-{self.stop}"
 
     @property
@@ -348,7 +348,7 @@ def _cut(
     length: int,
 ) -> Iterator[LogPiece]:
     """Yield pieces of so many rows each, and which rows are to be read with each."""
-    reach = memory(header.signals)
+    reach = filter_reach(header.signals)
     begins = [stretch.first for stretch in stretches]
     for first in range(*window, length):
         stop = min(first + length, window[1])

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from robotid.data import Trajectory
 from robotid.long_logs import LogPiece, LongLog
 from robotid.metrics import TorqueSums
 from robotid.model import RobotModel
-from robotid.pieces import Reduction
+from robotid.pieces import Reduction, join_stretches
 from robotid.problem import Block, Problem
 from robotid.recordings import Recordings, base_problem, independent_share
 from robotid.signals import turns_note
@@ -35,6 +35,10 @@ from robotid.work_plan import WorkPlan
 __all__ = ["LongRecordings", "evaluate_long"]
 
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
+
+_STRETCHES = 64  # of each log whose factors are kept apart
+_FACTORS = 2**26  # bytes of them all, if that leaves each log a few
+_FEW = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +71,7 @@ class LongRecordings(Recordings):
             mapping: Standard to base parameters; that which the logs were surveyed with.
 
         Returns:
-            One reduction per piece.
+            One reduction per stretch of neighbouring pieces of a log.
 
         Raises:
             DataError: If a row cannot be used, or no stretch of a log is long enough.
@@ -75,8 +79,11 @@ class LongRecordings(Recordings):
         pieces = [piece for log in self.fitted for piece in log.pieces]
         found = iter(self.plan.reduce(pieces, checkpoint=self.checkpoint))
         reductions = []
+        size = 8 * self.model.n_rows * (len(mapping.independent) + 1) ** 2 * len(self.fitted)
+        most = max(_FEW, min(_STRETCHES, _FACTORS // size))
         for log in self.fitted:
-            own = [next(found) for _ in log.pieces]
+            count = len(log.pieces)
+            own = join_stretches(islice(found, count), count, most)
             if not any(reduction.samples for reduction in own):
                 raise too_short(log.path, len(log.stretches), log.header.signals)
             reductions += own

@@ -89,7 +89,7 @@ class _ParquetRows(RowReader):
         row = 0
         with _open(self.path, _BUFFER) as file:
             _check_types(file, [name], self.path.name)
-            for batch in file.iter_batches(_BATCH, columns=[name]):
+            for batch in file.iter_batches(_BATCH, columns=[name], use_threads=False):
                 yield _to_numpy(batch.column(0)), Place(row)
                 row += batch.num_rows
 
@@ -101,16 +101,16 @@ class _ParquetRows(RowReader):
             sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
             edges = np.cumsum([0, *sizes])
             groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
-            row = int(edges[groups[0]])
-            for batch in file.iter_batches(_BATCH, row_groups=groups, columns=list(wanted)):
-                start, end = max(first - row, 0), min(stop - row, batch.num_rows)
-                if start < end:
-                    part = slice(row + start - first, row + end - first)
-                    for name, array in zip(batch.schema.names, batch.columns, strict=True):
-                        values[name][part] = _to_numpy(array.slice(start, end - start))
-                row += batch.num_rows
-                if row >= stop:
-                    break
+            for name in wanted:  # one by one: each column read holds some pages in memory
+                row, how = int(edges[groups[0]]), {"row_groups": groups, "use_threads": False}
+                for batch in file.iter_batches(_BATCH, columns=[name], **how):
+                    start, end = max(first - row, 0), min(stop - row, batch.num_rows)
+                    if start < end:
+                        part = slice(row + start - first, row + end - first)
+                        values[name][part] = _to_numpy(batch.column(0).slice(start, end - start))
+                    row += batch.num_rows
+                    if row >= stop:
+                        break
         return values
 
 

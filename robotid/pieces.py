@@ -5,7 +5,7 @@ to never depends on who reduces it, nor on what else is reduced beside it.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from robotid.exceptions import DataError
 from robotid.factors import Factors, compress, merge
 from robotid.problem import Problem
 
-__all__ = ["Piece", "Reduction", "join"]
+__all__ = ["Piece", "Reduction", "join", "join_stretches"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Piece(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What messages call it, as ``run3.parquet rows 0-65536``."""
+        """What messages call it, as ``run3.parquet rows 0-16384``."""
 
     @property
     @abstractmethod
@@ -135,3 +135,29 @@ def _join_neighbours(reductions: Sequence[Reduction]) -> Reduction:
         np.sum([r.squares for r in reductions], axis=0),
         sum(r.samples for r in reductions),
     )
+
+
+def join_stretches(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
+    """Return the reductions of at most so many stretches of neighbouring pieces.
+
+    They are joined as they come, so that no more are in memory.
+
+    Args:
+        reductions: One per piece, in order.
+        count: Number of pieces, at least 1.
+        most: Largest number of stretches, at least 1.
+
+    Returns:
+        One per stretch, in order; the last stretch may be shorter.
+
+    Raises:
+        DataError: If their columns or joints differ.
+    """
+    length = -(-count // most)
+    stretches: list[Reduction] = []
+    for k, reduction in enumerate(reductions):
+        if k % length:
+            stretches[-1] = join([stretches[-1], reduction])
+        else:
+            stretches.append(reduction)
+    return stretches

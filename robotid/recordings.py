@@ -36,7 +36,7 @@ class Recordings(ABC):
             mapping: Standard to base parameters.
 
         Returns:
-            One reduction per log or piece of a log, in order.
+            One reduction per log or stretch of a log, in order.
 
         Raises:
             DataError: If a row cannot be used.

@@ -246,6 +246,7 @@ def map_pieces(
     )  # fmt: skip
     report(what, done, total, "samples")
     early: dict[int, Any] = {}
+    left = len(missing)
     with closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
         for k in range(len(pieces)):
             while k not in kept and k not in early:
@@ -255,9 +256,10 @@ def map_pieces(
                     checkpoint.save(index, pieces[index].name, result)
                 done += pieces[index].samples
                 report(what, done, total, "samples")
+                left -= 1
+                if not left:
+                    next(finished, None)  # there is none: the work ends, and is not broken off
             yield early.pop(k) if checkpoint is None or k not in kept else checkpoint.load(k)
-        if missing:
-            next(finished, None)  # there is none: the work ends of itself and is not broken off
 
 
 def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:

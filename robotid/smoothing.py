@@ -13,7 +13,7 @@ from robotid.data import Log, Trajectory
 from robotid.exceptions import DataError
 from robotid.signal_settings import SignalSettings
 
-__all__ = ["SPLINE", "Stretch", "memory", "process_stretches", "too_short"]
+__all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"]
 
 #: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
 SPLINE = 64
@@ -56,7 +56,7 @@ def process_stretches(
     """Return the smooth motion of uninterrupted stretches, or of a part of them.
 
     A part is as smooth as if the whole had been processed, if the log has the rows of its
-    stretches that are within :func:`memory` of its own rows.
+    stretches that are within :func:`filter_reach` of its own rows.
 
     Args:
         log: Rows of the stretches, all of them or a part.
@@ -84,7 +84,7 @@ def process_stretches(
     )  # fmt: skip
 
 
-def memory(settings: SignalSettings) -> float:
+def filter_reach(settings: SignalSettings) -> float:
     """Return how long before and after a row others have a say in its smooth value [s].
 
     Args:

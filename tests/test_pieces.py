@@ -8,7 +8,7 @@ from synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
 from robotid.identification import structural_mapping
-from robotid.pieces import Reduction, join
+from robotid.pieces import Reduction, join, join_stretches
 from robotid.regressor import build_problem, joint_torque_regressor
 from robotid.signals import SignalSettings
 from robotid.validation import prepare
@@ -36,6 +36,19 @@ def test_reductions_of_the_parts_join_to_that_of_the_whole(ur5, rng):
     np.testing.assert_allclose(whole.squares[1], (motion.v**2).sum(axis=0), rtol=1e-13)
     for one, other in zip(joined.factors.R, whole.factors.R, strict=True):
         np.testing.assert_allclose(one.T @ one, other.T @ other, rtol=1e-10, atol=1e-10)
+
+
+def test_neighbours_are_joined_to_few_stretches(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng)
+    edges = np.linspace(0, 12, 11)
+    ends = np.nextafter(edges[1:], 0)
+    parts = [reduction(ur5, log.window(*x))[0] for x in zip(edges[:-1], ends, strict=True)]
+    found = join_stretches(iter(parts), len(parts), 4)
+    assert [x.samples for x in found] == [180, 180, 180, 60]
+    again = join_stretches(iter(parts), len(parts), 64)
+    assert [x.samples for x in again] == [60] * 10
+    for x in (found, again):
+        np.testing.assert_allclose(join(x).squares, join(parts).squares, rtol=1e-13)
 
 
 def test_nothing_cannot_be_joined():

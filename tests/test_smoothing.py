@@ -7,7 +7,7 @@ import pytest
 
 from robotid.data import Log
 from robotid.signals import SignalSettings, process, resolve
-from robotid.smoothing import SPLINE, Stretch, memory, process_stretches
+from robotid.smoothing import SPLINE, Stretch, filter_reach, process_stretches
 
 RATE = 200.0  # [Hz]
 PART = 700  # rows
@@ -37,7 +37,7 @@ def in_parts(log, settings):
     for start in range(0, len(log.t), PART):
         stop = min(start + PART, len(log.t))
         mine = [s for s in stretches if s.first < stop and s.stop > start]
-        reach = memory(settings)
+        reach = filter_reach(settings)
         before = int(np.searchsorted(log.t, log.t[start] - reach)) - SPLINE
         after = int(np.searchsorted(log.t, log.t[stop - 1] + reach)) + SPLINE
         low, high = max(before, mine[0].first), min(after, mine[-1].stop)
@@ -89,8 +89,10 @@ def test_parts_give_the_motion_of_the_whole(case, rng):
 def test_rows_that_a_part_does_not_own_are_cut_off_behind_the_filter(rng):
     log = recording(rng)
     settings = resolve(log, SignalSettings())
-    reach = memory(settings)
+    reach = filter_reach(settings)
     # an order of 4 at 8 Hz forgets by 1 / e in 0.05 s
     assert 1.5 < reach < 3.0
-    assert memory(resolve(log, SignalSettings(cutoff=None))) == 0.0
-    assert memory(resolve(log, SignalSettings(torque_delay=-0.4))) == pytest.approx(reach + 0.4)
+    assert filter_reach(resolve(log, SignalSettings(cutoff=None))) == 0.0
+    assert filter_reach(resolve(log, SignalSettings(torque_delay=-0.4))) == pytest.approx(
+        reach + 0.4
+    )
