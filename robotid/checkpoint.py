@@ -77,33 +77,47 @@ class Checkpoint:
         _write(folder / "inputs.json", text.encode())
         return found
 
-    def load(self, pieces: Sequence[Piece]) -> dict[int, Reduction]:
-        """Return the reductions that are kept.
+    def finished(self) -> frozenset[int]:
+        """Return the indices of the pieces whose reductions are kept."""
+        return frozenset(int(path.stem.split("-")[1]) for path in self.folder.glob("piece-*.npz"))
+
+    def load(self, index: int) -> Reduction:
+        """Return a reduction that is kept.
 
         Args:
-            pieces: The pieces that the checkpoint was opened with.
+            index: Which piece.
 
         Returns:
-            Reductions by index of the piece.
+            The reduction, to the same bits.
 
         Raises:
-            DataError: If a file cannot be read or belongs to other inputs.
+            DataError: If the file cannot be read or belongs to other inputs.
         """
-        paths = {k: self._path(k) for k in range(len(pieces))}
-        return {k: self._read(path) for k, path in paths.items() if path.is_file()}
+        path = self._path(index)
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                content = dict(arrays)
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise DataError(
+                f"{path} cannot be read ({error}); delete it, its piece is reduced again",
+                "checkpoint",
+            ) from error
+        if str(content.pop("key")) != self.key:
+            raise DataError(f"{path} belongs to other inputs; delete it", "checkpoint")
+        return Reduction.from_arrays(content)
 
-    def save(self, index: int, piece: Piece, reduction: Reduction) -> None:
+    def save(self, index: int, name: str, reduction: Reduction) -> None:
         """Keep the reduction of a piece; the file is there as a whole or not at all.
 
         Args:
             index: Which piece.
-            piece: The piece.
+            name: Name of the piece.
             reduction: What it came down to.
         """
         path = self._path(index)
         beside = path.with_suffix(".partial")
         content: dict[str, Any] = reduction.to_arrays()
-        content |= {"key": self.key, "piece": piece.name}
+        content |= {"key": self.key, "piece": name}
         with beside.open("wb") as file:
             np.savez(file, **content)
             file.flush()
@@ -116,20 +130,6 @@ class Checkpoint:
 
     def _path(self, index: int) -> Path:
         return self.folder / f"piece-{index:06d}.npz"
-
-    def _read(self, path: Path) -> Reduction:
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                content = dict(arrays)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise DataError(
-                f"{path} cannot be read ({error}); delete it, its piece is reduced again",
-                "checkpoint",
-            ) from error
-        if str(content.pop("key")) != self.key:
-            raise DataError(f"{path} belongs to other inputs; delete it", "checkpoint")
-        content.pop("piece")
-        return Reduction.from_arrays(content)
 
     def _require_same(self, stated: Mapping[str, Any]) -> None:
         path = self.folder / "inputs.json"

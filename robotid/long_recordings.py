@@ -241,7 +241,7 @@ def _score_logs(
     """Return what is known of each log."""
     parts = [_parts(log) for log in logs]
     work = partial(_score, parameters=parameters, prior=prior, sought=sought)
-    scores = iter(plan.map(work, list(chain.from_iterable(parts)), "evaluating"))
+    scores = plan.map(work, list(chain.from_iterable(parts)), "evaluating")
     return [reduce(_Score.join, [next(scores) for _ in own]) for own in parts]
 
 

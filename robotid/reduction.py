@@ -10,11 +10,10 @@ import os
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
@@ -177,7 +176,7 @@ def reduce_pieces(
     backend: Backend | None = None,
     checkpoint: Checkpoint | None = None,
     progress: ProgressCallback | None = None,
-) -> tuple[Reduction, ...]:
+) -> Iterator[Reduction]:
     """Reduce pieces; the result has the same bits whatever the backend.
 
     Args:
@@ -186,20 +185,24 @@ def reduce_pieces(
         checkpoint: Where finished pieces are kept and, if resumed, taken from.
         progress: Called with ("reducing", samples done, samples in all, "samples").
 
-    Returns:
+    Yields:
         One reduction per piece, in order; :func:`robotid.pieces.join` gives the whole.
 
     Raises:
         DataError: If a row cannot be used.
         WorkerError: If a worker ends before its work.
     """
-    found = {} if checkpoint is None else checkpoint.load(pieces)
-    keep = None if checkpoint is None else partial(_keep, checkpoint, pieces)
     try:
-        return map_pieces(
-            reduce_piece, pieces, "reducing", backend=backend, progress=progress,
-            found=found, keep=keep,
-        )  # fmt: skip
+        yield from map_pieces(
+            reduce_piece,
+            pieces,
+            "reducing",
+            backend=backend,
+            progress=progress,
+            checkpoint=checkpoint,
+        )
+    except GeneratorExit:
+        raise
     except BaseException as error:
         if checkpoint is not None:
             error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
@@ -213,10 +216,9 @@ def map_pieces(
     *,
     backend: Backend | None = None,
     progress: ProgressCallback | None = None,
-    found: Mapping[int, Any] | None = None,
-    keep: Callable[[int, Any], None] | None = None,
-) -> tuple[Any, ...]:
-    """Do the same with every piece.
+    checkpoint: Checkpoint | None = None,
+) -> Iterator[Any]:
+    """Do the same with every piece; no more results are in memory than are ahead of their turn.
 
     Args:
         work: What to do with a piece.
@@ -224,10 +226,9 @@ def map_pieces(
         what: What the work is called.
         backend: Where it is done; in this process if None.
         progress: Called with (what, samples done, samples in all, "samples").
-        found: Results that are there already, by index of the piece.
-        keep: Called with index and result of each piece that is finished.
+        checkpoint: Where results are kept, if they are reductions, and taken from.
 
-    Returns:
+    Yields:
         One result per piece, in order.
 
     Raises:
@@ -235,23 +236,30 @@ def map_pieces(
         WorkerError: If a worker ends before its work.
     """
     chosen, report = backend or SerialBackend(), progress or ignore_progress
-    results = dict(found or {})
-    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in results]
+    kept = frozenset() if checkpoint is None else checkpoint.finished()
+    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in kept]
     total = sum(piece.samples for piece in pieces)
     done = total - sum(piece.samples for _, piece in missing)
     _log.info(
         "%s %d pieces, %d of them kept from before, %d samples in all: %s",
-        what, len(pieces), len(results), total, chosen.description,
+        what, len(pieces), len(kept), total, chosen.description,
     )  # fmt: skip
     report(what, done, total, "samples")
+    early: dict[int, Any] = {}
+    left = len(missing)
     with closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
-        for index, result in finished if missing else ():
-            if keep is not None:
-                keep(index, result)
-            results[index] = result
-            done += pieces[index].samples
-            report(what, done, total, "samples")
-    return tuple(results[k] for k in range(len(pieces)))
+        for k in range(len(pieces)):
+            while k not in kept and k not in early:
+                index, result = next(finished)
+                early[index] = result
+                if checkpoint is not None:
+                    checkpoint.save(index, pieces[index].name, result)
+                done += pieces[index].samples
+                report(what, done, total, "samples")
+                left -= 1
+                if not left:
+                    next(finished, None)  # there is none: the work ends, and is not broken off
+            yield early.pop(k) if checkpoint is None or k not in kept else checkpoint.load(k)
 
 
 def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
@@ -309,12 +317,6 @@ def _collect(
             "a worker process ended in the middle of its work (killed from outside, short of "
             f"memory, or a script without the guard if __name__ == '__main__'); under way: {names}"
         ) from error
-
-
-def _keep(
-    checkpoint: Checkpoint, pieces: Sequence[Piece], index: int, reduction: Reduction
-) -> None:
-    checkpoint.save(index, pieces[index], reduction)
 
 
 @contextmanager

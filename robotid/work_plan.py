@@ -81,14 +81,14 @@ class WorkPlan:
 
     def reduce(
         self, pieces: Sequence[Piece], *, checkpoint: Checkpoint | None = None
-    ) -> tuple[Reduction, ...]:
+    ) -> Iterator[Reduction]:
         """Reduce pieces; see :func:`robotid.reduction.reduce_pieces`.
 
         Args:
             pieces: The pieces.
             checkpoint: Where finished pieces are kept.
 
-        Returns:
+        Yields:
             One reduction per piece, in order.
 
         Raises:
@@ -96,11 +96,11 @@ class WorkPlan:
             WorkerError: If a worker ends before its work.
         """
         with self._backend(pieces) as backend:
-            return reduce_pieces(
+            yield from reduce_pieces(
                 pieces, backend=backend, checkpoint=checkpoint, progress=self.progress
             )
 
-    def map(self, work: Work, pieces: Sequence[Workload], what: str) -> tuple[Any, ...]:
+    def map(self, work: Work, pieces: Sequence[Workload], what: str) -> Iterator[Any]:
         """Do the same with every piece; see :func:`robotid.reduction.map_pieces`.
 
         Args:
@@ -108,7 +108,7 @@ class WorkPlan:
             pieces: The pieces.
             what: What the work is called.
 
-        Returns:
+        Yields:
             One result per piece, in order.
 
         Raises:
@@ -116,4 +116,4 @@ class WorkPlan:
             WorkerError: If a worker ends before its work.
         """
         with self._backend(pieces) as backend:
-            return map_pieces(work, pieces, what, backend=backend, progress=self.progress)
+            yield from map_pieces(work, pieces, what, backend=backend, progress=self.progress)

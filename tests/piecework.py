@@ -99,6 +99,11 @@ def pieces_in(folder, count=10, pause=0.0, faults=()):
     return [RandomPiece(k, str(folder), pause, by_seed.get(k, "")) for k in range(count)]
 
 
+def reduce_all(pieces, **options):
+    """Return the reductions of all pieces."""
+    return tuple(reduce_pieces(pieces, **options))
+
+
 def same_bits(one, other):
     """Return whether two reductions are equal to the last bit."""
     ours, theirs = one.to_arrays(), other.to_arrays()
@@ -113,7 +118,7 @@ def main(folder, workers, *words):
     checkpoint = Checkpoint.open(folder, {"inputs": "these"}, pieces, resume="resume" in words)
     backend = ProcessBackend(int(workers)) if int(workers) > 1 else SerialBackend()
     with backend:
-        found = reduce_pieces(pieces, backend=backend, checkpoint=checkpoint)
+        found = reduce_all(pieces, backend=backend, checkpoint=checkpoint)
     with open(Path(folder) / "joined.npz", "wb") as file:
         np.savez(file, **join(found).to_arrays())
     checkpoint.remove()

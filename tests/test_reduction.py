@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from piecework import marks, pieces_in, same_bits, workers_of
+from piecework import marks, pieces_in, reduce_all, same_bits, workers_of
 
 from robotid.exceptions import (
     DataError,
@@ -22,7 +22,7 @@ from robotid.exceptions import (
 )
 from robotid.factors import available_cores
 from robotid.pieces import Reduction, join
-from robotid.reduction import ProcessBackend, choose_workers, reduce_pieces
+from robotid.reduction import ProcessBackend, choose_workers
 
 SCRIPT = Path(__file__).with_name("piecework.py")
 
@@ -57,10 +57,10 @@ def kept(folder):
 def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
     pieces = pieces_in(tmp_path / "marks")
     calls = []
-    serial = reduce_pieces(pieces, progress=lambda *call: calls.append(call))
+    serial = reduce_all(pieces, progress=lambda *call: calls.append(call))
     for workers in (1, 2):
         with ProcessBackend(workers) as backend:
-            found = reduce_pieces(pieces, backend=backend)
+            found = reduce_all(pieces, backend=backend)
         assert all(map(same_bits, found, serial))
         assert same_bits(join(found), join(serial))
     assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
@@ -74,13 +74,13 @@ def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
 def test_two_workers_work_at_the_same_time(tmp_path):
     pieces = pieces_in(tmp_path / "marks", 2, faults={0: "meet", 1: "meet"}.items())
     with ProcessBackend(2) as backend:
-        reduce_pieces(pieces, backend=backend)
+        reduce_all(pieces, backend=backend)
 
 
 def test_workers_wait_for_more_work_and_end_when_they_are_let_go(tmp_path):
     pieces = pieces_in(tmp_path / "marks", 4)
     with ProcessBackend(1) as backend:
-        once, again = (reduce_pieces(pieces, backend=backend) for _ in range(2))
+        once, again = (reduce_all(pieces, backend=backend) for _ in range(2))
         (worker,) = workers_of(tmp_path / "marks")
         assert is_running(worker)
     assert not is_running(worker)
@@ -91,7 +91,7 @@ def test_reductions_come_back_in_the_order_of_the_pieces(tmp_path):
     pieces = pieces_in(tmp_path / "marks", 4)
     late = [type(pieces[0])(0, pieces[0].marks, pause=0.5), *pieces[1:]]
     with ProcessBackend(2) as backend:
-        found = reduce_pieces(late, backend=backend)
+        found = reduce_all(late, backend=backend)
     assert [r.samples for r in found] == [100, 101, 102, 103]
 
 
@@ -99,7 +99,7 @@ def test_reductions_come_back_in_the_order_of_the_pieces(tmp_path):
 def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(tmp_path, backend):
     pieces = pieces_in(tmp_path / "marks", faults={3: "data"}.items())
     with pytest.raises(DataError, match="row 7 is not finite") as caught:
-        reduce_pieces(pieces, backend=backend)
+        reduce_all(pieces, backend=backend)
     assert caught.value.code == "not_finite"
     assert "while working on random rows 3" in caught.value.__notes__
 
@@ -107,7 +107,7 @@ def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(tmp_path, backe
 def test_a_worker_that_is_killed_is_an_error_that_names_what_was_under_way(tmp_path):
     pieces = pieces_in(tmp_path / "marks", faults={2: "kill"}.items())
     with pytest.raises(WorkerError, match="worker process ended in the middle") as caught:
-        reduce_pieces(pieces, backend=ProcessBackend(2))
+        reduce_all(pieces, backend=ProcessBackend(2))
     assert "random rows 2" in str(caught.value)
     assert eventually(lambda: not any(map(is_running, workers_of(tmp_path / "marks"))))
 
@@ -119,7 +119,7 @@ def test_what_stops_the_caller_ends_the_workers(tmp_path):
 
     pieces = pieces_in(tmp_path / "marks", 40, pause=0.1)
     with pytest.raises(KeyboardInterrupt):
-        reduce_pieces(pieces, backend=ProcessBackend(2), progress=stop)
+        reduce_all(pieces, backend=ProcessBackend(2), progress=stop)
     done = len(marks(tmp_path / "marks"))
     assert done < 10
     assert not any(map(is_running, workers_of(tmp_path / "marks")))
@@ -146,7 +146,7 @@ def test_a_run_that_was_killed_resumes_to_the_same_bits(tmp_path, number, worker
     ) - finished
     with np.load(tmp_path / "joined.npz") as arrays:
         resumed = Reduction.from_arrays(arrays)
-    assert same_bits(resumed, join(reduce_pieces(pieces_in(tmp_path / "other"))))
+    assert same_bits(resumed, join(reduce_all(pieces_in(tmp_path / "other"))))
     assert not (tmp_path / ".robotid-checkpoint").exists()
 
 

@@ -1,0 +1,84 @@
+"""Worker processes on one long log: time of the reduction, ratio to one process, same bits.
+
+Writes a Parquet log of a simulated Panda (7 joints, 1 kHz), surveys it, and reduces its pieces in
+this process and in worker processes, one BLAS thread each. "with start" holds the start of the
+workers; "s" is the next reduction by the same workers. Wall-clock time: other work on the machine
+shows in it.
+
+    python benchmarks/bench_workers.py [--quick] [--workers 1 2 4]
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import bench_memory
+from setting import ROBOTS, machine
+
+from robotid.examples import example_urdf
+from robotid.identification import structural_mapping
+from robotid.job import Job, LogEntry
+from robotid.long_jobs import survey_logs
+from robotid.pieces import join
+from robotid.work_plan import WorkPlan
+
+WRITE = Path(bench_memory.__file__)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a short log")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2], metavar="N")
+    options = parser.parse_args()
+    rows = 30_000 if options.quick else 10**6
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.parquet"
+        subprocess.run([sys.executable, WRITE, "--write", path, str(rows)], check=True)
+        pieces = survey(path, 2**14 if options.quick else 2**17)
+        print("| workers | with start, s | s | samples/s | ratio to the first | same bits |")
+        print("|" + "---|" * 6)
+        first = None
+        for workers in options.workers:
+            with WorkPlan(workers) as plan:
+                (started, whole), (again, _) = (timed(plan, pieces) for _ in range(2))
+            first = first or (again, whole)
+            same = identical(whole, first[1])
+            cells = [f"{started:.2f}", f"{again:.2f}", f"{rows / again:,.0f}"]
+            cells += [f"{first[0] / again:.2f}", "yes" if same else "NO"]
+            print(f"| {workers} | " + " | ".join(cells) + " |", flush=True)
+            if not same:
+                sys.exit(f"{workers} workers gave other bits")
+    print(f"\n{rows} rows in {len(pieces)} pieces; {machine()}, load {os.getloadavg()[0]:.1f}")
+
+
+def survey(path, rows_in_memory):
+    joints = tuple(ROBOTS["panda"][1]["joints"])
+    entry = LogEntry(path)
+    job = Job(
+        example_urdf("panda.urdf"),
+        joints=joints,
+        identification=(entry,),
+        rows_in_memory=rows_in_memory,
+    )
+    model = job.model()
+    (log,) = survey_logs(job, [entry], model, structural_mapping(model))
+    return log.pieces
+
+
+def timed(plan, pieces):
+    start = time.perf_counter()
+    whole = join(list(plan.reduce(pieces)))
+    return time.perf_counter() - start, whole
+
+
+def identical(one, other):
+    ours, theirs = one.to_arrays(), other.to_arrays()
+    return all(ours[key].tobytes() == theirs[key].tobytes() for key in ours)
+
+
+if __name__ == "__main__":
+    main()
