@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from robotid._typing import Array
+from robotid.bands import TorqueBand, torque_band
 from robotid.base_parameters import BaseMapping, base_mapping
 from robotid.data import Log
 from robotid.estimator_settings import (
@@ -62,7 +63,7 @@ class Identification:
         prior: Standard parameters of the URDF, shape (p,).
         prior_std: How far they may plausibly be wrong, shape (p,).
         standard: Standard parameters, shape (p,).
-        standard_error: Their standard errors given the prior, shape (p,).
+        standard_covariance: Their covariance given the prior, shape (p, p).
         base: Base parameters, shape (b,).
         base_error: Their standard errors, shape (b,); inf where the data say nothing.
         identification: The recordings that were fitted, with predictions "estimate" and "wls".
@@ -79,7 +80,7 @@ class Identification:
     prior: Array
     prior_std: Array
     standard: Array
-    standard_error: Array
+    standard_covariance: Array
     base: Array
     base_error: Array
     identification: tuple[Evaluation, ...]
@@ -104,6 +105,13 @@ class Identification:
         return check_mass_matrix(self.model, self.standard)
 
     @property
+    def standard_error(self) -> Array:
+        """Standard errors of the standard parameters given the prior, shape (p,)."""
+        # exact data leave a variance of rounding size, of either sign
+        errors: Array = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
+        return errors
+
+    @property
     def sources(self) -> tuple[str, ...]:
         """Where each standard parameter comes from: "data", "mixed" or "prior"."""
         share = self.standard_error / np.maximum(self.prior_std, _KNOWN)
@@ -113,6 +121,30 @@ class Identification:
         pinned = self.estimate.details.get("pinned", ())
         kept = [name.rsplit(".", 1)[0] in pinned for name in self.model.layout.names]
         return tuple(np.where(kept, "prior", names).tolist())
+
+    @property
+    def base_interval(self) -> Array:
+        """95 % interval of each base parameter, shape (b, 2); infinite where it is open."""
+        half = self.errors.reach * self.base_error
+        return np.column_stack([self.base - half, self.base + half])
+
+    def band(self, evaluation: Evaluation) -> TorqueBand:
+        """Return how far the torques predicted for a recording can be trusted.
+
+        Args:
+            evaluation: One of the recordings.
+
+        Returns:
+            The band.
+        """
+        K, C = self.mapping.K, self.standard_covariance
+        return torque_band(
+            self.model,
+            self.mapping,
+            evaluation.recording.trajectory,
+            K @ C @ K.T,
+            self.estimate.sigma,
+        )
 
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.
@@ -235,9 +267,8 @@ def conclude(
         prior=prior,
         prior_std=spread if estimate.prior_std is None else estimate.prior_std,
         standard=standard,
-        standard_error=np.sqrt(np.maximum(np.diag(covariance), 0.0)),
+        standard_covariance=covariance,
         base=mapping.to_base(standard),
-        # exact data leave a variance of rounding size, of either sign
         base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
         identification=fitted,
         validation=kept,

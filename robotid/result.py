@@ -13,6 +13,7 @@ import numpy as np
 
 from robotid import __version__
 from robotid._typing import Array
+from robotid.bands import REACH
 from robotid.exceptions import DataError
 from robotid.identification import Identification, structural_mapping
 from robotid.metrics import Metrics
@@ -60,11 +61,19 @@ def build_result(
             "undetermined": list(identification.estimate.undetermined),
         },
         "base_parameters": _base_parameters(identification),
+        "uncertainty": {
+            "method": identification.errors.method,
+            "stretches": identification.errors.stretches,
+            "inflation": identification.errors.inflation,
+        },
         "standard_parameters": _standard_parameters(identification),
         "drive_parameters": _drive_parameters(identification),
         "consistency": _consistency(identification),
         "identification": _metrics(identification.metrics()),
-        "validation": [recording_metrics(e, "estimate") for e in identification.validation],
+        "validation": [
+            recording_metrics(e, "estimate") | {"band": _band(identification, e)}
+            for e in identification.validation
+        ],
         "warnings": [{"code": f.code, "message": f.message, "where": f.where} for f in findings],
         "wls": {
             "base_values": identification.wls.theta.tolist(),
@@ -182,13 +191,15 @@ def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
             "expression": expression,
             "value": float(value),
             "std_error": _finite(error),
+            "interval_95": [_finite(end) for end in interval],
             "unit": units[i],
         }
-        for name, expression, value, error, i in zip(
+        for name, expression, value, error, interval, i in zip(
             mapping.base_names,
             mapping.expressions,
             identification.base,
             identification.base_error,
+            identification.base_interval,
             mapping.independent,
             strict=True,
         )
@@ -264,6 +275,22 @@ def _metrics(metrics: Metrics) -> dict[str, Any]:
             for joint, m in metrics.per_joint.items()
         },
         "pooled_rmse": metrics.pooled_rmse,
+    }
+
+
+def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the 95 % band of the predicted torque: its half width, and what lies in it."""
+    recording, band = evaluation.recording, identification.band(evaluation)
+    held = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
+    return {
+        row: {
+            "half_width": float(REACH * np.sqrt(np.mean(total**2))),
+            "of_parameters": float(REACH * np.sqrt(np.mean(parameters**2))),
+            "held_pct": _finite(100 * share),
+        }
+        for row, total, parameters, share in zip(
+            identification.model.row_names, band.total.T, band.parameters.T, held, strict=True
+        )
     }
 
 

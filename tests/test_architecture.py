@@ -24,7 +24,8 @@ FLOORS = {
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
     "constraint_settings task checkpoint prediction",
-    5: "validation sidecar estimator_settings simulation dynamics log_files probe mass_matrix "
+    5: "bands "
+    "validation sidecar estimator_settings simulation dynamics log_files probe mass_matrix "
     "reduction",
     6: "recordings closed_loop conversion explanations load_checks motion_checks cluster",
     7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
