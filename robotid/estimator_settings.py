@@ -46,9 +46,9 @@ _FOLDS = 6  # held out in turn by prior_weight = "cv"
 #: The keys that each estimator has, beside its name.
 KEYS: Mapping[str, tuple[str, ...]] = {
     "ols": (),
-    "wls": (),
-    "consistent": _PROJECTION,
-    "log_cholesky": (*_PROJECTION, "starts", "seed"),
+    "wls": ("robust",),
+    "consistent": ("robust", *_PROJECTION),
+    "log_cholesky": ("robust", *_PROJECTION, "starts", "seed"),
     "rls": ("forgetting", "physical", *_PROJECTION),
     "kalman": ("walk", "gate", "physical", *_PROJECTION),
     "prx": ("step", "metric", "average", "passes", "seed", "physical", *_PROJECTION),
@@ -64,6 +64,8 @@ class EstimatorSettings:
 
     Attributes:
         name: "ols", "wls", "consistent", "log_cholesky", "rls", "kalman", "prx" or "gradient".
+        robust: Of "wls", "consistent" and "log_cholesky": "none", or the loss of rows that fit
+            badly, "huber" or "tukey".
         margin: Of "consistent" and ``physical``: smallest eigenvalue of a body's pseudo-inertia
             relative to its prior size [-].
         prior: Of the same: metric of the distance from the URDF's values, "euclidean",
@@ -88,6 +90,7 @@ class EstimatorSettings:
     """
 
     name: str = "consistent"
+    robust: str = "none"
     margin: float = 1e-4
     prior_weight: float | str = 1.0
     forgetting: float = 1.0
@@ -132,6 +135,7 @@ class EstimatorSettings:
         _check_range("gate", self.gate, is_gate, "0.5 <= x < 1, or false")
         _check_choice("step", self.step, ("exact", "printed"))
         _check_choice("metric", self.metric, ("noise", "mass", "rows"))
+        _check_choice("robust", self.robust, ("none", "huber", "tukey"))
         _check_choice("prior", self.prior, METRICS)
         _check_choice("solver", self.solver, tuple(SOLVERS))
         _check_range("starts", self.starts, self.starts >= 0, "x >= 0")

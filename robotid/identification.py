@@ -30,6 +30,7 @@ from robotid.pieces import join
 from robotid.prior import spread_of
 from robotid.recordings import LoadedRecordings, Recordings
 from robotid.regressor import random_regressor
+from robotid.robust import Outlier, find_outliers, reweigh
 from robotid.signals import SignalSettings
 from robotid.standard_errors import StandardErrors, measured_errors
 from robotid.validation import Evaluation, pool, prepare
@@ -146,6 +147,11 @@ class Identification:
             self.estimate.sigma,
         )
 
+    @cached_property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Rows of the fitted recordings that the estimate does not explain, the worst first."""
+        return find_outliers(self.model, self.identification)
+
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.
 
@@ -229,11 +235,15 @@ def conclude(
         NotConvergedError: If a solver fails.
     """
     mapping = structural_mapping(model)
-    reductions = recordings.reduce(mapping)
+    prior = model.standard_parameters()
+    reductions, grown = recordings.reduce(mapping), 1.0
+    if choice.robust != "none":
+        robust = reweigh(model, mapping, recordings, reductions, choice.robust, prior)
+        recordings, reductions = robust.recordings, robust.reductions
+        grown = robust.loss_of_efficiency**2
     reduction = join(reductions)
     stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share
-    prior = model.standard_parameters()
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Prior(prior, spread, share, rough.sigma, stretches)
@@ -252,6 +262,9 @@ def conclude(
             estimate.sigma if estimate.names == mapping.names else sigma,
             is_filter=choice.name == "kalman" or choice.forgetting < 1,
         )
+    if grown != 1.0:
+        estimate = replace(estimate, covariance=grown * estimate.covariance)
+        wls = replace(wls, covariance=grown * wls.covariance)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     wls_standard = mapping.to_standard(wls.theta, prior, spread)

@@ -44,6 +44,7 @@ KEYS: dict[str, Any] = {
         "prior_weight": (*_NUMBER, str),
         "solver": str,
         "check": bool,
+        "robust": str,
         "starts": int,
         "constraints": {
             "mass": dict,

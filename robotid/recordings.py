@@ -85,11 +85,19 @@ class LoadedRecordings(Recordings):
         model: The robot.
         fitted: Recordings to fit.
         kept: Recordings kept apart.
+        weights: Weights of the rows of each recording to fit, shapes (N, n_rows); 1 if None.
     """
 
     model: RobotModel
     fitted: Sequence[Recording]
     kept: Sequence[Recording]
+    weights: tuple[Array, ...] | None = None
+
+    def _row_weights(self) -> list[Array]:
+        masks = [recording.mask.astype(float) for recording in self.fitted]
+        if self.weights is None:
+            return masks
+        return [mask * weight for mask, weight in zip(masks, self.weights, strict=True)]
 
     @property
     def share(self) -> float:
@@ -107,11 +115,11 @@ class LoadedRecordings(Recordings):
         """
         count = -(-_STRETCHES // len(self.fitted))
         reductions: list[Reduction] = []
-        for recording in self.fitted:
-            motion, mask = recording.trajectory, recording.mask
+        for recording, weight in zip(self.fitted, self._row_weights(), strict=True):
+            motion = recording.trajectory
             shortest = round(_CORRELATIONS / independent_share(recording.signals))
             length = max(-(-len(motion.t) // count), shortest)
-            problem = base_problem(self.model, mapping, motion, mask)
+            problem = base_problem(self.model, mapping, motion, weight)
             for k, factors in enumerate(compress_stretches(problem, length)):
                 part = motion.part(k * length, (k + 1) * length)
                 reductions.append(Reduction(factors, part.squares, len(part.t)))
@@ -129,8 +137,8 @@ class LoadedRecordings(Recordings):
         """
         return concatenate(
             [
-                base_problem(self.model, mapping, r.trajectory, r.mask, with_mass=with_mass)
-                for r in self.fitted
+                base_problem(self.model, mapping, r.trajectory, weight, with_mass=with_mass)
+                for r, weight in zip(self.fitted, self._row_weights(), strict=True)
             ]
         )
 
@@ -161,7 +169,7 @@ def base_problem(
     model: RobotModel,
     mapping: BaseMapping,
     trajectory: Trajectory,
-    mask: Array,
+    weight: Array,
     *,
     with_mass: bool = False,
     compiled: bool | None = None,
@@ -172,18 +180,18 @@ def base_problem(
         model: The robot.
         mapping: Standard to base parameters.
         trajectory: N samples.
-        mask: Rows used, shape (N, n_rows), bool.
+        weight: Weight of each row, shape (N, n_rows); or which rows are used, bool.
         with_mass: As of :func:`robotid.regressor.build_problem`.
         compiled: As of :func:`robotid.regressor.build_problem`.
 
     Returns:
-        The problem, rows that are not used of weight 0.
+        The problem.
 
     Raises:
         DataError: If the trajectory's joints are not the model's.
     """
-    weight = mask.astype(float)
-    problem = build_problem(model, trajectory, weight, with_mass=with_mass, compiled=compiled)
+    rows = weight.astype(float)
+    problem = build_problem(model, trajectory, rows, with_mass=with_mass, compiled=compiled)
     return mapping.reduce(problem)
 
 

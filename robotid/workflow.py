@@ -41,6 +41,7 @@ __all__ = ["run_job", "validate_result"]
 
 _log = logging.getLogger(__name__)
 
+_NAMED = 5  # outliers that a finding names
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is worth a word
 
 
@@ -235,6 +236,29 @@ def _log_findings(logs: Sequence[Log]) -> list[Finding]:
     ]
 
 
+def _outlier_findings(identification: Identification) -> list[Finding]:
+    outliers = identification.outliers
+    if not outliers:
+        return []
+    places = [
+        f"{o.joint} at {o.t:.3f} s of {o.log}: {o.torque:.4g} against {o.predicted:.4g} predicted, "
+        f"{o.size:.0f} times its usual residual"
+        for o in outliers[:_NAMED]
+    ]
+    more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
+    advice = (
+        "they were weighted down"
+        if identification.estimator.robust != "none"
+        else "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
+    )
+    message = (
+        f"{len(outliers)} places of the fitted logs are not explained: {'; '.join(places)}{more}; "
+        f"{advice}"
+    )
+    evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
+    return [Finding("outliers", "warning", outliers[0].joint, message, evidence)]
+
+
 def _fit_findings(identification: Identification) -> list[Finding]:
     findings = []
     undetermined = identification.estimate.undetermined
@@ -251,6 +275,7 @@ def _fit_findings(identification: Identification) -> list[Finding]:
         )
         findings.append(Finding("urdf_not_written", "warning", "urdf", message))
     findings += consistency_findings(identification)
+    findings += _outlier_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

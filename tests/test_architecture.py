@@ -24,20 +24,20 @@ FLOORS = {
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
     "constraint_settings task checkpoint prediction",
-    5: "bands "
-    "validation sidecar estimator_settings simulation dynamics log_files probe mass_matrix "
-    "reduction",
+    5: "bands validation sidecar estimator_settings simulation dynamics log_files probe "
+    "mass_matrix reduction",
     6: "recordings closed_loop conversion explanations load_checks motion_checks cluster",
-    7: "identification urdf job visualization report_plots paper_simulation paper_trajectories "
+    7: "robust urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs work_plan",
-    8: "online report_page result inspection paper_errata consistency_findings long_recordings "
+    8: "identification",
+    9: "online report_page result inspection paper_errata consistency_findings long_recordings "
     "long_jobs report_consistency",
-    9: "doctor report_tables paper_plots paper_page tracking checkpoint_inputs",
-    10: "report paper",
-    11: "workflow",
-    12: "demo flags",
-    13: "cli",
-    14: "__main__",
+    10: "doctor report_tables paper_plots paper_page tracking checkpoint_inputs",
+    11: "report paper",
+    12: "workflow",
+    13: "demo flags",
+    14: "cli",
+    15: "__main__",
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
