@@ -80,13 +80,13 @@ def test_a_known_total_mass_is_met_exactly(case):
     assert one @ estimate.covariance @ one == pytest.approx(0.0, abs=1e-12)
 
 
-def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squares(case):
+def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squares(case, ur5):
     fit, factors = case
     estimate = constrained(fit, pinned=("forearm_link", "wrist_1_link")).fit(factors)
     np.testing.assert_allclose(estimate.theta[20:40], fit.prior[20:40], rtol=1e-12, atol=1e-14)
     assert not estimate.std_error[20:40].any()
     # oracle: the same quadratic without those columns, where no inequality binds
-    fit = replace(fit, prior_weight=100.0)
+    fit = replace(fit, prior=truth(ur5), prior_weight=10.0, metric="riemannian")
     pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
     estimate = pinned.fit(factors)
     assert estimate.message == "no constraint binds"

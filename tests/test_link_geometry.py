@@ -48,7 +48,11 @@ def test_shapes_of_links_that_are_fixed_to_each_other_make_one_body(tmp_path):
     np.testing.assert_allclose([low[0], high[0]], [-0.3, 0.3], atol=1e-12)
     np.testing.assert_allclose([low[1], high[1]], [-0.2, 0.2], atol=1e-12)
     assert low[2] == pytest.approx(0.0, abs=1e-12)
-    assert 1.1 <= high[2] < 1.103  # a prism around the cylinder
+    assert 1.1 <= high[2] < 1.103  # a prism around the cylinder, which lies in it all around
+    points = body_points(arm(tmp_path, CYLINDER, CYLINDER))["one"]
+    turn = np.linspace(0.0, 2 * np.pi, 100)
+    around = np.column_stack([np.cos(turn), np.sin(turn)])
+    assert (around @ points[np.abs(points[:, 2]) < 0.4, :2].T).max(axis=1).min() >= 0.1 - 1e-12
 
 
 def test_a_body_whose_link_has_mass_but_no_shape_is_not_bounded(tmp_path):

@@ -144,3 +144,32 @@ def test_poor_excitation_is_predicted_better_than_by_wls(ur5, rng):
         )
         assert (ours < wls).all()
         assert ours.sum() < 0.6 * wls.sum()
+
+
+def test_rows_that_repeat_each_other_tell_the_noise_no_better(ur5, rng):
+    # each row four times over, of which a quarter is independent: the same as once
+    log = exact_log(ur5, truth(ur5), rng, samples=40, noise=NOISE)
+    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+    factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
+    prior = ur5.standard_parameters()
+    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+    once = fit.noise(factors)
+    repeated = replace(fit, independent_share=0.25)
+    np.testing.assert_allclose(repeated.noise(merge([factors] * 4)), once, rtol=3e-3)
+    # weighted least squares believes in all of them
+    assert np.median(fit.noise(merge([factors] * 4)) / once) < 0.95
+
+
+def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
+    found = []
+    for _ in range(15):
+        log = exact_log(ur5, truth(ur5), rng, samples=40, noise=NOISE)
+        trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+        factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
+        prior = ur5.standard_parameters()
+        fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+        found.append(fit.noise(factors) ** 2)
+    ratio = np.sqrt(np.mean(found, axis=0)) / NOISE
+    # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
+    assert (ratio > 0.85).all()
+    assert (ratio < 1.2).all()

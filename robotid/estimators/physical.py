@@ -303,6 +303,7 @@ class Consistent(Estimator):
 
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""
+        is_bound = self.programme.space.basis.shape[1] < len(pi)
         chosen = (
             {}
             if self.choice is None
@@ -314,7 +315,7 @@ class Consistent(Estimator):
         return {
             "prior": {"metric": self.metric, "weight": self.prior_weight, **chosen},
             "solver": self.solver,
-            "constraints": list(self.programme.cone.families),
+            "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
             "active": sorted(set(self.active(pi)[1])),
             "pinned": list(self.constraints.pinned),
         }

@@ -21,7 +21,8 @@ _ROUGH = 0.1  # ... and at which it goes on to a smaller weight, in units of the
 _HEAVY = 100.0  # weight at which a fit stays near its prior, from which Newton's method sets out
 _DECADE = 10.0
 _HALVINGS = 40
-_NOISE_STEPS, _NOISE_SETTLED = 20, 1e-3  # a noise level need not be known better
+_NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
+_FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
 
 
@@ -138,12 +139,14 @@ class Programme:
             weight: Weight of the penalty [-].
 
         Returns:
-            Noise levels, shape (n,) [N m or N], at least those of the start.
+            Noise levels, shape (n,) [N m or N], never quite zero.
         """
         n, size, _ = factors.R.shape
         A, r = self.whitened(factors.R.reshape(n * size, size))
         A, r = A.reshape(n, size, -1), r.reshape(n, size)
-        least, rows, p = sigma, np.maximum(factors.rows, 1), A.shape[2]
+        rows, p = np.maximum(factors.rows, 1), A.shape[2]
+        torque = np.sqrt(factors.torque_squares() / rows)
+        least = np.minimum(sigma, _FLOOR * np.where(torque > 0, torque, 1.0))
         for _ in range(_NOISE_STEPS):
             root = (np.sqrt(share) / sigma)[:, None, None]
             stacked = np.vstack([(A * root).reshape(-1, p), np.sqrt(weight) * np.eye(p)])
