@@ -154,7 +154,7 @@ def figaroh(path):
         return eliminated, left, decomposer.double_decomposition(tau, W_e, left)
 
     def predict(found, arrays):
-        # W_b = Q R: the torque is W_b times the estimate, both in the decomposition's order of columns
+        # W_b = Q R: the torque is W_b times the estimate, both in the decomposition's order
         eliminated, left, (_, _, base_names, phi, *_) = found
         W = build_regressor_reduced(regressor(arrays), eliminated)
         leaders = [str(name).split(" ")[0] for name in base_names]

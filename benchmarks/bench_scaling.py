@@ -31,7 +31,7 @@ def main():
     threads = 1 if options.cpu else len(os.sched_getaffinity(0))  # they save no processor time
     sizes = [300, 1_000] if options.quick else [1_000, 10_000, 100_000, 1_000_000]
     lines = [("panda", samples) for samples in sizes]
-    names, samples = (BY_JOINTS[:4], 300) if options.quick else (BY_JOINTS, 5_000)
+    names, samples = (BY_JOINTS[:4], 300) if options.quick else (BY_JOINTS, 2_000)
     lines += [(name, samples) for name in names]
     print(
         "| robot | joints | base columns | samples | full QR, s | plain, s | ratio | compiled, s "
