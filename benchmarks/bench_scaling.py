@@ -2,7 +2,7 @@
 
 Samples from 1e3 to 1e6 for the panda, then 2 to 44 joints at one number of samples; friction,
 armature and offset of every joint. "full QR" is the plain way in the same process: Pinocchio in a
-Python loop, W stacked, numpy's QR (without the estimate); "-" where W would need more than
+Python loop, W stacked, numpy's QR (without the estimate); "-" where it would need more than
 --memory. All ways of a line are run in turn, the shortest time of each counts.
 
     python benchmarks/bench_scaling.py [--quick] [--cpu] [--memory GIB]
@@ -25,7 +25,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few samples, at most 12 joints")
     parser.add_argument("--cpu", action="store_true", help="processor time, for a busy machine")
-    parser.add_argument("--memory", type=float, default=2.0, help="GiB of W for full QR")
+    parser.add_argument("--memory", type=float, default=3.0, help="GiB for full QR")
     options = parser.parse_args()
     clock = time.process_time if options.cpu else time.perf_counter
     threads = 1 if options.cpu else len(os.sched_getaffinity(0))  # they save no processor time
