@@ -25,6 +25,7 @@ from robotid.compiled import is_installed
 from robotid.identification import structural_mapping
 
 README = Path(__file__).parents[1] / "README.md"
+README_SIZES = (10_000, 100_000, 1_000_000)
 MARKS = ("<!-- speed table -->\n", "<!-- end of speed table -->\n")
 LARGEST = 2**30  # [bytes] of W that full QR is asked to hold
 
@@ -92,7 +93,7 @@ def readme_table(threads, clock, python):
     figaroh = ["FIGAROH"] if python else []
     head = ["panda, friction, armature, offset", *figaroh, *ways.values(), "memory over the input"]
     lines = [head, ["---"] * len(head)]
-    for samples in (10_000, 100_000, 1_000_000):
+    for samples in README_SIZES:
         times, memory = measure("panda", samples, threads, clock)
         cells = [f"{samples:,} samples"]
         if python:

@@ -7,10 +7,11 @@ FIGAROH needs other packages than robotid, hence an environment of its own (abou
 
 Each way runs in a fresh process: a first run of 200 samples spread over the log, then all of it;
 imports are not counted. FIGAROH: its regressor, removal of silent columns, and double QR with the
-estimate of the base parameters. robotid: base parameters, factors, weighted least squares with the covariance.
+estimate of the base parameters. robotid: base parameters, factors, weighted least squares with
+the covariance.
 The first ratio is of processor times. "memory" is the growth of the process's largest resident set
-over that before the second run. "difference" is the root mean square of what the two predictions of
-the torque differ by, as a share of the torque.
+over that before the second run. "difference" is the root mean square of what the two predictions
+of the torque differ by, as a share of the torque.
 """
 
 import argparse

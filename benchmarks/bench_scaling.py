@@ -53,7 +53,8 @@ def row(name, samples, threads, clock, largest):
     if is_installed():
         identify(model, trajectory, True, 1)  # reads the compiled code
         ways["compiled"] = lambda: identify(model, trajectory, True, 1)
-        ways["threads"] = lambda: identify(model, trajectory, True, threads)
+        if threads > 1:
+            ways["threads"] = lambda: identify(model, trajectory, True, threads)
     # numpy holds W, its selected columns, their copy with tau and the one it works on
     if 4 * 8 * samples * model.n_rows * len(model.layout.names) < largest:
         ways["full"] = lambda: full_qr(model, mapping, trajectory)
