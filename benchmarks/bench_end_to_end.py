@@ -1,61 +1,33 @@
 """Arrays in memory to estimate: base parameters, rows, factors and weighted least squares.
 
-"full QR" is the plain way: Pinocchio in a loop, W stacked, numpy's QR (without the estimate). All
-ways are run in turn in this process, the shortest counts: wall-clock time, or with --cpu the
-processor's, which other work on the machine changes less. "memory" is the largest
-amount that Python and NumPy hold over the input arrays, by tracemalloc in a run of its own. Where
-FIGAROH is installed (an environment of its own with `pip install robotid[fast] figaroh`), its
-regressor and double QR of the same samples are timed too. The last lines are the start: the
-compiled path used first ever (it compiles) and first in a process.
+"full QR" is the plain way: Pinocchio in a loop, W stacked, numpy's QR, estimate and covariance by
+ordinary least squares. All ways are run in turn in this process, the shortest counts: wall-clock
+time, or with --cpu the processor's, which other work on the machine changes less. "memory" is the
+largest amount that Python and NumPy hold over the input arrays, by tracemalloc in a run of its own.
 
     python benchmarks/bench_end_to_end.py [--quick] [--million]
-    python benchmarks/bench_end_to_end.py --readme --cpu    # the table of the README
+    python benchmarks/bench_end_to_end.py --readme [--cpu] [--figaroh PYTHON]
+
+The last one also writes its table into README.md, between the lines that mark it; --figaroh names
+an interpreter with FIGAROH (see bench_figaroh.py) for a column of its time.
 """
 
 import argparse
 import os
-import subprocess
-import sys
-import tempfile
 import time
-from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
-from setting import (
-    ROBOTS,
-    figaroh_factor,
-    full_qr,
-    machine,
-    motion,
-    peak_memory,
-    robot,
-    side_by_side,
-)
+from bench_figaroh import compare
+from setting import ROBOTS, full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
 from robotid.compiled import is_installed
-from robotid.estimators import WLS
-from robotid.factors import compress
 from robotid.identification import structural_mapping
-from robotid.regressor import build_problem
 
+README = Path(__file__).parents[1] / "README.md"
+README_SIZES = (10_000, 100_000, 1_000_000)
+MARKS = ("<!-- speed table -->\n", "<!-- end of speed table -->\n")
 LARGEST = 2**30  # [bytes] of W that full QR is asked to hold
-START = """
-import time
-start = time.perf_counter()
-import numpy as np
-from robotid.data import Trajectory
-from robotid.examples import example_urdf
-from robotid.factors import compress
-from robotid.model import RobotModel
-from robotid.regressor import build_problem
-model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"))
-x = np.ones((64, 6))
-log = Trajectory(t=np.arange(64.0), q=x, v=x, a=x, tau=x, joints=model.joints, rate=1.0,
-                 segment=np.zeros(64, dtype=int))
-middle = time.perf_counter()
-compress(build_problem(model, log, compiled={compiled}))
-print(time.perf_counter() - middle)
-"""
 
 
 def main():
@@ -64,28 +36,40 @@ def main():
     parser.add_argument("--million", action="store_true", help="1e6 samples too (half an hour)")
     parser.add_argument("--readme", action="store_true", help="panda at 1e4, 1e5 and 1e6 only")
     parser.add_argument("--cpu", action="store_true", help="processor time, for a busy machine")
+    parser.add_argument("--figaroh", metavar="PYTHON", help="interpreter with FIGAROH")
     options = parser.parse_args()
     clock = time.process_time if options.cpu else time.perf_counter
     sizes = [1_000] if options.quick else [1_000, 10_000, 100_000]
     sizes += [1_000_000] if options.million else []
-    names = list(ROBOTS)
-    if options.readme:
-        names, sizes = ["panda"], [10_000, 100_000, 1_000_000]
     threads = len(os.sched_getaffinity(0))
+    if options.readme:
+        write_readme(readme_table(threads, clock, options.figaroh))
+        print(f"\n{'processor' if options.cpu else 'wall-clock'} time; {machine()}")
+        return
     print(
-        "| robot | samples | FIGAROH, s | full QR, s | plain, s | ratio | compiled, s | ratio "
+        "| robot | samples | full QR, s | plain, s | ratio | compiled, s | ratio "
         f"| {threads} threads, s | ratio | memory, MiB |"
     )
-    print("|" + "---|" * 11)
-    for name in names:
+    print("|" + "---|" * 10)
+    for name in ROBOTS:
         for samples in sizes:
             if name != "TALOS" or (samples <= 1_000 and not options.quick):
                 print(row(name, samples, threads, clock), flush=True)
-    start()
     print(f"\n{'processor' if options.cpu else 'wall-clock'} time; {machine()}")
 
 
 def row(name, samples, threads, clock):
+    times, memory = measure(name, samples, threads, clock)
+    full = times.get("full")
+    cells = [f"{full:.2f}" if full else "-"]
+    for key in ("plain", "compiled", "threads"):
+        cells.append(f"{times[key]:.3f}" if key in times else "-")
+        cells.append(f"{full / times[key]:.1f}" if full and key in times else "-")
+    return f"| {name} | {samples:.0e} | " + " | ".join(cells) + f" | {memory:.0f} |"
+
+
+def measure(name, samples, threads, clock):
+    """Return the time of each way [s] and robotid's memory over the input [MiB]."""
     model = robot(name)
     trajectory = motion(model, samples, np.random.default_rng(0))
     mapping = structural_mapping(model)
@@ -97,39 +81,39 @@ def row(name, samples, threads, clock):
             ways["threads"] = lambda: identify(model, trajectory, True, threads)
     if 8 * samples * model.n_rows * len(model.layout.names) < LARGEST:
         ways["full"] = lambda: full_qr(model, mapping, trajectory)
-        if find_spec("figaroh"):
-            ways["figaroh"] = lambda: figaroh_factor(model, trajectory)
-    repeats = 1 if samples > 100_000 else 3
-    seconds = side_by_side(list(ways.values()), repeats, clock)
-    times = dict(zip(ways, seconds, strict=True))
-    full = times.get("full")
-    cells = [f"{times[key]:.2f}" if key in times else "-" for key in ("figaroh", "full")]
-    for key in ("plain", "compiled", "threads"):
-        cells.append(f"{times[key]:.3f}" if key in times else "-")
-        cells.append(f"{full / times[key]:.0f}" if full and key in times else "-")
+    seconds = side_by_side(list(ways.values()), 1 if samples > 100_000 else 3, clock)
     memory = peak_memory(lambda: identify(model, trajectory, is_installed(), threads))
-    return f"| {name} | {samples:.0e} | " + " | ".join(cells) + f" | {memory:.0f} |"
+    return dict(zip(ways, seconds, strict=True)), memory
 
 
-def identify(model, trajectory, compiled, threads):
-    """Return the estimate of all base parameters."""
-    problem = structural_mapping(model).reduce(build_problem(model, trajectory, compiled=compiled))
-    return WLS().fit(compress(problem, threads=threads))
+def readme_table(threads, clock, python):
+    """Return the README's table, panda at 1e4, 1e5 and 1e6 samples."""
+    ways = {"full": "numpy's full QR", "plain": "plain", "compiled": "with `fast`"}
+    ways |= {"threads": f"`fast`, {threads} threads"} if clock is time.perf_counter else {}
+    figaroh = ["FIGAROH"] if python else []
+    head = ["panda, friction, armature, offset", *figaroh, *ways.values(), "memory over the input"]
+    lines = [head, ["---"] * len(head)]
+    for samples in README_SIZES:
+        times, memory = measure("panda", samples, threads, clock)
+        cells = [f"{samples:,} samples"]
+        if python:
+            key = "wall" if clock is time.perf_counter else "cpu"
+            is_run = samples <= 100_000
+            cells += [f"{compare(python, samples)['FIGAROH'][key]:.2f} s" if is_run else "not run"]
+        for way in ways:
+            ratio = f" ({times['full'] / times[way]:.0f}x)" if "full" in times else ""
+            text = f"{times[way]:.3f} s{ratio if way != 'full' else ''}" if way in times else None
+            cells.append(text or "not run")
+        lines.append([*cells, f"{memory:.0f} MiB"])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def start():
-    if not is_installed():
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        for text, compiled in (("first ever", True), ("first in a process", True), ("-", False)):
-            run = subprocess.run(
-                [sys.executable, "-c", START.format(compiled=compiled)],
-                capture_output=True, text=True, check=True, env=environment,
-            )  # fmt: skip
-            label = f"compiled path, {text}" if compiled else "Pinocchio"
-            print(f"\n64 samples by {label}: {float(run.stdout):.2f} s", end="")
-    print()
+def write_readme(table):
+    """Print the table and put it between its marks."""
+    print(table, end="")
+    before, rest = README.read_text().split(MARKS[0])
+    after = rest.split(MARKS[1])[1]
+    README.write_text(before + MARKS[0] + table + MARKS[1] + after)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import time
 import tracemalloc
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import SimpleNamespace
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
@@ -15,9 +14,13 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.data import Trajectory
+from robotid.estimators import WLS
 from robotid.examples import example_urdf
 from robotid.excitation import random_fourier
+from robotid.factors import compress
+from robotid.identification import structural_mapping
 from robotid.model import RobotModel
+from robotid.regressor import build_problem
 
 PLANAR = Path(__file__).parents[1] / "urdf" / "planar_2r.urdf"
 ROBOTS = {
@@ -26,10 +29,15 @@ ROBOTS = {
     "panda": ("panda.urdf", {"joints": [f"panda_joint{i}" for i in range(1, 8)]}),
     "TALOS": ("talos_full_v2.urdf", {}),
 }
+MORE_ROBOTS = {
+    "Solo12": ("solo12.urdf", {}),
+    "TIAGo": ("tiago_no_hand.urdf", {}),
+    "TALOS reduced": ("talos_reduced.urdf", {}),
+}
 
 
 def robot(name, **options):
-    path, own = ROBOTS[name]
+    path, own = (ROBOTS | MORE_ROBOTS)[name]
     return RobotModel.from_urdf(
         path if isinstance(path, Path) else example_urdf(path), **own, **options
     )
@@ -71,8 +79,14 @@ def rows_of(problem):
         yield from source.blocks(0, source.samples)
 
 
+def identify(model, trajectory, compiled, threads):
+    """Return the estimate of all base parameters by weighted least squares."""
+    problem = structural_mapping(model).reduce(build_problem(model, trajectory, compiled=compiled))
+    return WLS().fit(compress(problem, threads=threads))
+
+
 def full_qr(model, mapping, trajectory):
-    """Return R of the whole of W_b, the plain way: loop, stack, drive columns, numpy's QR."""
+    """Return estimate and covariance by the QR of the whole of W_b, all stacked: the plain way."""
     pin_model, data = model.pin_model, model.pin_model.createData()
     q, v, a = model.configurations(trajectory.q), trajectory.v, trajectory.a
     W = np.vstack(
@@ -86,29 +100,10 @@ def full_qr(model, mapping, trajectory):
     ]
     columns = [W, *(drive.reshape(-1, 1) for drive in drives)]
     W_b = np.hstack(columns)[:, mapping.independent]
-    return np.linalg.qr(np.column_stack([W_b, trajectory.tau.reshape(-1)]), mode="r")
-
-
-def figaroh_factor(model, trajectory):
-    """Return the base parameters' expressions by FIGAROH: regressor, columns, double QR."""
-    from figaroh.tools.qrdecomposition import double_QR
-    from figaroh.tools.regressor import (
-        RegressorBuilder,
-        RegressorConfig,
-        build_regressor_reduced,
-        get_index_eliminate,
-    )
-
-    robot = SimpleNamespace(model=model.pin_model, data=model.pin_model.createData())
-    settings = RegressorConfig(has_friction=True, has_actuator_inertia=True, has_joint_offset=True)
-    W = RegressorBuilder(robot, settings).build_basic_regressor(
-        model.configurations(trajectory.q), trajectory.v, trajectory.a,
-        {"act_idxv": list(range(model.n_rows))},
-    )  # fmt: skip
-    names = {str(k): 1.0 for k in range(W.shape[1])}
-    eliminated, left = get_index_eliminate(W, names)
-    tau = trajectory.tau.T.reshape(-1)  # FIGAROH's rows: joint after joint
-    return double_QR(tau, build_regressor_reduced(W, eliminated), left)
+    R = np.linalg.qr(np.column_stack([W_b, trajectory.tau.reshape(-1)]), mode="r")
+    inverse = np.linalg.inv(R[:-1, :-1])
+    variance = R[-1, -1] ** 2 / (len(W_b) - W_b.shape[1])
+    return inverse @ R[:-1, -1], variance * inverse @ inverse.T
 
 
 def side_by_side(functions, repeats, clock=time.process_time):
@@ -136,7 +131,7 @@ def peak_memory(function):
 def machine():
     """Return versions, cores and threads in one line."""
     parts = [f"Python {platform.python_version()}"]
-    for name in ("pin", "numpy", "scipy", "numba", "figaroh"):
+    for name in ("pin", "numpy", "scipy", "numba"):
         try:
             parts.append(f"{name} {version(name)}")
         except PackageNotFoundError:

@@ -72,8 +72,8 @@ class Factors:
     def weighted(self, sigma: Array) -> Array:
         """Return one factor of all joints, the rows of joint j divided by sigma_j.
 
-        A joint's columns are those of another one that carries it, or nearly so: each factor is
-        folded into the smallest that has all its columns, from the finger to the base.
+        From the fingers to the base, each factor is folded into the smallest one that has all its
+        columns: a joint's are among those of the joint that carries it.
 
         Args:
             sigma: Noise level per joint, shape (n,) [N m or N], positive.
@@ -82,17 +82,16 @@ class Factors:
             Triangular factor of the stacked [W_j tau_j] / sigma_j, shape (c + 1, c + 1).
         """
         c = len(self.names)
-        folded = [Triangle(len(own) + 1) for own in self.columns]
-        everything = Triangle(c + 1)
-        carriers = self._carriers
-        for j in sorted(range(len(folded)), key=lambda j: (len(self.columns[j]), -j)):
-            own = np.append(self.columns[j], c)
-            folded[j].fold_triangle(self.triangles[j] / sigma[j], np.arange(len(own)))
-            k = carriers[j]
+        folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
+        for total, own, level in zip(folded, self.triangles, sigma, strict=True):
+            total.R[:] = own / level
+        for j, k in self._carriers:
+            columns = np.append(self.columns[j], c)
             if k is None:
-                everything.fold_triangle(folded[j].R, own)
+                everything.fold_triangle(folded[j].R, columns)
             else:
-                folded[k].fold_triangle(folded[j].R, np.searchsorted(self.columns[k], own))
+                places = np.searchsorted(self.columns[k], columns)
+                folded[k].fold_triangle(folded[j].R, places)
         return everything.R
 
     def residual_squares(self, theta: Array) -> Array:
@@ -144,15 +143,17 @@ class Factors:
         return np.array([np.vdot(A @ C, A) for A, C in pairs])
 
     @cached_property
-    def _carriers(self) -> list[int | None]:
-        """The joint with the fewest columns among those that have all of joint j's, or None."""
+    def _carriers(self) -> list[tuple[int, int | None]]:
+        """Pairs of a joint and the one with the fewest columns that has all of its, or None.
+
+        Joints with few columns come first, so that a joint is complete before it is folded.
+        """
         order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
         sets = [set(own.tolist()) for own in self.columns]
-        carriers: list[int | None] = [None] * len(order)
-        for position, j in enumerate(order):
-            wider = (k for k in order[position + 1 :] if sets[j] <= sets[k])
-            carriers[j] = next(wider, None)
-        return carriers
+        return [
+            (j, next((k for k in order[position:] if sets[j] <= sets[k]), None))
+            for position, j in enumerate(order, start=1)
+        ]
 
 
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
