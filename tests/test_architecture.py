@@ -17,18 +17,19 @@ PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings job_keys lanes lapack log_source console",
+    "innovations online_settings job_keys lanes lapack log_source console "
+    "versions report_page summaries",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags",
     3: "array_files estimators plant lumping prior rows log_checks channel_checks",
     4: "regressor excitation tables",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
-    6: "identification closed_loop conversion explanations load_checks motion_checks",
+    6: "identification closed_loop conversion explanations load_checks motion_checks residuals",
     7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
-    "model_checks",
-    8: "report_page result inspection paper_errata doctor",
-    9: "report_tables paper_plots paper_page tracking",
-    10: "report paper",
+    "model_checks information",
+    8: "result inspection paper_errata doctor diagnosis_plots",
+    9: "report_tables paper_plots paper_page tracking comparison report_diagnosis",
+    10: "report paper comparison_page",
     11: "workflow",
     12: "demo flags",
     13: "cli",
@@ -47,7 +48,7 @@ INSIDE_FUNCTIONS = {
     "pyarrow": {"parquet_files"},
     "rosbags": {"bags"},
     "h5py": {"array_files"},
-    "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
+    "matplotlib": {"report", "report_plots", "paper", "paper_plots", "diagnosis_plots"},
     "clarabel": {"estimators"},
 }
 # modules that robotid.estimators may use among themselves, from the interface up
