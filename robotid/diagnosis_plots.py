@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from html import escape
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ def plot_residual(
             )
         if cutoff is not None:
             left.axvline(cutoff, color=INK, lw=0.6, ls=":")
+        _plain(left)
         left.set(xlabel="frequency [Hz]", ylabel=f"density [{unit}/√Hz]")
         left.legend(loc="lower left", bbox_to_anchor=(0.0, 0.96), ncols=2, borderpad=0)
         right.plot(dt * np.arange(len(correlation)), correlation, color=RESIDUAL, lw=1.0)
@@ -188,6 +190,7 @@ def plot_singular(values: Array, rank: int, *, title: str, key: str) -> str:
         axes = figure.subplots()
         axes.semilogy(number[:rank], values[:rank], "o", color=PREDICTED, ms=3)
         axes.semilogy(number[rank:], np.maximum(values[rank:], floor), "x", color=RESIDUAL, ms=4)
+        _plain(axes)
         axes.set(xlabel="number of the direction", ylabel="singular value")
         axes.grid(visible=True)
         figure.subplots_adjust(left=0.11, right=0.99, top=0.96, bottom=0.21)
@@ -227,6 +230,17 @@ def plot_correlation(correlation: Array, names: Sequence[str], *, title: str, ke
         f'<title id="{key}-title">{escape(title)}</title>'
         f'<g fill="currentColor" font-size="9" stroke="none">{labels}</g>{"".join(parts)}</svg>'
     )
+
+
+def _plain(axes: Any) -> None:  # noqa: ANN401
+    """Write the decades of a logarithmic axis as plain numbers: the page has no formulas."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axes.get_ylim()
+    few = np.log10(high / low) < 1.5
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _cells(step: NDArray[np.int_], shade: int, margin: int) -> str:

@@ -17,7 +17,7 @@ from robotid.report_diagnosis import (
     residual_section,
     version_table,
 )
-from robotid.report_page import code, number, page, percent, table, text
+from robotid.report_page import code, figure, number, page, percent, table, text
 from robotid.report_plots import plot_body, plot_torque
 from robotid.report_tables import (
     base_table,
@@ -246,14 +246,12 @@ def _torque_figure(e: Evaluation, row: int, name: str, unit: str, key: str, poin
         said = f"error {error} %, RMSE {measured.rmse:.3g} {unit}"
     title = f"Measured and predicted torque and residual of {name} over time; {said}"
     svg = plot_torque(e, row, unit=unit, title=title, key=key, points=points)
-    caption = f"<figcaption><strong>{escape(name)}</strong>: {said}</figcaption>"
-    return f"<figure>{caption}{svg}</figure>\n"
+    return figure(f"<strong>{escape(name)}</strong>: {said}", svg)
 
 
 def _standard(found: Identification) -> str:
     figures = "".join(
-        f"<figure><figcaption><strong>{escape(body)}</strong></figcaption>"
-        f"{_body_plot(found, i)}</figure>\n"
+        figure(f"<strong>{escape(body)}</strong>", _body_plot(found, i))
         for i, body in enumerate(found.model.layout.bodies)
     )
     return (
@@ -278,12 +276,12 @@ def _body_plot(found: Identification, i: int) -> str:
 
 
 def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
-    known = {finding.message for finding in findings}
+    known = [finding.message for finding in findings]
     notes = [
         Finding("log_note", "note", str(e.recording.log.path), note)
         for e in (*found.identification, *found.validation)
         for note in e.recording.log.notes
-        if note not in known
+        if not any(message.endswith(note) for message in known)
     ]
     if not findings and not notes:
         return "<p>None.</p>\n"

@@ -15,7 +15,7 @@ from robotid.diagnosis_plots import (
 )
 from robotid.identification import Identification
 from robotid.information import Information, information
-from robotid.report_page import code, number, table, text
+from robotid.report_page import code, figure, number, table, text
 from robotid.residuals import autocorrelation, friction_split, spectrum
 from robotid.validation import Evaluation
 from robotid.versions import versions
@@ -118,8 +118,7 @@ def information_section(found: Identification) -> str:
         f"the base parameters the data give {shares.mean():.0f} % in the mean and {shares.min()} "
         "% of the weakest, the URDF the rest: S²/(S² + s²) with the spread S assumed before the "
         "fit and the standard error s of WLS.</p>\n"
-        f"<figure><figcaption>{title}</figcaption>{singular}</figure>\n{known}"
-        + _correlations(said, names)
+        f"{figure(title, singular, single=True)}{known}" + _correlations(said, names)
     )
 
 
@@ -187,7 +186,7 @@ def _residual_figure(e: Evaluation, row: int, name: str, unit: str) -> str:
         key=f"residual{row}",
     )
     caption = f"<strong>{escape(name)}</strong>: correlation {falls}"
-    return f"<figure><figcaption>{caption}</figcaption>{svg}</figure>\n"
+    return figure(caption, svg)
 
 
 def _period(t: Array, segment: Array) -> float:
@@ -213,8 +212,7 @@ def _friction_figures(found: Identification) -> str:
             title=f"Friction of {name} against speed, measured and identified",
             key=f"friction{row}",
         )
-        caption = f"<figcaption><strong>{escape(name)}</strong></figcaption>"
-        figures.append(f"<figure>{caption}{svg}</figure>\n")
+        figures.append(figure(f"<strong>{escape(name)}</strong>", svg))
     return "".join(figures)
 
 
@@ -235,7 +233,7 @@ def _drive_figure(found: Identification, term: str) -> str:
             title=f"{term} of each drive with error bars, beside the value before the fit",
             key=f"{term}{k}",
         )
-        figures.append(f"<figure><figcaption>{term} [{unit}]</figcaption>{svg}</figure>\n")
+        figures.append(figure(f"{term} [{unit}]", svg))
     return "".join(figures)
 
 
@@ -265,5 +263,5 @@ def _correlations(said: Information, names: Sequence[str]) -> str:
     return (
         "<h3>Correlation of errors</h3>\n<p>Two parameters whose errors are correlated near ±1 are "
         "known as a sum or a difference only: the motion does not tell them apart.</p>\n"
-        f"{listed}<figure><figcaption>{caption}</figcaption>{image}</figure>\n"
+        f"{listed}{figure(caption, image)}"
     )

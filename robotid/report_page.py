@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["Cell", "code", "number", "page", "percent", "table", "text"]
+__all__ = ["Cell", "code", "figure", "number", "page", "percent", "table", "text"]
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,21 @@ def table(
     )
 
 
+def figure(caption: str, svg: str, *, single: bool = False) -> str:
+    """Return a figure, which scrolls where the page is narrow, by keys too.
+
+    Args:
+        caption: What it shows, HTML.
+        svg: The ``<svg>`` element.
+        single: Whether it stands alone and is kept from filling the page.
+
+    Returns:
+        HTML.
+    """
+    kind = ' class="single"' if single else ""
+    return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
+
+
 def page(title: str, body: str) -> str:
     """Return the whole page.
 
@@ -186,7 +201,7 @@ td.flag { color: var(--poor); font-weight: 600; }
 figure { margin: 0; min-width: 0; overflow-x: auto; }
 figcaption { font-size: .875rem; overflow-wrap: anywhere; }
 figure svg { display: block; width: 100%; min-width: 26rem; height: auto; color: var(--text); }
-figure svg.map { width: auto; max-width: none; }
+figure.single { max-width: 40rem; } figure svg.map { width: auto; max-width: none; }
 @media (min-width: 40rem) { tbody th wbr { display: none; } }
 @media print { :root { --page: #fff; --text: #000; --quiet: #444; --line: #bbb; --soft: #f3f5f7;
   --predicted: #0b63c5; --residual: #b4500f; --good: #1a7f37; --usable: #9a6700; --poor: #c21f2c; }
