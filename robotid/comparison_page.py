@@ -95,31 +95,43 @@ def _errors(content: Mapping[str, Any]) -> str:
             f"{Path(entry['log']).name} {entry['start']:.4g}-{entry['end']:.4g} s: not fitted",
             content,
             entry["per_joint"],
+            alike=True,
         )
         for entry in content["validation"]
     ]
     if not content["fitted_alike"]:
         parts.append("<p>The results were fitted to other recordings: of the errors below each is "
                      "that of its own, and they are not comparable.</p>\n")  # fmt: skip
-    parts.append(_error_table("Fitted rows of each result", content, content["fitted"]))
+    fitted, alike = content["fitted"], content["fitted_alike"]
+    parts.append(_error_table("Fitted rows of each result", content, fitted, alike))
     return "".join(parts)
 
 
 def _error_table(
-    caption: str, content: Mapping[str, Any], per_joint: Sequence[Mapping[str, Any]]
+    caption: str, content: Mapping[str, Any], per_joint: Sequence[Mapping[str, Any]], alike: bool
 ) -> str:
     headers = ["joint", *_labels(content, " %"), *_labels(content, " RMSE"), "unit"]
-    rows = []
-    for entry in per_joint:
-        errors = entry["relative_error_pct"]
-        least = min((e for e in errors if e is not None), default=None)
-        cells = [
-            Cell(f"<strong>{percent(e).html}</strong>", "number") if e == least else percent(e)
-            for e in errors
+    rows = [
+        [
+            code(entry["joint"]),
+            *_percents(entry["relative_error_pct"], alike),
+            *[number(value, ".3g") for value in entry["rmse"]],
+            text(entry["unit"]),
         ]
-        rmse = [number(value, ".3g") for value in entry["rmse"]]
-        rows.append([code(entry["joint"]), *cells, *rmse, text(entry["unit"])])
+        for entry in per_joint
+    ]
     return table(caption, headers, rows)
+
+
+def _percents(errors: Sequence[float | None], alike: bool) -> list[Cell]:
+    """Return the errors, the least in bold where they are comparable; ties by what is shown."""
+    cells = [percent(error) for error in errors]
+    known = [(error, cell.html) for error, cell in zip(errors, cells, strict=True) if error]
+    least = min(known)[1] if known and alike else None
+    return [
+        Cell(f"<strong>{cell.html}</strong>", "number") if cell.html == least else cell
+        for cell in cells
+    ]
 
 
 def _base(content: Mapping[str, Any]) -> str:
