@@ -27,6 +27,7 @@ from robotid.prior import prior_spread
 from robotid.problem import Problem, concatenate
 from robotid.regressor import build_problem, random_regressor
 from robotid.signals import SignalSettings
+from robotid.summaries import identification_html, identification_line, identification_text
 from robotid.validation import Evaluation, Recording, evaluate, pool, prepare, shares_rows
 from robotid.verdict import Verdict, judge
 
@@ -55,6 +56,7 @@ class Identification:
         identification: The recordings that were fitted, with predictions "estimate" and "wls".
         validation: The same of the recordings that were kept apart.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
+        report: File of the report, if one was written with the result.
     """
 
     model: RobotModel
@@ -71,6 +73,19 @@ class Identification:
     identification: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
     alarms: tuple[str, ...] = ()
+    report: str = ""
+
+    def __repr__(self) -> str:
+        return identification_line(self)
+
+    def _repr_html_(self) -> str:
+        return identification_html(self)
+
+    def summary(self) -> str:
+        """Return verdict, reasons and errors by joint as text."""
+        return identification_text(self)
+
+    __str__ = summary
 
     @property
     def is_consistent(self) -> bool:

@@ -82,6 +82,7 @@ def run_job(job: Job, folder: str | Path) -> tuple[Identification, dict[str, Any
         write_json(result, partial / "result.json")
         for made in sorted(partial.iterdir()):
             os.replace(made, target / made.name)
+        identification = replace(identification, report=str(target / outputs["report"]))
     finally:
         shutil.rmtree(partial)
     return identification, result
