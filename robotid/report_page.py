@@ -203,12 +203,13 @@ figcaption { font-size: .875rem; overflow-wrap: anywhere; }
 figure svg { display: block; width: 100%; min-width: 26rem; height: auto; color: var(--text); }
 figure.single { max-width: 40rem; } figure svg.map { width: auto; max-width: none; }
 @media (min-width: 40rem) { tbody th wbr { display: none; } }
+@page { margin: 14mm; }
 @media print { :root { --page: #fff; --text: #000; --quiet: #444; --line: #bbb; --soft: #f3f5f7;
   --predicted: #0b63c5; --residual: #b4500f; --good: #1a7f37; --usable: #9a6700; --poor: #c21f2c; }
   body { font-size: 10pt; } main { max-width: none; padding: 0; }
   nav, .skip { display: none; }
   .scroll, figure { overflow: visible; } table { font-size: 8pt; } .code { font-size: 7pt; }
   td.code { min-width: 8rem; } .plots { grid-template-columns: 1fr 1fr; }
-  figure svg { min-width: 0; } figure, tr { break-inside: avoid; }
+  figure svg, figure svg.map { min-width: 0 !important; max-width: 100% !important; } figure, tr { break-inside: avoid; }
   h2, h3, caption { break-after: avoid; } }
 """
