@@ -148,6 +148,8 @@ def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
 
 def test_names_of_files_cannot_inject_markup(folder, tmp_path):
     path = tmp_path / "<b>x.json"
-    path.write_bytes((folder / "b.json").read_bytes())
+    write_json({**read_result(folder / "b.json"), "robot": "<i>r"}, path)
     write_comparison([folder / "a.json", path], tmp_path / "c.html")
-    assert "<b>" not in (tmp_path / "c.html").read_text(encoding="utf-8")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert "<b>" not in html
+    assert "<i>" not in html
