@@ -210,6 +210,7 @@ figure.single { max-width: 40rem; } figure svg.map { width: auto; max-width: non
   nav, .skip { display: none; }
   .scroll, figure { overflow: visible; } table { font-size: 8pt; } .code { font-size: 7pt; }
   td.code { min-width: 8rem; } .plots { grid-template-columns: 1fr 1fr; }
-  figure svg, figure svg.map { min-width: 0 !important; max-width: 100% !important; } figure, tr { break-inside: avoid; }
+  figure svg, figure svg.map { min-width: 0 !important; max-width: 100% !important; }
+  figure, tr { break-inside: avoid; }
   h2, h3, caption { break-after: avoid; } }
 """

@@ -18,9 +18,9 @@ FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
     "innovations online_settings job_keys lanes lapack log_source console "
-    "versions report_page summaries",
+    "versions report_page",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
-    "compiled columns array_tables csv_files parquet_files bags",
+    "compiled columns array_tables csv_files parquet_files bags summaries",
     3: "array_files estimators plant lumping prior rows log_checks channel_checks",
     4: "regressor excitation tables",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
