@@ -7,6 +7,7 @@ from typing import Any
 
 from robotid import __version__
 from robotid.console import (
+    print_comparison,
     print_error,
     print_files,
     print_inspection,
@@ -117,6 +118,12 @@ def _parser() -> argparse.ArgumentParser:
     validate.add_argument("logs", nargs="+", metavar="LOG")
     validate.add_argument("--json", action="store_true", help="print one JSON object")
     validate.set_defaults(run=_validate)
+
+    compare = commands.add_parser("compare", help="several results side by side")
+    compare.add_argument("results", nargs="+", metavar="RESULT.json")
+    compare.add_argument("--out", metavar="FILE.html", help="page to write")
+    compare.add_argument("--json", action="store_true", help="print one JSON object")
+    compare.set_defaults(run=_compare)
 
     convert = commands.add_parser(
         "convert", help="write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names"
@@ -235,6 +242,22 @@ def _validate(options: argparse.Namespace) -> None:
         print(f"\n{recording['log']}")
         print_table(recording["per_joint"], {})
     print_verdict(found["verdict"])
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from robotid.comparison import compare_results
+    from robotid.comparison_page import write_comparison
+
+    if options.out:
+        content = write_comparison(options.results, options.out)
+    else:
+        content = compare_results(options.results)
+    if options.json:
+        print(json.dumps(content, allow_nan=False))
+        return
+    print_comparison(content)
+    if options.out:
+        print(f"\nwritten to {options.out}")
 
 
 def _convert(options: argparse.Namespace) -> None:

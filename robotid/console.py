@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "print_comparison",
     "print_error",
     "print_files",
     "print_inspection",
@@ -150,3 +151,46 @@ def print_inspection(content: dict[str, Any]) -> None:
     for finding in content["findings"]:
         where = finding.get("link") or finding.get("joint") or ""
         print(f"{finding['severity']}: {finding['code']} {where}: {finding['message']}")
+
+
+def print_comparison(content: dict[str, Any]) -> None:
+    """Print several results side by side.
+
+    Args:
+        content: What ``robotid compare --json`` prints.
+    """
+    labels = [result["label"] for result in content["results"]]
+    for result in content["results"]:
+        verdict = result["verdict"]["status"]
+        print(f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}")
+    for remark in content["remarks"]:
+        print(f"  - {remark}")
+    for entry in content["validation"]:
+        print(f"\nkept apart: {entry['log']}, error %")
+        _print_columns(entry["per_joint"], labels)
+    alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
+    print(f"\nfitted recordings of each, error %{alike}")
+    _print_columns(content["fitted"], labels)
+    print("\nbase parameters; last columns: difference to A over the combined standard error")
+    width = max(len(entry["name"]) for entry in content["base_parameters"])
+    heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
+    print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
+    for entry in content["base_parameters"]:
+        cells = "".join(f"{value:10.4g}" for value in entry["values"])
+        cells += "".join(_cell(value, 10) for value in entry["differences"])
+        print(f"  {entry['name']:{width}}{cells}")
+    for key in ("settings", "versions"):
+        for row in content[key]:
+            print(f"{key}: {row['name']}: {' | '.join(value or '-' for value in row['values'])}")
+    for row in content["inputs"]:
+        if not all(row["in"]):
+            read = ", ".join(label for label, has in zip(labels, row["in"], strict=True) if has)
+            print(f"only {read} read {row['path']} ({row['role']})")
+
+
+def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
+    width = max(len(entry["joint"]) for entry in per_joint)
+    print(f"  {'joint':{width}}" + "".join(f"{label:>9}" for label in labels))
+    for entry in per_joint:
+        cells = "".join(_cell(value, 9) for value in entry["relative_error_pct"])
+        print(f"  {entry['joint']:{width}}{cells}")

@@ -33,6 +33,7 @@ from robotid.regressor import random_regressor
 from robotid.robust import Outlier, find_outliers, reweigh
 from robotid.signals import SignalSettings
 from robotid.standard_errors import StandardErrors, measured_errors
+from robotid.summaries import identification_html, identification_line, identification_text
 from robotid.validation import Evaluation, pool, prepare
 from robotid.verdict import Verdict, judge
 
@@ -70,7 +71,9 @@ class Identification:
         identification: The recordings that were fitted, with predictions "estimate" and "wls".
         validation: The same of the recordings that were kept apart.
         errors: What the standard errors rest on.
+        factors: What the fitted rows come down to, base parameters.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
+        report: File of the report, if one was written with the result.
     """
 
     model: RobotModel
@@ -87,7 +90,21 @@ class Identification:
     identification: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
     errors: StandardErrors
+    factors: Factors
     alarms: tuple[str, ...] = ()
+    report: str = ""
+
+    def __repr__(self) -> str:
+        return identification_line(self)
+
+    def _repr_html_(self) -> str:
+        return identification_html(self)
+
+    def summary(self) -> str:
+        """Return verdict, reasons and errors by joint as text."""
+        return identification_text(self)
+
+    __str__ = summary
 
     @property
     def is_consistent(self) -> bool:
@@ -286,6 +303,7 @@ def conclude(
         identification=fitted,
         validation=kept,
         errors=errors,
+        factors=factors,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from robotid import __version__
 from robotid.paper_simulation import CASES
-from robotid.report_page import Cell, code, number, page, table, text
+from robotid.report_page import Cell, code, figure, number, page, table, text
 
 __all__ = ["paper_page"]
 
@@ -56,7 +56,7 @@ def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]
 
 
 def _figure(caption: str, svg: str) -> str:
-    return f"<figure><figcaption>{escape(caption)}</figcaption>{svg}</figure>\n"
+    return figure(escape(caption), svg)
 
 
 def _summary(content: Mapping[str, Any]) -> str:

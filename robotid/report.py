@@ -11,7 +11,13 @@ from robotid.identification import Identification
 from robotid.metrics import JointMetrics, Metrics
 from robotid.parameters import INERTIAL_TERMS
 from robotid.report_consistency import consistency_notes
-from robotid.report_page import code, number, page, percent, table, text
+from robotid.report_diagnosis import (
+    drive_figures,
+    information_section,
+    residual_section,
+    version_table,
+)
+from robotid.report_page import code, figure, number, page, percent, table, text
 from robotid.report_plots import plot_body, plot_torque
 from robotid.report_tables import (
     base_table,
@@ -31,18 +37,21 @@ __all__ = ["write_report"]
 _POINTS = 120_000  # points of all lines together: about 2 MB
 _LONGEST = 2000  # points of one line
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
-_SEVERITIES = ("error", "warning", "note")
+_SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 _SECTIONS = {
     "errors": "Prediction errors",
     "torques": "Torques over time",
+    "residuals": "What the residuals hold",
     "drives": "Drive parameters",
     "base": "Base parameters",
     "standard": "Standard parameters",
     "consistency": "Physical consistency",
+    "information": "Excitation and correlation",
     "open": "What the data do not determine",
     "warnings": "Warnings and notes",
     "settings": "Settings",
     "inputs": "Inputs",
+    "versions": "Versions",
 }
 _ESTIMATORS = {
     "ols": "ordinary least squares (ols)",
@@ -81,23 +90,27 @@ def write_report(
     contents = {
         "errors": _errors(identification),
         "torques": _torques(identification),
-        "drives": drive_table(identification),
+        "residuals": residual_section(identification),
+        "drives": drive_figures(identification) + drive_table(identification),
         "base": base_table(identification),
         "standard": _standard(identification),
         "consistency": consistency_table(identification) + consistency_notes(identification),
+        "information": information_section(identification),
         "open": open_section(identification),
         "warnings": _warnings(identification, findings),
         "settings": settings_tables(identification),
         "inputs": input_table(identification),
+        "versions": version_table(),
     }
     links = "".join(f'<a href="#{key}">{title}</a> ' for key, title in _SECTIONS.items())
+    nav = f'<nav aria-label="Sections">{links}</nav>'
     sections = "".join(
         f'<section aria-labelledby="{key}">\n<h2 id="{key}">{title}</h2>\n'
         f"{contents[key]}</section>\n"
         for key, title in _SECTIONS.items()
     )
     title = f"{identification.model.name}: identified parameters"
-    html = page(title, f"{_summary(identification)}<nav>{links}</nav>\n{sections}")
+    html = page(title, f"{_summary(identification)}{nav}\n{sections}")
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         beside.write_text(html, encoding="utf-8")
@@ -240,14 +253,12 @@ def _torque_figure(e: Evaluation, row: int, name: str, unit: str, key: str, poin
         said = f"error {error} %, RMSE {measured.rmse:.3g} {unit}"
     title = f"Measured and predicted torque and residual of {name} over time; {said}"
     svg = plot_torque(e, row, unit=unit, title=title, key=key, points=points)
-    caption = f"<figcaption><strong>{escape(name)}</strong>: {said}</figcaption>"
-    return f"<figure>{caption}{svg}</figure>\n"
+    return figure(f"<strong>{escape(name)}</strong>: {said}", svg)
 
 
 def _standard(found: Identification) -> str:
     figures = "".join(
-        f"<figure><figcaption><strong>{escape(body)}</strong></figcaption>"
-        f"{_body_plot(found, i)}</figure>\n"
+        figure(f"<strong>{escape(body)}</strong>", _body_plot(found, i))
         for i, body in enumerate(found.model.layout.bodies)
     )
     return (
@@ -272,22 +283,23 @@ def _body_plot(found: Identification, i: int) -> str:
 
 
 def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
-    known = {finding.message for finding in findings}
+    known = [finding.message for finding in findings]
     notes = [
         Finding("log_note", "note", str(e.recording.log.path), note)
         for e in (*found.identification, *found.validation)
         for note in e.recording.log.notes
-        if note not in known
+        if not any(message.endswith(note) for message in known)
     ]
     if not findings and not notes:
         return "<p>None.</p>\n"
-    ranked = sorted((*findings, *notes), key=lambda f: _rank(f.severity))
-    rows = [
-        [text(f.severity), text(f.message, flag=f.severity == "error"), code(f.where)]
-        for f in ranked
-    ]
-    return table("Findings, the gravest first", ["severity", "message", "about"], rows)
-
-
-def _rank(severity: str) -> int:
-    return _SEVERITIES.index(severity) if severity in _SEVERITIES else -1
+    every = [*findings, *notes]
+    tables = ""
+    for severity, title in _SEVERITIES.items():
+        rows = [
+            [code(f.code), text(f.message, flag=severity == "error"), code(f.where)]
+            for f in every
+            if f.severity == severity
+        ]
+        if rows:
+            tables += table(f"{title}: {len(rows)}", ["code", "message", "about"], rows)
+    return tables

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["Cell", "code", "number", "page", "percent", "table", "text"]
+__all__ = ["Cell", "code", "figure", "number", "page", "percent", "table", "text"]
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,21 @@ def table(
     )
 
 
+def figure(caption: str, svg: str, *, single: bool = False) -> str:
+    """Return a figure, which scrolls where the page is narrow, by keys too.
+
+    Args:
+        caption: What it shows, HTML.
+        svg: The ``<svg>`` element.
+        single: Whether it stands alone and is kept from filling the page.
+
+    Returns:
+        HTML.
+    """
+    kind = ' class="single"' if single else ""
+    return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
+
+
 def page(title: str, body: str) -> str:
     """Return the whole page.
 
@@ -130,7 +145,8 @@ def page(title: str, body: str) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
         f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}</main>\n</body>\n</html>\n"
+        '<body>\n<a class="skip" href="#content">Skip to the content</a>\n'
+        f'<main id="content" tabindex="-1">\n{body}</main>\n</body>\n</html>\n'
     )
 
 
@@ -156,6 +172,10 @@ h2 { font-size: 1.25rem; margin: 2.5rem 0 .75rem; padding-top: .75rem;
   border-top: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.5rem 0 .5rem; }
 p, ul { margin: .5rem 0; max-width: 48rem; }
+.skip { position: absolute; left: -100vw; } .skip:focus { left: .5rem; top: .5rem; z-index: 1;
+  padding: .5rem .75rem; background: var(--page); }
+:focus-visible { outline: .15rem solid var(--predicted); outline-offset: .1rem; }
+main:focus { outline: none; }
 nav { font-size: .875rem; } nav a { margin-right: 1rem; white-space: nowrap; }
 a { color: var(--predicted); }
 .verdict { border-left: .4rem solid var(--tone); background: var(--soft); padding: .75rem 1rem;
@@ -181,12 +201,16 @@ td.flag { color: var(--poor); font-weight: 600; }
 figure { margin: 0; min-width: 0; overflow-x: auto; }
 figcaption { font-size: .875rem; overflow-wrap: anywhere; }
 figure svg { display: block; width: 100%; min-width: 26rem; height: auto; color: var(--text); }
+figure.single { max-width: 40rem; } figure svg.map { width: auto; max-width: none; }
 @media (min-width: 40rem) { tbody th wbr { display: none; } }
+@page { margin: 14mm; }
 @media print { :root { --page: #fff; --text: #000; --quiet: #444; --line: #bbb; --soft: #f3f5f7;
   --predicted: #0b63c5; --residual: #b4500f; --good: #1a7f37; --usable: #9a6700; --poor: #c21f2c; }
-  body { font-size: 10pt; } main { max-width: none; padding: 0; } nav { display: none; }
+  body { font-size: 10pt; } main { max-width: none; padding: 0; }
+  nav, .skip { display: none; }
   .scroll, figure { overflow: visible; } table { font-size: 8pt; } .code { font-size: 7pt; }
   td.code { min-width: 8rem; } .plots { grid-template-columns: 1fr 1fr; }
-  figure svg { min-width: 0; } figure, tr { break-inside: avoid; }
+  figure svg, figure svg.map { min-width: 0 !important; max-width: 100% !important; }
+  figure, tr { break-inside: avoid; }
   h2, h3, caption { break-after: avoid; } }
 """

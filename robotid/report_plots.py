@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from robotid._typing import Array
 from robotid.validation import Evaluation
 
-__all__ = ["INK", "STYLE", "plot_body", "plot_torque", "stretches", "svg_element", "thin"]
+__all__ = [
+    "INK",
+    "PREDICTED",
+    "RESIDUAL",
+    "STYLE",
+    "plot_body",
+    "plot_torque",
+    "stretches",
+    "svg_element",
+    "thin",
+]
 
 # Matplotlib writes each of these colours into the SVG; there it becomes one of the page's own
 #: Colour of text and axes; in a page it becomes the colour of the page's text.
@@ -23,6 +33,8 @@ _PAGE_COLOURS = {
     _PREDICTED: "var(--predicted)",
     _RESIDUAL: "var(--residual)",
 }
+#: Colours of predictions and of residuals, which follow the page likewise.
+PREDICTED, RESIDUAL = _PREDICTED, _RESIDUAL
 #: Matplotlib's settings for every plot.
 STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,

@@ -20,6 +20,7 @@ from robotid.metrics import Metrics
 from robotid.parameters import pseudo_inertia
 from robotid.validation import Evaluation
 from robotid.verdict import Finding
+from robotid.versions import versions
 
 __all__ = ["build_result", "file_sha256", "read_result", "recording_metrics", "write_json"]
 
@@ -47,6 +48,7 @@ def build_result(
     return {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
+        "versions": versions(),
         "robot": model.name,
         "joints": list(model.joints),
         "settings": dict(settings),

@@ -97,6 +97,7 @@ def run_job(
         write_json(result, partial / "result.json")
         for made in sorted(partial.iterdir()):
             os.replace(made, target / made.name)
+        identification = replace(identification, report=str(target / outputs["report"]))
     finally:
         shutil.rmtree(partial)
     if checkpoint is not None:

@@ -18,22 +18,23 @@ FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
     "innovations online_settings job_keys lanes lapack log_source console signal_settings "
-    "progress work_flags",
+    "progress work_flags versions report_page",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
-    "time_stamps compiled columns array_tables csv_files parquet_files bags",
+    "time_stamps compiled columns array_tables csv_files parquet_files bags summaries",
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
     "constraint_settings task checkpoint prediction",
     5: "bands validation sidecar estimator_settings simulation dynamics log_files probe "
     "mass_matrix reduction",
-    6: "recordings closed_loop conversion explanations load_checks motion_checks cluster",
+    6: "recordings closed_loop conversion explanations load_checks motion_checks cluster residuals",
     7: "robust urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs work_plan",
-    8: "identification",
-    9: "online report_page result inspection paper_errata consistency_findings long_recordings "
+    8: "identification diagnosis_plots",
+    9: "information online result inspection paper_errata consistency_findings long_recordings "
     "long_jobs report_consistency",
-    10: "doctor report_tables paper_plots paper_page tracking checkpoint_inputs",
-    11: "report paper",
+    10: "comparison report_diagnosis doctor report_tables paper_plots paper_page tracking "
+    "checkpoint_inputs",
+    11: "comparison_page report paper",
     12: "workflow",
     13: "demo flags",
     14: "cli",
@@ -55,7 +56,7 @@ INSIDE_FUNCTIONS = {
     "distributed": {"cluster"},
     "rich": {"progress"},
     "h5py": {"array_files"},
-    "matplotlib": {"report", "report_plots", "paper", "paper_plots"},
+    "matplotlib": {"report", "report_plots", "paper", "paper_plots", "diagnosis_plots"},
     "clarabel": {"estimators"},
     "scs": {"estimators"},
 }

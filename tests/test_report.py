@@ -1,5 +1,6 @@
 import os
 import re
+from html import escape
 from html.parser import HTMLParser
 
 import numpy as np
@@ -15,6 +16,7 @@ from robotid.report_page import number, percent
 from robotid.report_plots import stretches, thin
 from robotid.signals import SignalSettings
 from robotid.verdict import Finding
+from robotid.versions import versions
 
 NAME = '<b>x</b>"'
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;&quot;">
@@ -195,6 +197,57 @@ def test_findings_are_ranked_and_notes_of_the_logs_are_added(html):
     text = Reader(html).text
     assert text.index("a <grave> thing") < text.index("a small thing")
     assert text.count("column 'gripper <w>' is ignored") == 2  # one per log
+
+
+def test_findings_stand_in_one_table_per_severity(html):
+    captions = re.findall(r"<caption>([^<]*)</caption>", html)
+    severities = [c for c in captions if re.fullmatch(r"(Errors|Warnings|Notes): \d+", c)]
+    assert severities == ["Errors: 1", "Notes: 3"]  # two of the notes are the logs' own
+
+
+def test_a_note_that_a_finding_tells_is_not_told_again(found, tmp_path):
+    known = [Finding("log_note", "note", "x", "x: column 'gripper <w>' is ignored")]
+    html = write_report(found, tmp_path / "r.html", findings=known).read_text(encoding="utf-8")
+    assert Reader(html).text.count("column 'gripper <w>' is ignored") == 1
+
+
+def test_every_joint_has_its_residual_its_friction_and_bars(html, found):
+    text = Reader(html).text
+    for joint in found.model.joints:
+        assert f"Spectrum and autocorrelation of the residual of {joint}, which falls" in text
+        assert f"Friction of {joint} against speed" in text
+    for term in found.model.layout.terms:
+        assert f"{term} of each drive with error bars" in text
+    assert "\\mathdefault" not in html  # formulas of a logarithmic axis are not set
+    assert "{" not in "".join(re.findall(r"<text[^>]*>([^<]*)</text>", html))
+
+
+def test_the_correlation_map_has_every_name_and_a_cell_per_pair(html, found):
+    figure = html[html.index('<svg class="map"') :].split("</svg>")[0]
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
+    names = [escape(name) for name in found.mapping.base_names]
+    assert texts[::2] == [f"{name} {i}" for i, name in enumerate(names, start=1)]
+    C = found.wls.covariance
+    r = C / np.sqrt(np.outer(np.diag(C), np.diag(C)))
+    shown = np.abs(np.tril(r, -1)) >= 0.5 / 8  # a shade
+    assert figure.count("h-10z") == shown.sum()
+
+
+def test_excitation_names_the_condition_and_the_strongest_correlation(html, found):
+    text = Reader(html).text
+    assert f"Condition number {found.wls.condition:.3g}; singular values from" in text
+    assert "Correlation of errors" in text
+
+
+def test_the_audit_of_the_mass_matrix_is_shown(html):
+    assert "random poses" in Reader(html).text
+
+
+def test_versions_are_those_that_run(html):
+    text = Reader(html).text
+    for name in ("robotid", "pinocchio", "numpy", "scipy", "clarabel", "python", "platform"):
+        assert f"{name}{versions()[name]}" in text
+    assert versions()["numpy"] == np.__version__
 
 
 def test_a_joint_worse_than_the_urdf_is_flagged(model, tmp_path):

@@ -11,6 +11,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.factors import Factors, compress
 from robotid.problem import Problem
+from robotid.summaries import estimate_html, estimate_line, estimate_text
 
 __all__ = ["Estimate", "Estimator", "as_factors", "require_rows"]
 
@@ -46,6 +47,18 @@ class Estimate:
     message: str
     prior_std: Array | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return estimate_line(self)
+
+    def _repr_html_(self) -> str:
+        return estimate_html(self)
+
+    def summary(self) -> str:
+        """Return the parameters with their standard errors as text."""
+        return estimate_text(self)
+
+    __str__ = summary
 
     @property
     def std_error(self) -> Array:

@@ -1,0 +1,64 @@
+"""The examples under docs/ run, and what they say of their output is so."""
+
+import re
+
+import pytest
+from conftest import ROOT
+from synthetic import exact_log, truth
+
+from robotid.examples import example_urdf
+from robotid.log_files import write_log
+
+DOCS = ROOT / "docs"
+
+
+def run(name):
+    """Run the Python blocks of a page one after the other, in one namespace."""
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.DOTALL)
+    assert blocks
+    namespace = {}
+    for block in blocks:
+        exec(compile(block, name, "exec"), namespace)
+    return blocks, namespace
+
+
+def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):
+    (tmp_path / "robot.urdf").write_bytes(example_urdf("ur5_robot.urdf").read_bytes())
+    for name in ("first", "second"):
+        log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=0.1)
+        write_log(log, tmp_path / f"{name}.csv")
+    monkeypatch.chdir(tmp_path)
+    blocks, namespace = run("own_robot.md")
+    assert len(blocks[0].strip().splitlines()) <= 10
+    printed = capsys.readouterr().out
+    assert "verdict good" in printed.splitlines()[0]
+    assert "not fitted" in printed
+    best = re.findall(r"^ *(\S+) \+- (\S+)  \S", printed, re.MULTILINE)
+    assert len(best) == 5
+    assert all(abs(float(value)) > 10 * float(error) for value, error in best)
+    assert {"report.html", "identified.urdf"} <= {p.name for p in tmp_path.iterdir()}
+    assert set(namespace["found"].sources) <= {"data", "mixed", "prior"}
+
+
+def test_paper(capsys):
+    _, namespace = run("paper.md")
+    printed = capsys.readouterr().out
+    assert printed.startswith("after 0 runs: relative error 0.500")
+    errors = namespace["errors"]
+    assert (errors[1:] < errors[:-1]).all()
+    for name in ("disturbed", "noisy"):
+        assert namespace[name][-1] < namespace[name][0]
+    assert namespace["study"].one_shot_error < 1e-6
+
+
+def test_online_tracker(capsys):
+    _, namespace = run("online_tracker.md")
+    printed = capsys.readouterr().out
+    shares = [float(x) for x in re.findall(r"excitation (\S+),", printed)]
+    assert shares[:5] == sorted(shares[:5])  # before the load
+    assert "converged: True" not in printed
+    (change,) = namespace["tracker"].changes
+    assert change.onset == pytest.approx(10.0, abs=0.1)
+    assert change.onset <= change.flagged < 10.5
+    mass, error = map(float, re.search(r"load: (\S+) \+- (\S+) kg", printed).groups())
+    assert abs(mass - 2.0) < 4 * error < 1.0
