@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browsing import launch
 
 from robotid.examples import example_urdf
 from robotid.model import RobotModel
@@ -35,3 +36,9 @@ def recordings():
             return Path(folder)
     assert not IN_CI, "CI must not skip the real recordings: set ROBOTID_DATA"
     pytest.skip("no real recordings: set ROBOTID_DATA to their folder")
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """The system's Chromium; see browsing.py."""
+    yield from launch()

@@ -1,0 +1,71 @@
+"""The real browser of the tests: the system's Chromium, driven by Playwright.
+
+Use the fixture ``browser`` (it is in conftest.py) and :func:`visit`. Without a Chromium tests are
+skipped with the reason, but never in CI.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+IN_CI = os.environ.get("CI") == "true"
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # no GPU needed
+NO_BROWSER = f"no browser: none of {', '.join(NAMES)} is on PATH; apt-get install chromium"
+
+
+@dataclass
+class Visit:
+    """A page in the browser, and what went wrong on it.
+
+    ``errors`` has the console's errors and warnings and uncaught exceptions; ``requests`` every
+    address but that of the page itself and data: and blob: addresses, which leave no machine.
+    """
+
+    page: Any
+    errors: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+
+def launch() -> Iterator[Any]:
+    """Yield a browser: what the fixture ``browser`` gives."""
+    program = next(filter(None, map(shutil.which, NAMES)), None)
+    if program is None:
+        assert not IN_CI, f"CI must not skip the browser tests: {NO_BROWSER}"
+        pytest.skip(NO_BROWSER)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def visit(
+    browser: Any, target: str | Path, *, size: tuple[int, int] = (1280, 800), **options: Any
+) -> Iterator[Visit]:
+    """Open a file or an address in a window [px]; options are those of Playwright's new_context."""
+    address = Path(target).resolve().as_uri() if isinstance(target, Path) else target
+    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
+    page = context.new_page()
+    seen = Visit(page)
+    page.on("console", lambda m: m.type in ("error", "warning") and seen.errors.append(m.text))
+    page.on("pageerror", lambda error: seen.errors.append(str(error)))
+
+    def note(request: Any) -> None:
+        if request.url != address and not request.url.startswith(("data:", "blob:")):
+            seen.requests.append(request.url)
+
+    page.on("request", note)
+    page.goto(address)
+    try:
+        yield seen
+    finally:
+        context.close()
