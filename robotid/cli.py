@@ -4,7 +4,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robotid import __version__
 from robotid.console import print_files, print_inspection, print_result, print_table, print_verdict
@@ -14,8 +14,12 @@ from robotid.flags import (
     add_log_flags,
     add_source_flags,
     job_from_flags,
+    refuse_log_flags,
     source_settings,
 )
+
+if TYPE_CHECKING:
+    from robotid.job import Job
 
 __all__ = ["main"]
 
@@ -82,7 +86,22 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--out", default="robotid-track", metavar="DIR", help="folder to write to")
     track.add_argument("--json", action="store_true", help="print track.json")
     add_log_flags(track.add_argument_group("the log"))
+    _add_serve_flags(track, "show it in the browser while it runs, in true time")
     track.set_defaults(run=_track, validate=[], estimator=None)
+
+    replay = commands.add_parser(
+        "replay", help="play a log in the browser: robot, torques, what was identified"
+    )
+    replay.add_argument("source", metavar="URDF")
+    replay.add_argument("logs", nargs=1, metavar="LOG")
+    replay.add_argument(
+        "results", nargs="*", metavar="RESULT", help="result.json, track.json or their folder"
+    )
+    replay.add_argument("--html", metavar="FILE", help="page to write; default: replay.html")
+    replay.add_argument("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+    _add_serve_flags(replay, "track the log again, in true time, and show it as it goes")
+    add_log_flags(replay.add_argument_group("the log, unless a RESULT says it"))
+    replay.set_defaults(run=_replay, validate=[], estimator=None)
 
     doctor = commands.add_parser(
         "doctor", help="what is wrong with logs: JOB.toml, or URDF LOG ..."
@@ -109,6 +128,13 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--json", action="store_true", help="print one JSON object")
     convert.set_defaults(run=_convert)
     return parser
+
+
+def _add_serve_flags(parser: argparse.ArgumentParser, help_: str) -> None:
+    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=help_)
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="of --serve; 0: as fast as it can"
+    )
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -172,7 +198,11 @@ def _identify(options: argparse.Namespace) -> None:
 def _track(options: argparse.Namespace) -> None:
     from robotid.tracking import run_track
 
-    found = run_track(job_from_flags(options), options.out)
+    job = job_from_flags(options)
+    if options.serve is not None:
+        _serve(job, options.out, options)
+        return
+    found = run_track(job, options.out)
     if options.json:
         print(json.dumps(found, allow_nan=False))
         return
@@ -191,6 +221,35 @@ def _track(options: argparse.Namespace) -> None:
     for entry in found["base_parameters"]:
         print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
     print_files(options.out, [found["history"], "track.json"])
+
+
+def _replay(options: argparse.Namespace) -> None:
+    from robotid.replay_job import read_findings, replay_files, stated_job
+
+    findings = read_findings(options.results)
+    if findings.settings is None:
+        job = job_from_flags(options)
+    else:
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+        job = stated_job(findings, options.source, options.logs[0])
+    if options.html or options.serve is None:
+        page = replay_files(job, findings, ghost=options.ghost)
+        target = page.write(options.html or "replay.html")
+        print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
+    if options.serve is not None:
+        _serve(job, None, options)
+
+
+def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
+    from robotid.live import serve_track
+
+    def announce(url: str) -> None:
+        print(f"live: {url}  (Ctrl-C ends it)", file=sys.stderr, flush=True)
+
+    try:
+        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce)
+    except KeyboardInterrupt:
+        print("", file=sys.stderr)
 
 
 def _doctor(options: argparse.Namespace) -> None:

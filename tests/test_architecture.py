@@ -17,10 +17,10 @@ PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings job_keys lanes lapack log_source console",
+    "innovations online_settings job_keys lanes lapack log_source console replay_page",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
-    "compiled columns array_tables csv_files parquet_files bags",
-    3: "array_files estimators plant lumping prior rows log_checks channel_checks",
+    "compiled columns array_tables csv_files parquet_files bags meshes ellipsoids",
+    3: "array_files estimators plant lumping prior rows log_checks channel_checks scene",
     4: "regressor excitation tables",
     5: "validation sidecar estimator_settings simulation dynamics log_files probe",
     6: "identification closed_loop conversion explanations load_checks motion_checks",
@@ -28,7 +28,7 @@ FLOORS = {
     "model_checks",
     8: "report_page result inspection paper_errata doctor",
     9: "report_tables paper_plots paper_page tracking",
-    10: "report paper",
+    10: "report paper replay_job live",
     11: "workflow",
     12: "demo flags",
     13: "cli",
@@ -37,13 +37,14 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
     "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior", "rows",
-    "compiled",
+    "compiled", "scene",
 }  # fmt: skip
 NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
-    "meshcat": {"visualization"},
+    "meshcat": {"replay_page"},
+    "trimesh": {"meshes"},
     "pyarrow": {"parquet_files"},
     "rosbags": {"bags"},
     "h5py": {"array_files"},
@@ -131,6 +132,7 @@ def test_no_estimator_knows_the_physics_engine():
 @pytest.mark.parametrize("statement", ["import robotid", "from robotid import *"])
 def test_importing_the_package_is_light(statement):
     heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "rosbags", "h5py"]
+    heavy += ["trimesh"]
     found = f"[m for m in {heavy} if m in sys.modules]"
     code = f"{statement}\nimport sys, json\nprint(json.dumps({found}))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
