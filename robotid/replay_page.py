@@ -85,7 +85,8 @@ _BODY = f"""\
 <aside id="side" aria-label="what is shown, and plots" hidden>
 <div id="switches"></div>
 <p id="residuals" class="quiet">Arcs: measured torque, 270° is a joint's largest; the inner one is
-predicted, unless the joint stands still. Colour: residual, <span class="ramp"></span> from 0 to half the torque's rms.</p>
+predicted, unless the joint stands still. Colour: residual, <span class="ramp"></span> from 0 to
+half the torque's rms.</p>
 <div id="plots"></div>
 </aside>
 <footer>

@@ -155,14 +155,12 @@ class _Library:
 
     def _read(self, model: RobotModel, visual: Visual) -> list[Surface]:
         path = find_mesh(visual.file, model.tree.path)
-        if path is None:
-            self.missing.append(visual.file)
-            return []
         try:
-            found = read_surfaces(path)
+            found = () if path is None else read_surfaces(path)
         except ValueError:
+            found = ()
+        if not found:
             self.missing.append(visual.file)
-            return []
         return [replace(s, vertices=s.vertices * np.array(visual.size)) for s in found]
 
 

@@ -293,7 +293,7 @@ def _gaps(t: Array) -> list[int]:
 
 def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, Array]:
     """Return times from 0 and how far each joint has moved, at the keyframes."""
-    model.configurations(q[:1])  # says what width q should have
+    model.configurations(q)  # says what width q should have
     q = q.copy()
     base = 7 if model.free_flyer else 0
     free = [base + j for j, joint in enumerate(model.limits) if joint.turns_freely]

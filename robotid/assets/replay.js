@@ -334,7 +334,13 @@ class Plot { // one chart: columns of a table over time, the clock's cursor, cli
     const end = clock.end || 1;
     return [data.live ? Math.max(0, end - 60) : 0, end];
   }
-  refresh() { this.chart.setData(this.columns()); this.move(clock.time); }
+  refresh() {
+    const { top, bottom } = this.place.getBoundingClientRect();
+    if (!this.stale || bottom < 0 || top > innerHeight) return;
+    this.stale = false;
+    this.chart.setData(this.columns());
+    this.move(clock.time);
+  }
   move(time) {
     this.cursor.style.transform = `translateX(${this.chart.valToPos(time, "x")}px)`;
   }
@@ -590,7 +596,7 @@ if (viewer) {
 
 // ---- live ------------------------------------------------------------------------------------
 
-let stale = false;
+let news = false;
 function take(message) {
   if (message.mark) addMark(message.mark);
   if (message.t === undefined) return;
@@ -601,15 +607,17 @@ function take(message) {
   }
   clock.end = motion.end;
   slider.max = clock.end;
-  stale = true;
+  news = true;
 }
 
-function refresh() { // the charts of a live page, a few times a second
-  if (!stale) return;
-  stale = false;
-  measureTorques();
+function refresh() { // the charts of a live page that are in sight, a few times a second
+  if (news) {
+    measureTorques();
+    placeMarks();
+    plots.forEach((plot) => { plot.stale = true; });
+  }
+  news = false;
   plots.forEach((plot) => plot.refresh());
-  placeMarks();
 }
 
 function listen() {
@@ -619,7 +627,7 @@ function listen() {
   source.onmessage = (event) => JSON.parse(event.data).forEach(take);
   source.addEventListener("end", () => { source.close(); state("the tracker has finished"); refresh(); });
   source.onerror = () => state("no connection to the tracker");
-  setInterval(refresh, 200);
+  setInterval(refresh, 250);
 }
 
 // ---- start -----------------------------------------------------------------------------------
