@@ -6,6 +6,7 @@ skipped with the reason, but never in CI.
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -31,6 +32,14 @@ class Visit:
     page: Any
     errors: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
+
+
+def until(seen: Visit, expression: str, timeout: float = 20.0) -> None:
+    """Wait until a page says yes. Playwright's wait_for_function needs eval, which pages forbid."""
+    end = time.monotonic() + timeout
+    while not seen.page.evaluate(expression):
+        assert time.monotonic() < end, f"{expression} is not true after {timeout:g} s"
+        seen.page.wait_for_timeout(50)
 
 
 def launch() -> Iterator[Any]:
