@@ -162,7 +162,9 @@ def _paper(options: argparse.Namespace) -> None:
         print(json.dumps(result, allow_nan=False))
         return
     _print_paper(result)
-    print(f"\nwritten to {options.out}: paper.html, paper.json, figures as PNG and SVG")
+    print(
+        f"\nwritten to {options.out}: paper.html, paper.json, replay.html, figures as PNG and SVG"
+    )
 
 
 def _overwrite(line: str) -> None:

@@ -14,6 +14,7 @@ from robotid import __version__, paper_plots
 from robotid._typing import Array
 from robotid.paper_errata import EnergyDrift, energy_drift, errata
 from robotid.paper_page import paper_page
+from robotid.paper_replay import write_paper_replay
 from robotid.paper_simulation import (
     AMPLITUDE,
     CASES,
@@ -76,7 +77,7 @@ def run_paper(
     drift = energy_drift()
     content = _content(chosen, studies, near, exact, drift)
     say("drawing")
-    _write(target, content, _figures(studies, near, drift))
+    _write(target, content, _figures(studies, near, drift), studies[list(MODELS).index("physical")])
     return content
 
 
@@ -193,7 +194,9 @@ def _figures(
     }
 
 
-def _write(target: Path, content: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
+def _write(
+    target: Path, content: Mapping[str, Any], figures: Mapping[str, Any], study: ModelStudy
+) -> None:
     """Write all files beside their places, then put each in place."""
     import matplotlib
 
@@ -206,6 +209,7 @@ def _write(target: Path, content: Mapping[str, Any], figures: Mapping[str, Any])
                 figure.set_layout_engine("none")  # it is laid out now
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
                 shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
+        write_paper_replay(study, beside)
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
         text = json.dumps(content, allow_nan=False, indent=1)
         (beside / "paper.json").write_text(text + "\n", encoding="utf-8")

@@ -1,7 +1,8 @@
 """The robot as a viewer draws it: joints as nodes, meshes or a skeleton as the parts they carry."""
 
 import base64
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +23,7 @@ _SHORT = 1e-4  # [m] joints closer than this are one point
 _UP = np.array([0.0, 1.0, 0.0])  # the viewer's axis of a cylinder
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What is drawn, in plain values for JSON, lengths in m.
 
@@ -31,10 +32,12 @@ class Scene:
             pose at 0 and how it moves; ``parts``: shapes on nodes; ``meshes``: triangles that
             parts share; ``reach``: the size of the robot.
         notes: What could not be drawn, in words.
+        corners: Points on each node whose hull holds its parts, shape (k, 3) each [m].
     """
 
     content: dict[str, Any]
     notes: tuple[str, ...]
+    corners: tuple[Array, ...]
 
 
 def robot_scene(model: RobotModel) -> Scene:
@@ -65,7 +68,10 @@ def robot_scene(model: RobotModel) -> Scene:
         "meshes": library.meshes,
         "reach": _reach(model),
     }
-    return Scene(content, tuple(notes))
+    corners = [[np.zeros((1, 3))] for _ in range(tree.njoints)]
+    for part in parts:
+        corners[part["node"]].append(_corners(part, library.boxes))
+    return Scene(content, tuple(notes), tuple(map(np.vstack, corners)))
 
 
 def coordinates(model: RobotModel, q: Array) -> Array:
@@ -137,6 +143,7 @@ class _Library:
         self.missing: list[str] = []
         self.meshes: list[dict[str, Any]] = []
         self.parts: list[dict[str, Any]] = []
+        self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
         surfaces: list[Surface] = []
         ranges: dict[tuple[str, tuple[float, ...]], range] = {}
         visuals = [v for v in read_visuals(model.tree.path) if v.link in model.tree.links]
@@ -149,6 +156,7 @@ class _Library:
         for surface in thin(surfaces, _TRIANGLES):
             mesh = {"vertices": packed(surface.vertices), "faces": packed(surface.faces, "<u4")}
             self.meshes.append(mesh)
+            self.boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
         for visual in visuals:
             which = ranges.get((visual.file, visual.size), range(0))
             self.parts += _visual_parts(model, visual, which, surfaces)
@@ -178,6 +186,26 @@ def _visual_parts(
             yield _part(frame.parentJoint, "mesh", [k], colour, M)
     else:
         yield _part(frame.parentJoint, visual.shape, visual.size, _hex(visual.rgba), M)
+
+
+def _corners(part: Mapping[str, Any], boxes: Sequence[Array]) -> Array:
+    """Return the corners of the box about a part, in the frame of its node, shape (8, 3)."""
+    size = part["size"]
+    match part["shape"]:
+        case "mesh":
+            low, high = boxes[size[0]]
+        case "sphere":
+            low, high = np.full(3, -size[0]), np.full(3, size[0])
+        case "cylinder":
+            high = np.array([size[0], size[1] / 2, size[0]])
+            low = -high
+        case _:
+            high = np.array(size) / 2
+            low = -high
+    box = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    M = np.array(part["matrix"]).reshape(4, 4).T
+    moved: Array = box @ M[:3, :3].T + M[:3, 3]
+    return moved
 
 
 def _part(

@@ -25,7 +25,7 @@ __all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay", "write_r
 _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
-_SEEN = 300  # poses that the camera is aimed by
+_SEEN = 100  # poses that the camera is aimed by
 _CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
 _GAP = 0.25  # [s] a longer time without samples is a gap ...
 _TIMES = 5.0  # ... if it is so many times the usual one
@@ -183,7 +183,7 @@ def replay(
             for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
         ],
         notes=[*notes, *lead, *(f"{note}." for note in scene.notes)],
-        view=_view(model, [q] if ghost is None else [q, ghost[2]]),
+        view=_view(model, scene.corners, [q] if ghost is None else [q, ghost[2]]),
     )
     return Replay(data)
 
@@ -232,11 +232,12 @@ def live_page(
         gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
     """
     empty = np.zeros((0, 0))
+    scene = robot_scene(model)
     torques = Torques(np.zeros(0), np.zeros((0, model.n_rows)), {"predicted": empty})
     return page(
         _data(
             model,
-            robot_scene(model).content,
+            scene.content,
             motion=_packed_motion(np.zeros(0), empty),
             ghost=None,
             masses=[mass_marks(model, masses, "URDF")],
@@ -244,7 +245,7 @@ def live_page(
             bands={"names": list(names), "units": list(units), "t": None, "values": None},
             marks=[],
             notes=[],
-            view=_view(model, [q]),
+            view=_view(model, scene.corners, [q]),
             live=True,
         )
     )
@@ -352,19 +353,19 @@ def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
     return times, np.insert(values[rows], after, np.nan, axis=0)
 
 
-def _view(model: RobotModel, motions: Sequence[Array]) -> dict[str, Any]:
+def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array]) -> dict[str, Any]:
     """Return a camera that sees the whole motion, and a grid below it."""
     data = model.pin_model.createData()
-    points = [np.zeros((0 if model.free_flyer else 1, 3))]
+    points = []
     for q in motions:
         rows = np.unique(np.linspace(0, len(q) - 1, _SEEN).astype(int))
         for configuration in model.configurations(q[rows]):
             pin.forwardKinematics(model.pin_model, data, configuration)
-            points.append(np.array([M.translation for M in list(data.oMi)[1:]]))
+            for M, own in zip(list(data.oMi), corners, strict=True):
+                points.append(own @ M.rotation.T + M.translation)
     places = np.vstack(points)
     centre = (places.min(axis=0) + places.max(axis=0)) / 2
-    reach = float(model.length)
-    radius = float(np.linalg.norm(places - centre, axis=1).max()) + 0.2 * reach
+    radius = float(np.linalg.norm(places - centre, axis=1).max())
     # the camera stands 2.8 radii off; a grid that ends before it has no line behind it
     cell = max((c for c in _CELLS if 20 * c <= 2.5 * radius), default=_CELLS[0])
     ground = np.r_[cell * np.round(centre[:2] / cell), 0.0]

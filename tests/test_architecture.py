@@ -27,7 +27,7 @@ FLOORS = {
     7: "online urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks",
     8: "report_page result inspection paper_errata doctor",
-    9: "report_tables paper_plots paper_page tracking",
+    9: "report_tables paper_plots paper_page tracking paper_replay",
     10: "report paper replay_job live",
     11: "workflow",
     12: "demo flags",

@@ -568,7 +568,7 @@ function aim() { // the viewer's camera has y upwards: (x, y, z) of the robot is
   const [x, y, z] = data.view.centre, camera = viewer.camera, half = (20 * Math.PI) / 180;
   const aspect = pane.clientWidth / Math.max(pane.clientHeight, 1);
   const narrow = Math.min(half, Math.atan(Math.tan(half) * aspect));
-  const far = (0.8 * data.view.radius) / Math.sin(narrow); // corners of the sphere stay empty
+  const far = (0.9 * data.view.radius) / Math.sin(narrow); // corners of the sphere stay empty
   camera.fov = 40;
   camera.near = far / 200;
   camera.far = 200 * far;
