@@ -156,7 +156,8 @@ class _Library:
         for surface in thin(surfaces, _TRIANGLES):
             mesh = {"vertices": packed(surface.vertices), "faces": packed(surface.faces, "<u4")}
             self.meshes.append(mesh)
-            self.boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
+            points = surface.vertices if len(surface.vertices) else np.zeros((1, 3))
+            self.boxes.append(np.array([points.min(axis=0), points.max(axis=0)]))
         for visual in visuals:
             which = ranges.get((visual.file, visual.size), range(0))
             self.parts += _visual_parts(model, visual, which, surfaces)

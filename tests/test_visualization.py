@@ -1,11 +1,10 @@
-import base64
-import json
 import os
 import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from replay_data import shown
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.model import RobotModel
@@ -43,21 +42,6 @@ def page(arm, motion, tmp_path_factory):
     assert path == folder / "replay.html"
     assert [p.name for p in folder.iterdir()] == ["replay.html"]
     return path.read_text(encoding="utf-8")
-
-
-def shown(html):
-    """Return the data of a page, arrays unpacked."""
-    data = json.loads(re.search(r'id="data">(.*?)</script>', html, re.DOTALL)[1])
-    return unpacked(data)
-
-
-def unpacked(value):
-    if isinstance(value, dict) and set(value) == {"kind", "shape", "data"}:
-        numbers = np.frombuffer(base64.b64decode(value["data"]), value["kind"])
-        return numbers.reshape(value["shape"])
-    if isinstance(value, dict):
-        return {key: unpacked(x) for key, x in value.items()}
-    return [unpacked(x) for x in value] if isinstance(value, list) else value
 
 
 def world_poses(nodes, moved):

@@ -263,12 +263,12 @@ function measureTorques() { // what an arc is drawn in proportion to
 }
 const arcs = [];
 if (torques && viewer) {
-  const reach = data.scene.reach;
+  const radius = Math.max(0.06 * data.scene.reach, 0.06 * data.view.radius);
   torques.joints.forEach(({ node }) => {
     const joint = robot.joints[node];
     arcs.push({
-      measured: new Arc(joint, 0.06 * reach, 0.009 * reach, UNSURE),
-      predicted: predictions ? new Arc(joint, 0.043 * reach, 0.004 * reach, "#1c2126") : null,
+      measured: new Arc(joint, radius, 0.15 * radius, UNSURE),
+      predicted: predictions ? new Arc(joint, 0.72 * radius, 0.07 * radius, "#1c2126") : null,
     });
   });
 }
