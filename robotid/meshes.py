@@ -163,7 +163,8 @@ def thin(surfaces: Sequence[Surface], most: int) -> list[Surface]:
     left = [_clustered(surface, 1e-3 * cell) for surface in surfaces]  # joins equal corners
     while sum(len(s.faces) for s in left) > most:
         left = [_clustered(surface, cell) for surface in surfaces]
-        cell *= 1.4
+        # at most as many triangles as go with the square of the cell
+        cell *= min(max(np.sqrt(sum(len(s.faces) for s in left) / most), 1.2), 2.0)
     return [_creased(surface) for surface in left]
 
 

@@ -16,6 +16,7 @@ from robotid.job import Job, LogEntry, job_from_settings
 from robotid.log_source import LogSource
 from robotid.model import RobotModel
 from robotid.result import read_result, stated_parameters
+from robotid.surprises import find_surprises
 from robotid.tables import open_table
 from robotid.validation import predict, prepare
 from robotid.visualization import Bands, Mark, Replay, Torques, replay
@@ -128,15 +129,16 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         other = job.read(LogEntry(Path(ghost)), model)
         second = (Path(ghost).name, other.t, other.q)
     prior = model.standard_parameters()
+    torques = _torques(job, model, motion, vectors)
     return replay(
         model,
         motion.t,
         motion.q,
-        torques=_torques(job, model, motion, vectors),
+        torques=torques,
         masses={"URDF": prior, **vectors} if vectors else None,
         ghost=second,
         bands=None if findings.track is None else _bands(findings),
-        marks=_marks(findings.track),
+        marks=[*_payloads(findings.track), *_contacts(torques, model.joints)],
         notes=[f"Motion: {entry.path.name}."],
     )
 
@@ -212,10 +214,26 @@ def _bands(findings: Findings) -> Bands:
     )
 
 
-def _marks(track: Mapping[str, Any] | None) -> list[Mark]:
+def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
     marks = []
     for change in [] if track is None else track["changes"]:
         load = change["payload"]
         label = f"payload {load['mass']:.2f} ± {load['std_error']:.2f} kg on {load['body']}"
         marks.append(Mark(change["onset"], label, "payload"))
     return marks
+
+
+def _contacts(torques: Torques, joints: Sequence[str]) -> list[Mark]:
+    """Return marks where the first result does not explain the torque."""
+    if not torques.predicted:
+        return []
+    predicted = next(iter(torques.predicted.values()))
+    return [
+        Mark(
+            found.start,
+            f"unexplained torque, most at {found.joint} ({found.residual:.2g} on average, for "
+            f"{found.end - found.start:.1f} s): contact or load?",
+            "contact",
+        )
+        for found in find_surprises(torques.t, torques.measured, predicted, joints)
+    ]

@@ -17,7 +17,8 @@ PACKAGE = Path(robotid.__file__).parent
 FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
-    "innovations online_settings job_keys lanes lapack log_source console replay_page",
+    "innovations online_settings job_keys lanes lapack log_source console replay_page "
+    "surprises",
     2: "factors units model signals live_signals base_parameters verdict planar_2r procedure "
     "compiled columns array_tables csv_files parquet_files bags meshes ellipsoids",
     3: "array_files estimators plant lumping prior rows log_checks channel_checks scene",
