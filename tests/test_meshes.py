@@ -3,7 +3,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from robotid.examples import example_urdf, example_urdfs
+from robotid.examples import example_urdfs
 from robotid.meshes import Surface, find_mesh, read_surfaces, read_visuals, thin
 from robotid.model import RobotModel
 from robotid.scene import robot_scene
@@ -153,17 +153,34 @@ def test_a_scene_holds_each_mesh_once_and_names_what_is_missing(package):
     assert "lost.stl" in note
 
 
-def test_parts_sit_where_pinocchio_puts_the_visuals():
+def test_parts_sit_where_pinocchio_puts_the_visuals(package):
     """Pinocchio's own reading of the visuals is the oracle."""
-    path = example_urdf("panda.urdf")
-    model = RobotModel.from_urdf(path)
-    folder = next(p for p in path.parents if p.name == "example-robot-data").parent
+    path = package / "urdf" / "r.urdf"
+    hand = """
+      <link name="hand"><visual><origin xyz="0.1 0.2 0.3" rpy="1 0.5 -0.3"/>
+        <geometry><box size="1 1 1"/></geometry></visual></link>
+      <joint name="mount" type="fixed"><parent link="arm"/><child link="hand"/>
+        <origin xyz="3 2 1" rpy="-0.4 0.2 1.1"/></joint></robot>"""
+    lost = '<visual><geometry><mesh filename="package://my_robot/meshes/lost.stl"/></geometry></visual>'
+    wrong = '<visual><geometry><sphere radius="oops"/></geometry></visual>'
+    path.write_text(URDF.replace(lost, "").replace(wrong, "").replace("</robot>", hand))
     full = pin.buildModelFromUrdf(str(path))
-    shapes = pin.buildGeomFromUrdf(full, str(path), pin.VISUAL, package_dirs=[str(folder)])
-    parts = robot_scene(model).content["parts"]
-    for shape in shapes.geometryObjects:
+    shapes = pin.buildGeomFromUrdf(
+        full, str(path), pin.VISUAL, package_dirs=[str(package.parent)]
+    ).geometryObjects
+    parts = robot_scene(RobotModel.from_urdf(path)).content["parts"]
+    assert len(shapes) == len(parts) == 5
+    for shape in shapes:
         wanted = shape.placement.homogeneous
-        own = [
-            np.array(p["matrix"]).reshape(4, 4).T for p in parts if p["node"] == shape.parentJoint
-        ]
+        if "arm_2" in shape.name:  # the page's cylinder lies along y, that of a URDF along z
+            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]))
+            wanted = wanted @ pin.SE3(turn, np.zeros(3)).homogeneous
+        own = [p for p in parts if p["node"] == shape.parentJoint]
+        own = [np.array(p["matrix"]).reshape(4, 4).T for p in own]
         assert any(np.allclose(M, wanted, atol=1e-9) for M in own), shape.name
+
+
+def test_meshes_of_the_example_robots_are_found_from_anywhere(tmp_path):
+    whole = "package://example-robot-data/robots/ur_description/meshes/ur5/visual/base.dae"
+    for name in (whole, whole.replace("example-robot-data/robots/", "")):
+        assert find_mesh(name, tmp_path / "x.urdf").name == "base.dae"

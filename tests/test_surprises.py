@@ -17,6 +17,12 @@ def test_noise_is_no_surprise(torques):
     assert find_surprises(T, *torques, JOINTS) == ()
 
 
+def test_a_joint_that_is_poorly_explained_throughout_is_none_either(torques, rng):
+    tau, predicted = torques
+    predicted = predicted + rng.normal(0.0, 4.0, tau.shape)
+    assert find_surprises(T, tau, predicted, JOINTS) == ()
+
+
 def test_a_push_is_found_with_its_joint_its_time_and_its_size(torques):
     tau, predicted = torques
     tau = tau.copy()
