@@ -13,7 +13,7 @@ from robotid.data import Log
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification import Identification
 from robotid.job import Job, LogEntry, job_from_settings
-from robotid.log_source import LogSource
+from robotid.log_source import LogSource, prefixes
 from robotid.model import RobotModel
 from robotid.result import read_result, stated_parameters
 from robotid.surprises import find_surprises
@@ -126,8 +126,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     vectors = {label: stated_parameters(r, model) for label, r in findings.results.items()}
     second = None
     if ghost is not None:
-        other = job.read(LogEntry(Path(ghost)), model)
-        second = (Path(ghost).name, other.t, other.q)
+        second = (Path(ghost).name, *_ghost(job, model, Path(ghost)))
     prior = model.standard_parameters()
     torques = _torques(job, model, motion, vectors)
     return replay(
@@ -163,6 +162,24 @@ def replay_identified(identification: Identification) -> Replay:
         masses={"URDF": identification.prior, "identified": identification.standard},
         notes=[f"Motion: {shown.recording.name}."],
     )
+
+
+def _ghost(job: Job, model: RobotModel, path: Path) -> tuple[Array, Array]:
+    """Return times and positions of a second motion, which need not have torques."""
+    table = open_table(path, job.source)
+    starts = prefixes()
+    torques = (*starts["tau"], *starts["current"])
+    if any(name.startswith(torques) for name in table.names):
+        log = job.read(LogEntry(path), model)
+        return log.t, log.q
+    found = []
+    for wanted in [("time", "t"), *([s + joint for s in starts["q"]] for joint in model.joints)]:
+        name = next((name for name in wanted if name in table.names), None)
+        if name is None:
+            raise DataError(f"{path.name} has no column {wanted[0]!r}; columns: {table.names}")
+        found.append(name)
+    columns = table.read(found)
+    return columns[found[0]], np.column_stack([columns[name] for name in found[1:]])
 
 
 def _track(path: Path) -> Mapping[str, Any] | None:

@@ -77,6 +77,19 @@ def test_a_ghost_starts_with_the_motion(folder):
     np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
 
 
+def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    kept = [k for k, name in enumerate(header.split(",")) if name.startswith(("time", "q_"))]
+    cut = [",".join(line.split(",")[k] for k in kept) for line in (header, *rows)]
+    (folder / "design.csv").write_text("\n".join(cut) + "\n")
+    _, data = run(folder, folder / "log.csv", "--ghost", folder / "design.csv")
+    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+    cut[0] = cut[0].replace("q_elbow", "x_elbow")
+    (folder / "design.csv").write_text("\n".join(cut) + "\n")
+    assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1
+    assert "design.csv has no column 'q_elbow_joint'; columns: " in capsys.readouterr().err
+
+
 def test_a_joint_that_stands_still_has_no_prediction(folder):
     text = (folder / "log.csv").read_text().splitlines()
     names, last = text[0].split(","), text[-1].split(",")
