@@ -7,6 +7,8 @@ const byId = (id) => document.getElementById(id);
 const COLOURS = ["#2f7ed8", "#e0671f", "#3a9d5d", "#a855c7", "#b58900", "#c2366b"];
 const FULL = 1.5 * Math.PI; // [rad] what the largest torque of a joint spans as an arc
 const POOR = 0.5; // residual over the torque's root mean square that is as red as it gets
+const SLOW = 0.045; // [s] a frame
+const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
 const LONGEST = 20000; // rows that a live page keeps of each table
 
 function element(tag, attributes = {}, ...children) {
@@ -65,20 +67,21 @@ const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, th
 
 // ---- the scene -------------------------------------------------------------------------------
 
-function isSlow() { // drawn by the processor: smooth edges would halve the frames
+const onProcessor = (() => { // no graphics card draws: smooth edges would halve the frames
   const context = document.createElement("canvas").getContext("webgl");
   const info = context && context.getExtension("WEBGL_debug_renderer_info");
   const name = info ? context.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
   return /swiftshader|llvmpipe|software|basic render/i.test(name);
-}
+})();
 
 const pane = byId("meshcat-pane");
-let viewer = null;
+let viewer = null, fullRatio = 1; // pixels of the view per pixel of the page
 try {
-  const renderer = new THREE.WebGLRenderer({ antialias: !isSlow(), alpha: true });
+  const renderer = new THREE.WebGLRenderer({ antialias: !onProcessor, alpha: true });
   pane.append(renderer.domElement);
   viewer = new MeshCat.Viewer(pane, true, renderer);
-  if (isSlow()) renderer.setPixelRatio(1);
+  fullRatio = onProcessor ? 1 : window.devicePixelRatio;
+  renderer.setPixelRatio(fullRatio);
 } catch (error) { // the plots are of use without it
   pane.append(element("p", { class: "fault" }, `This browser shows no 3-D view: ${error.message}`));
 }
@@ -407,21 +410,29 @@ function drawBands() {
 // ---- the clock -------------------------------------------------------------------------------
 
 const clock = { time: 0, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
-  speed: 1, loop: true, follow: Boolean(data.live), end: 0, frames: 0 };
+  speed: 1, loop: true, follow: Boolean(data.live), end: 0, frames: 0, at: 0 };
 clock.end = Math.max(motion.end, ghostMotion ? ghostMotion.end : 0);
 const slider = byId("time"), clockText = byId("clock"), playButton = byId("play");
-let shown = null, spoken = -1;
+let shown = null, told = null, spoken = -1;
 
-function show(force) {
-  if (!force && shown === clock.time) return;
+function show() { // the robot in every frame, the page about it ten times a second
+  if (shown !== clock.time) showRobot(clock.time);
   shown = clock.time;
-  const time = clock.time;
-  if (viewer) {
-    if (motion.rows.length) robot.pose(motion.at(time));
-    if (ghost) ghost.pose(ghostMotion.at(time));
-    if (arcs.length && torqueTable.rows.length) showArcs(torqueTable.at(time));
-    viewer.set_dirty();
-  }
+  const now = performance.now();
+  if (told && (told.time === clock.time || (clock.playing && now - told.at < 100))) return;
+  told = { time: clock.time, at: now };
+  showReadings(clock.time);
+}
+
+function showRobot(time) {
+  if (!viewer) return;
+  if (motion.rows.length) robot.pose(motion.at(time));
+  if (ghost) ghost.pose(ghostMotion.at(time));
+  if (arcs.length && torqueTable.rows.length) showArcs(torqueTable.at(time));
+  viewer.set_dirty();
+}
+
+function showReadings(time) {
   if (torqueTable && torqueTable.rows.length) {
     const row = torqueTable.rows[torqueTable.before(time)];
     torquePlots.forEach((plot, j) => plot.say(torques.labels.map((_, k) => row[k * count + j])));
@@ -442,26 +453,39 @@ function show(force) {
 function seek(time) {
   clock.follow = false;
   clock.time = Math.min(Math.max(time, 0), clock.end);
+  told = null;
   buttons();
-  show(false);
+  show();
 }
 function play() {
   if (clock.time >= clock.end) clock.time = 0;
   clock.playing = true;
   buttons();
 }
-function pause() { clock.playing = false; clock.follow = false; buttons(); }
+function pause() { clock.playing = false; clock.follow = false; told = null; buttons(); }
 function toggle() { if (clock.playing) pause(); else play(); }
 function buttons() {
   playButton.textContent = clock.playing ? "Pause" : "Play";
   byId("live").setAttribute("aria-pressed", clock.follow);
 }
 
+const pace = { mean: 0, frames: 0, pixels: 1 }; // of the last frames [s]; share of the pixels' width
+function spare(passed) { // a slow processor draws fewer pixels rather than fewer frames
+  pace.mean += (Math.min(passed, 0.5) - pace.mean) / Math.min(++pace.frames, 15);
+  if (pace.frames < 15 || pace.mean < SLOW || pace.pixels <= COARSEST) return;
+  pace.pixels = Math.max(0.8 * pace.pixels, COARSEST);
+  pace.frames = 0;
+  viewer.renderer.setPixelRatio(pace.pixels * fullRatio);
+  viewer.set_3d_pane_size();
+}
+
 let last = null;
 function tick(now) {
   const passed = last === null ? 0 : (now - last) / 1000;
   last = now;
+  clock.at = now;
   clock.frames++;
+  if (clock.playing && viewer && onProcessor) spare(passed);
   if (clock.follow) clock.time = clock.end;
   else if (clock.playing && clock.end > 0) {
     clock.time += passed * clock.speed;
@@ -470,7 +494,7 @@ function tick(now) {
       if (!clock.loop) pause();
     }
   }
-  show(false);
+  show();
   requestAnimationFrame(tick);
 }
 
@@ -640,7 +664,7 @@ drawSwitches();
 data.marks.forEach(addMark);
 if (data.live) listen();
 buttons();
-show(true);
+show();
 requestAnimationFrame(tick);
 
 // for scripts and notebooks: the clock, and the world pose of every node as 16 numbers by columns
