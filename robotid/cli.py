@@ -204,7 +204,10 @@ def _track(options: argparse.Namespace) -> None:
     if options.serve is not None:
         _serve(job, options.out, options)
         return
-    found = run_track(job, options.out)
+    _print_track(run_track(job, options.out), options)
+
+
+def _print_track(found: dict[str, Any], options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(found, allow_nan=False))
         return
@@ -248,10 +251,16 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
     def announce(url: str) -> None:
         print(f"live: {url}  (Ctrl-C ends it)", file=sys.stderr, flush=True)
 
+    def finished(found: dict[str, Any]) -> None:
+        if folder is not None:
+            _print_track(found, options)
+            sys.stdout.flush()
+
+    settings = {"port": options.serve, "speed": options.speed}
     try:
-        serve_track(job, folder, port=options.serve, speed=options.speed, announce=announce)
+        serve_track(job, folder, **settings, announce=announce, finished=finished)
     except KeyboardInterrupt:
-        print("", file=sys.stderr)
+        print("\nended", file=sys.stderr)
 
 
 def _doctor(options: argparse.Namespace) -> None:

@@ -153,6 +153,7 @@ def serve_track(
     port: int = 0,
     speed: float = 1.0,
     announce: Callable[[str], None],
+    finished: Callable[[dict[str, Any]], None] | None = None,
     linger: bool = True,
 ) -> dict[str, Any]:
     """Track the one log of a job and show it in a live page as it goes.
@@ -163,6 +164,7 @@ def serve_track(
         port: Port of the page on 127.0.0.1; any free one if 0.
         speed: How fast the log passes, 1 is true time; 0 is as fast as the tracker can.
         announce: Called with the address of the page.
+        finished: Called with the content of track.json when the log has ended.
         linger: Whether the page is served on after the end, until KeyboardInterrupt.
 
     Returns:
@@ -186,6 +188,8 @@ def serve_track(
         announce(live.url)
         content = run_track(job, folder, observer=_Teller(live, model, log, speed))
         live.finish()
+        if finished is not None:
+            finished(content)
         while linger:
             time.sleep(3600.0)
     return content

@@ -137,7 +137,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         masses={"URDF": prior, **vectors} if vectors else None,
         ghost=second,
         bands=None if findings.track is None else _bands(findings),
-        marks=[*_payloads(findings.track), *_contacts(torques, model.joints)],
+        marks=[*_payloads(findings.track), *_contacts(torques, model)],
         notes=[f"Motion: {entry.path.name}."],
     )
 
@@ -240,17 +240,16 @@ def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
     return marks
 
 
-def _contacts(torques: Torques, joints: Sequence[str]) -> list[Mark]:
+def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
     """Return marks where the first result does not explain the torque."""
     if not torques.predicted:
         return []
     predicted = next(iter(torques.predicted.values()))
-    return [
-        Mark(
-            found.start,
-            f"unexplained torque, most at {found.joint} ({found.residual:.2g} on average, for "
-            f"{found.end - found.start:.1f} s): contact or load?",
-            "contact",
-        )
-        for found in find_surprises(torques.t, torques.measured, predicted, joints)
-    ]
+    units = dict(zip(model.joints, model.row_units, strict=True))
+    marks = []
+    for found in find_surprises(torques.t, torques.measured, predicted, model.joints):
+        size = f"{found.residual:.2g} {units[found.joint]} on average"
+        label = f"unexplained torque, most at {found.joint} ({size}, for "
+        label += f"{found.end - found.start:.1f} s): contact or load?"
+        marks.append(Mark(found.start, label, "contact"))
+    return marks

@@ -242,7 +242,8 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pan
     words = ["track", str(panda.tree.path), "log.csv", "--joints", ",".join(panda.joints)]
     run = subprocess.Popen(
         [sys.executable, "-m", "robotid", *words, "--out", "out", "--serve", "--speed", "3"],
-        cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     try:
         address = run.stderr.readline().split()[1]
@@ -266,7 +267,9 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pan
         run.send_signal(signal.SIGINT)
         assert run.wait(10) == 0
         assert "Traceback" not in run.stderr.read()
+        assert "step change at" in run.stdout.read()
     finally:
         run.kill()
         run.wait()
         run.stderr.close()
+        run.stdout.close()

@@ -115,6 +115,7 @@ def test_torque_that_the_result_does_not_explain_is_marked(folder):
     assert mark["kind"] == "contact"
     assert mark["t"] == pytest.approx(7.0, abs=0.15)
     assert mark["label"].startswith("unexplained torque, most at elbow_joint (")
+    assert " N m on average, for " in mark["label"]
     assert run(folder, folder / "log.csv", folder / "out")[1]["marks"] == []
 
 
