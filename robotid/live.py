@@ -48,7 +48,11 @@ class LivePage:
         self._sent, self._over = 0, False
         self._news = threading.Condition()
         handler = type("Handler", (_Handler,), {"live": self})
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), handler)
+        try:
+            self._server = ThreadingHTTPServer(("127.0.0.1", port), handler)
+        except OSError as error:
+            message = f"port {port} of 127.0.0.1: {error.strerror}; name another one, or none"
+            raise OSError(message) from error
         self._server.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)

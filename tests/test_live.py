@@ -76,7 +76,7 @@ def test_only_the_newest_messages_are_kept(monkeypatch):
 
 def test_closing_frees_the_port_and_a_taken_one_is_an_error(live):
     port = int(live.url.rstrip("/").rsplit(":", 1)[1])
-    with pytest.raises(OSError, match="in use"):
+    with pytest.raises(OSError, match=rf"port {port} of .* already in use; name another one"):
         LivePage("", port)
     live.close()
     LivePage("", port).close()
