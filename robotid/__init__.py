@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from robotid.log_source import LogSource
     from robotid.model import RobotModel
     from robotid.parameters import Coupling
+    from robotid.replay_job import replay_identified
     from robotid.report import write_report
     from robotid.signals import SignalSettings
     from robotid.units import LogUnits
     from robotid.urdf import write_urdf
+    from robotid.visualization import replay
 
 __version__ = "0.1.0"
 
@@ -44,6 +46,8 @@ __all__ = [
     "identify",
     "read_job",
     "read_log",
+    "replay",
+    "replay_identified",
     "write_log",
     "write_report",
     "write_urdf",
@@ -60,10 +64,12 @@ _HOMES = {
     "log_source": ["LogSource"],
     "model": ["RobotModel"],
     "parameters": ["Coupling"],
+    "replay_job": ["replay_identified"],
     "report": ["write_report"],
     "signals": ["SignalSettings"],
     "units": ["LogUnits"],
     "urdf": ["write_urdf"],
+    "visualization": ["replay"],
 }
 
 

@@ -2,8 +2,9 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robotid import __version__
 from robotid.console import (
@@ -22,10 +23,14 @@ from robotid.flags import (
     add_log_flags,
     add_source_flags,
     job_from_flags,
+    refuse_log_flags,
     source_settings,
 )
 from robotid.progress import terminal_progress
 from robotid.work_flags import add_progress_flags, add_verbose_flag, add_work_flags
+
+if TYPE_CHECKING:
+    from robotid.job import Job
 
 __all__ = ["main"]
 
@@ -101,7 +106,22 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--json", action="store_true", help="print track.json")
     add_log_flags(track.add_argument_group("the log"))
     add_verbose_flag(track)
+    _add_serve_flags(track, "show it in the browser while it runs, in true time")
     track.set_defaults(run=_track, validate=[], estimator=None)
+
+    replay = commands.add_parser(
+        "replay", help="play a log in the browser: robot, torques, what was identified"
+    )
+    replay.add_argument("source", metavar="URDF")
+    replay.add_argument("logs", nargs=1, metavar="LOG")
+    replay.add_argument(
+        "results", nargs="*", metavar="RESULT", help="result.json, track.json or their folder"
+    )
+    replay.add_argument("--html", metavar="FILE", help="page to write; default: replay.html")
+    replay.add_argument("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+    _add_serve_flags(replay, "track the log again, in true time, and show it as it goes")
+    add_log_flags(replay.add_argument_group("the log, unless a RESULT says it"))
+    replay.set_defaults(run=_replay, validate=[], estimator=None)
 
     doctor = commands.add_parser(
         "doctor", help="what is wrong with logs: JOB.toml, or URDF LOG ..."
@@ -137,6 +157,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_serve_flags(parser: argparse.ArgumentParser, help_: str) -> None:
+    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=help_)
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="of --serve; 0: as fast as it can"
+    )
+
+
 def _demo(options: argparse.Namespace) -> None:
     from robotid.demo import run_demo
 
@@ -160,7 +187,9 @@ def _paper(options: argparse.Namespace) -> None:
         print(json.dumps(result, allow_nan=False))
         return
     _print_paper(result)
-    print(f"\nwritten to {options.out}: paper.html, paper.json, figures as PNG and SVG")
+    print(
+        f"\nwritten to {options.out}: paper.html, paper.json, replay.html, figures as PNG and SVG"
+    )
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -196,7 +225,14 @@ def _identify(options: argparse.Namespace) -> None:
 def _track(options: argparse.Namespace) -> None:
     from robotid.tracking import run_track
 
-    found = run_track(job_from_flags(options), options.out)
+    job = job_from_flags(options)
+    if options.serve is not None:
+        _serve(job, options.out, options)
+        return
+    _print_track(run_track(job, options.out), options)
+
+
+def _print_track(found: dict[str, Any], options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(found, allow_nan=False))
         return
@@ -215,6 +251,41 @@ def _track(options: argparse.Namespace) -> None:
     for entry in found["base_parameters"]:
         print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
     print_files(options.out, [found["history"], "track.json"])
+
+
+def _replay(options: argparse.Namespace) -> None:
+    from robotid.replay_job import read_findings, replay_files, stated_job
+
+    findings = read_findings(options.results)
+    if findings.settings is None:
+        job = job_from_flags(options)
+    else:
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+        job = stated_job(findings, options.source, options.logs[0])
+    if options.html or options.serve is None:
+        page = replay_files(job, findings, ghost=options.ghost)
+        target = page.write(options.html or "replay.html")
+        print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
+    if options.serve is not None:
+        _serve(job, None, options)
+
+
+def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
+    from robotid.live import serve_track
+
+    def announce(url: str) -> None:
+        print(f"live: {url}  (Ctrl-C ends it)", file=sys.stderr, flush=True)
+
+    def finished(found: dict[str, Any]) -> None:
+        if folder is not None:
+            _print_track(found, options)
+            sys.stdout.flush()
+
+    settings = {"port": options.serve, "speed": options.speed}
+    try:
+        serve_track(job, folder, **settings, announce=announce, finished=finished)
+    except KeyboardInterrupt:
+        print("\nended", file=sys.stderr)
 
 
 def _doctor(options: argparse.Namespace) -> None:

@@ -12,9 +12,9 @@ from robotid.identification import Identification
 from robotid.job import Job, LogEntry
 from robotid.log_files import write_log
 from robotid.model import RobotModel
+from robotid.replay_job import replay_identified
 from robotid.signals import SignalSettings
 from robotid.simulation import Noise, another_robot, simulate
-from robotid.visualization import write_replay
 from robotid.workflow import run_job
 
 __all__ = ["run_demo"]
@@ -58,6 +58,5 @@ def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]
         validation=(entries[1],),
     )
     identification, result = run_job(job, target)
-    shown = identification.validation[0].recording.trajectory
-    write_replay(model, shown.t - shown.t[0], shown.q, target / "replay.html")
+    replay_identified(identification).write(target / "replay.html")
     return identification, result, identification.mapping.to_base(truth)

@@ -15,6 +15,7 @@ __all__ = [
     "add_log_flags",
     "add_source_flags",
     "job_from_flags",
+    "refuse_log_flags",
     "source_settings",
 ]
 
@@ -98,7 +99,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
     from robotid.job import job_from_settings, read_job
 
     if Path(options.source).suffix == ".toml":
-        given = [name for name in _JOB_FLAGS if getattr(options, name)]
+        given = _given(options)
         if options.logs or given:
             raise SettingsError(
                 f"{options.source} is a job file, which states its logs and settings itself; "
@@ -139,6 +140,24 @@ _JOB_FLAGS = (
     "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
     "time_unit", "angle_unit", "dynamics", "topic", "effort", "stamp", "ignore",
 )  # fmt: skip
+
+
+def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
+    """Refuse the flags that say how logs are read.
+
+    Args:
+        options: The flags, those of :func:`add_log_flags` among them.
+        why: What is in their place.
+
+    Raises:
+        SettingsError: If one is given.
+    """
+    if given := _given(options):
+        raise SettingsError(f"{why}; leave out {given}")
+
+
+def _given(options: argparse.Namespace) -> list[str]:
+    return [name for name in _JOB_FLAGS if getattr(options, name)]
 
 
 def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:

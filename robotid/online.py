@@ -131,6 +131,16 @@ class OnlineIdentifier:
         )
 
     @property
+    def compared(self) -> tuple[Array, Array]:
+        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each.
+
+        Raises:
+            DataError: If the robot has not moved enough for a first estimate.
+        """
+        self._require_ready()
+        return self._compared
+
+    @property
     def estimate(self) -> Estimate:
         """The estimate as the batch estimators return it.
 
@@ -236,6 +246,7 @@ class OnlineIdentifier:
         self._remember(t)
         self._state, self._t = state, t
         residual = tau - Y @ state.theta
+        self._compared = tau, tau - residual
         onset = self._innovations.push(t, tau, e, residual, doubt, used, self._share)
         if onset is not None:
             self._reopen(now, onset)

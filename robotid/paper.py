@@ -14,6 +14,7 @@ from robotid import __version__, paper_plots
 from robotid._typing import Array
 from robotid.paper_errata import EnergyDrift, energy_drift, errata
 from robotid.paper_page import paper_page
+from robotid.paper_replay import write_paper_replay
 from robotid.paper_simulation import (
     AMPLITUDE,
     CASES,
@@ -80,7 +81,8 @@ def run_paper(
     drift = energy_drift()
     content = _content(chosen, studies, near, exact, drift)
     report("drawing", 0, 1, "pages")
-    _write(target, content, _figures(studies, near, drift))
+    physical = studies[list(MODELS).index("physical")]
+    _write(target, content, _figures(studies, near, drift), physical)
     return content
 
 
@@ -203,7 +205,9 @@ def _figures(
     }
 
 
-def _write(target: Path, content: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
+def _write(
+    target: Path, content: Mapping[str, Any], figures: Mapping[str, Any], study: ModelStudy
+) -> None:
     """Write all files beside their places, then put each in place."""
     import matplotlib
 
@@ -216,6 +220,7 @@ def _write(target: Path, content: Mapping[str, Any], figures: Mapping[str, Any])
                 figure.set_layout_engine("none")  # it is laid out now
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
                 shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
+        write_paper_replay(study, beside)
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
         text = json.dumps(content, allow_nan=False, indent=1)
         (beside / "paper.json").write_text(text + "\n", encoding="utf-8")

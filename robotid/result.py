@@ -14,15 +14,23 @@ import numpy as np
 from robotid import __version__
 from robotid._typing import Array
 from robotid.bands import REACH
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, ModelError
 from robotid.identification import Identification, structural_mapping
 from robotid.metrics import Metrics
+from robotid.model import RobotModel
 from robotid.parameters import pseudo_inertia
 from robotid.validation import Evaluation
 from robotid.verdict import Finding
 from robotid.versions import versions
 
-__all__ = ["build_result", "file_sha256", "read_result", "recording_metrics", "write_json"]
+__all__ = [
+    "build_result",
+    "file_sha256",
+    "read_result",
+    "recording_metrics",
+    "stated_parameters",
+    "write_json",
+]
 
 SCHEMA_VERSION = 1
 
@@ -125,6 +133,29 @@ def read_result(path: str | Path) -> dict[str, Any]:
             "written by 'robotid identify'"
         )
     return dict(result)
+
+
+def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
+    """Return the standard parameters that a result states.
+
+    Args:
+        result: Content of a result.json.
+        model: Its robot.
+
+    Returns:
+        Parameters, shape (p,), SI units, in ``layout.names`` order.
+
+    Raises:
+        ModelError: If a parameter of the robot is not in it.
+    """
+    stated = {
+        entry["name"]: entry["value"]
+        for entry in (*result["standard_parameters"], *result["drive_parameters"])
+    }
+    missing = [name for name in model.layout.names if name not in stated]
+    if missing:
+        raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
+    return np.array([stated[name] for name in model.layout.names])
 
 
 def write_json(content: Mapping[str, Any], target: str | Path) -> None:

@@ -1,5 +1,6 @@
 """An online identification over a recorded log, as if it came in live; its history in files."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ from robotid.parquet_files import load_pyarrow
 from robotid.result import file_sha256, write_json
 from robotid.tables import write_columns
 
-__all__ = ["Track", "run_track", "track"]
+__all__ = ["Observer", "Track", "run_track", "track"]
+
+Observer = Callable[[int, OnlineIdentifier], None]
 
 _ROWS = 20.0  # [Hz] rows of the history per second
 _SCHEMA = 1
@@ -61,13 +64,16 @@ class Track:
         }
 
 
-def track(model: RobotModel, log: Log, settings: OnlineSettings) -> Track:
+def track(
+    model: RobotModel, log: Log, settings: OnlineSettings, *, observer: Observer | None = None
+) -> Track:
     """Give a log to an online identifier, sample by sample.
 
     Args:
         model: The robot, with a fixed base.
         log: The log, of the model's joints in its order; its q and tau are used.
         settings: How the identification runs.
+        observer: Called after each sample with its row of the log and the identifier.
 
     Returns:
         The history, about 20 rows a second.
@@ -81,6 +87,8 @@ def track(model: RobotModel, log: Log, settings: OnlineSettings) -> Track:
     readings: list[Reading] = []
     for k in range(len(log.t)):
         identifier.update(float(log.t[k]), log.q[k], log.tau[k])
+        if observer is not None:
+            observer(k, identifier)
         is_due = not times or log.t[k] > times[-1] + 0.999 / _ROWS
         if identifier.is_ready and (is_due or k == len(log.t) - 1):
             times.append(float(log.t[k]))
@@ -100,12 +108,15 @@ def track(model: RobotModel, log: Log, settings: OnlineSettings) -> Track:
     )
 
 
-def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
+def run_track(
+    job: Job, folder: str | Path | None, *, observer: Observer | None = None
+) -> dict[str, Any]:
     """Track the one log of a job; write the history and track.json.
 
     Args:
         job: The robot, the log and the signals' settings.
-        folder: Where to write; made if it is missing.
+        folder: Where to write; made if it is missing. Nothing is written if None.
+        observer: Called after each sample with its row of the log and the identifier.
 
     Returns:
         The content of track.json.
@@ -127,13 +138,14 @@ def run_track(job: Job, folder: str | Path) -> dict[str, Any]:
         cutoff=job.signals.cutoff,
         min_velocity=job.signals.min_velocity,
     )
-    found = track(model, log, settings)
-    target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
+    found = track(model, log, settings, observer=observer)
     history = _history_name()
-    write_columns(found.columns(), target / history)
     content = _summary(found, job, log, history)
-    write_json(content, target / "track.json")
+    if folder is not None:
+        target = Path(folder)
+        target.mkdir(parents=True, exist_ok=True)
+        write_columns(found.columns(), target / history)
+        write_json(content, target / "track.json")
     return content
 
 

@@ -9,15 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from robotid._typing import Array
 from robotid.checkpoint import Checkpoint
 from robotid.checkpoint_inputs import checkpoint_inputs
 from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
-from robotid.exceptions import DataError, ModelError
+from robotid.exceptions import DataError
 from robotid.identification import Identification, conclude, identify, structural_mapping
 from robotid.job import Job, LogEntry, job_from_settings
 from robotid.long_jobs import is_long, survey_logs
@@ -29,6 +26,7 @@ from robotid.result import (
     build_result,
     read_result,
     recording_metrics,
+    stated_parameters,
     write_json,
 )
 from robotid.sidecar import load_identified
@@ -181,7 +179,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     if "urdf" in outputs:
         model, pi = load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
     else:
-        model, pi = source, _stated_parameters(result, source)
+        model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
     if is_long(job, entries):
@@ -202,17 +200,6 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         "validation": [recording_metrics(e, "estimate") for e in evaluations],
         "verdict": {"status": verdict.status, "reasons": list(verdict.reasons)},
     }
-
-
-def _stated_parameters(result: dict[str, Any], model: RobotModel) -> Array:
-    stated = {
-        entry["name"]: entry["value"]
-        for entry in (*result["standard_parameters"], *result["drive_parameters"])
-    }
-    missing = [name for name in model.layout.names if name not in stated]
-    if missing:
-        raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
-    return np.array([stated[name] for name in model.layout.names])
 
 
 def _locked_findings(job: Job, model: RobotModel) -> list[Finding]:

@@ -18,10 +18,12 @@ FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
     "innovations online_settings job_keys lanes lapack log_source console signal_settings "
-    "progress work_flags versions report_page",
+    "progress work_flags versions report_page replay_page surprises",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
-    "time_stamps compiled columns array_tables csv_files parquet_files bags summaries",
-    3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces",
+    "time_stamps compiled columns array_tables csv_files parquet_files bags summaries meshes "
+    "ellipsoids",
+    3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces "
+    "scene",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
     "constraint_settings task checkpoint prediction",
     5: "bands validation sidecar estimator_settings simulation dynamics log_files probe "
@@ -31,10 +33,10 @@ FLOORS = {
     "model_checks long_logs work_plan",
     8: "identification diagnosis_plots",
     9: "information online result inspection paper_errata consistency_findings long_recordings "
-    "long_jobs report_consistency",
+    "long_jobs report_consistency paper_replay",
     10: "comparison report_diagnosis doctor report_tables paper_plots paper_page tracking "
-    "checkpoint_inputs",
-    11: "comparison_page report paper",
+    "checkpoint_inputs replay_job",
+    11: "live comparison_page report paper",
     12: "workflow",
     13: "demo flags",
     14: "cli",
@@ -43,14 +45,14 @@ FLOORS = {
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 PINOCCHIO = {
     "model", "regressor", "plant", "simulation", "visualization", "lumping", "prior", "rows",
-    "compiled", "link_geometry", "mass_matrix", "prediction",
+    "compiled", "link_geometry", "mass_matrix", "prediction", "scene",
 }  # fmt: skip
 NUMBA = {"lanes"}  # at its top; no module imports lanes at its own
 
 INSIDE_FUNCTIONS = {
     "yourdfpy": {"urdf"},
-    "meshcat": {"visualization"},
-    "trimesh": {"link_geometry"},
+    "meshcat": {"replay_page"},
+    "trimesh": {"link_geometry", "meshes"},
     "pyarrow": {"parquet_files"},
     "rosbags": {"bags"},
     "distributed": {"cluster"},
@@ -144,6 +146,7 @@ def test_importing_the_package_is_light(statement):
     heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "rosbags", "h5py"]
     heavy += ["rich", "distributed"]
     heavy += ["scs", "trimesh"]
+    heavy += ["trimesh"]
     found = f"[m for m in {heavy} if m in sys.modules]"
     code = f"{statement}\nimport sys, json\nprint(json.dumps({found}))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

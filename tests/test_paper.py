@@ -72,7 +72,8 @@ def test_every_number_is_finite(written):
 def test_the_figures_are_there_as_png_and_svg_and_nothing_else(written):
     folder, _ = written
     wanted = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")}
-    assert {path.name for path in folder.iterdir()} == wanted | {"paper.json", "paper.html"}
+    others = {"paper.json", "paper.html", "replay.html", "planar_2r.urdf"}
+    assert {path.name for path in folder.iterdir()} == wanted | others
     for name in FIGURES:
         assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert ET.parse(folder / f"{name}.svg").getroot().tag.endswith("svg")

@@ -9,6 +9,7 @@ import pytest
 from robotid.data import Log
 from robotid.exceptions import DataError
 from robotid.identification import identify
+from robotid.information import information
 from robotid.model import RobotModel
 from robotid.regressor import joint_torque_regressor
 from robotid.report import write_report
@@ -227,8 +228,7 @@ def test_the_correlation_map_has_every_name_and_a_cell_per_pair(html, found):
     texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
     names = [escape(name) for name in found.mapping.base_names]
     assert texts[::2] == [f"{name} {i}" for i, name in enumerate(names, start=1)]
-    C = found.wls.covariance
-    r = C / np.sqrt(np.outer(np.diag(C), np.diag(C)))
+    r = information(found).correlation
     shown = np.abs(np.tril(r, -1)) >= 0.5 / 8  # a shade
     assert figure.count("h-10z") == shown.sum()
 

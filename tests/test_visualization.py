@@ -1,16 +1,14 @@
-import base64
-import json
 import os
 import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
-import umsgpack
+from replay_data import shown
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.model import RobotModel
-from robotid.visualization import write_replay
+from robotid.visualization import Bands, Mark, Torques, replay, write_replay
 
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
   <link name="base"/><link name="turner"/><link name="slider"/><link name="tip"/>
@@ -46,78 +44,79 @@ def page(arm, motion, tmp_path_factory):
     return path.read_text(encoding="utf-8")
 
 
-def commands(html):
-    packed = json.loads(re.search(r"const commands = (\[.*\]);", html)[1])
-    return [umsgpack.unpackb(base64.b64decode(text)) for text in packed]
-
-
-def world_poses(found, time_index):
-    """Return the world pose of every animated node at a keyframe, the chain multiplied out."""
-    (animation,) = [c for c in found if c["type"] == "set_animation"]
-    poses = {}
-    for clip in sorted(animation["animations"], key=lambda clip: len(clip["path"])):
-        tracks = {t["name"]: [k["value"] for k in t["keys"]] for t in clip["clip"]["tracks"]}
-        turn = pin.Quaternion(np.array(tracks[".quaternion"][time_index])).normalized()
-        positions = tracks[".position"]
-        position = np.array(positions[time_index if len(positions) > 1 else 0])
-        parent = poses.get(clip["path"].rsplit("/", 1)[0], pin.SE3.Identity())
-        poses[clip["path"]] = parent * pin.SE3(turn.toRotationMatrix(), position)
-    return list(poses.values())
+def world_poses(nodes, moved):
+    """Return the world pose of every node but the first, as the page's script poses them."""
+    poses = [pin.SE3.Identity()]
+    for node in nodes[1:]:
+        rest = pin.SE3(pin.Quaternion(np.array(node["quaternion"])), np.array(node["position"]))
+        axis, by = np.array(node["axis"]), float(moved[node["column"]])
+        if node["kind"] == "turn":
+            rest = rest * pin.SE3(pin.exp3(axis * by), np.zeros(3))
+        elif node["kind"] == "slide":
+            rest = rest * pin.SE3(np.eye(3), axis * by)
+        else:
+            turn = pin.Quaternion(np.array(moved[3:7], dtype=float)).normalized()
+            rest = pin.SE3(turn, np.array(moved[:3], dtype=float))
+        poses.append(poses[node["parent"]] * rest)
+    return poses[1:]
 
 
 def test_the_page_fetches_nothing_and_cannot_be_injected(page):
-    outside = re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
-    assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=", page.split("MeshCat")[0])
-    assert "src=" not in outside
-    assert "href=" not in outside
-    assert "http" not in outside
+    outside = re.sub(r"<(script|style)\b.*?</\1>", "", page, flags=re.DOTALL)
+    assert set(re.findall(r'(?:src|href)="([^"]*)"', outside)) == {"data:,"}
+    assert "connect-src" not in outside
+    assert "default-src 'none'" in outside
     assert "<b>x</b>" not in page
     assert "<title>&lt;b&gt;x&lt;/b&gt;: replay</title>" in outside
-    assert page.count("</script>") == 2
+    assert page.count("</script>") == 4
+    assert shown(page)["title"] == "<b>x</b>"
     assert "MeshCat.Viewer" in page
 
 
+def test_text_from_files_stays_text(arm, motion):
+    bad = "</script><img src=x onerror=alert(1)>"
+    marks = [Mark(5.5, bad, "payload")]
+    html = replay(arm, *motion, marks=marks, notes=[bad], ghost=(bad, *motion)).html
+    assert "<img" not in html
+    assert html.count("</script>") == 4
+    data = shown(html)
+    assert (data["marks"][0]["label"], data["ghost"]["label"]) == (bad, bad)
+    assert data["marks"][0]["t"] == pytest.approx(0.5)
+
+
 def test_keyframes_have_the_true_times_at_the_rate(page):
-    (animation,) = [c for c in commands(page) if c["type"] == "set_animation"]
-    assert len(animation["animations"]) == 2
-    for clip in animation["animations"]:
-        assert clip["clip"]["fps"] == 1
-        (turn,) = [t for t in clip["clip"]["tracks"] if t["name"] == ".quaternion"]
-        times = np.array([key["time"] for key in turn["keys"]])
-        assert (times[0], times[-1]) == (0.0, pytest.approx(2.0))
-        assert np.diff(times).max() <= 1 / 30 + 0.0101
-        assert 55 <= len(times) <= 63
+    times = shown(page)["motion"]["t"]
+    assert (times[0], times[-1]) == (0.0, pytest.approx(2.0))
+    assert np.diff(times).max() <= 1 / 30 + 0.0101
+    assert 55 <= len(times) <= 63
 
 
 def test_every_keyframe_is_the_robot_s_pose(arm, motion, page):
     t, q = motion
-    found = commands(page)
-    keys = found[-1]["animations"][0]["clip"]["tracks"][0]["keys"]
-    data = arm.pin_model.createData()
-    for k in (0, 17, len(keys) - 1):
-        row = int(np.argmin(np.abs(t - t[0] - keys[k]["time"])))
-        pin.forwardKinematics(arm.pin_model, data, arm.configurations(q)[row])
-        for shown, true in zip(world_poses(found, k), list(data.oMi)[1:], strict=True):
+    data = shown(page)
+    times, moved = data["motion"]["t"], data["motion"]["q"]
+    pinned = arm.pin_model.createData()
+    for k in (0, 17, len(times) - 1):
+        row = int(np.argmin(np.abs(t - t[0] - times[k])))
+        pin.forwardKinematics(arm.pin_model, pinned, arm.configurations(q)[row])
+        poses = world_poses(data["scene"]["nodes"], moved[k])
+        for pose, true in zip(poses, list(pinned.oMi)[1:], strict=True):
             # keyframes are single precision
-            np.testing.assert_allclose(shown.homogeneous, true.homogeneous, atol=1e-6)
+            np.testing.assert_allclose(pose.homogeneous, true.homogeneous, atol=1e-6)
 
 
-def test_the_first_pose_is_set_without_the_animation(arm, motion, page):
-    poses = [c for c in commands(page) if c["type"] == "set_transform" and "part" not in c["path"]]
-    assert [c["path"] for c in poses] == [
-        "/meshcat/robot/1 turn|1",
-        "/meshcat/robot/1 turn|1/2 slide",
-    ]
-    data = arm.pin_model.createData()
-    pin.forwardKinematics(arm.pin_model, data, arm.configurations(motion[1])[0])
-    for command, M in zip(poses, list(data.liMi)[1:], strict=True):
-        shown = np.array(command["matrix"]).reshape(4, 4).T
-        np.testing.assert_allclose(shown, M.homogeneous, atol=1e-6)
+def test_a_joint_that_turns_freely_turns_on_between_keyframes(arm, motion):
+    t, q = motion
+    wrapped = q.copy()
+    wrapped[:, 0] = np.angle(np.exp(1j * q[:, 0]))
+    moved = shown(replay(arm, t, wrapped).html)["motion"]["q"]
+    np.testing.assert_allclose(moved[-1, 0] - moved[0, 0], 8.0, atol=1e-5)
 
 
 def test_links_reach_from_joint_to_joint_and_to_the_tip(page):
-    shapes = {c["path"]: c["object"]["geometries"][0] for c in commands(page) if "object" in c}
-    tall = [shape["height"] for path, shape in shapes.items() if path.endswith("part 0")]
+    parts = shown(page)["scene"]["parts"]
+    links = [p for p in parts if p["shape"] == "cylinder" and p["colour"] in ("#9aa7b4", "#4a5560")]
+    tall = [p["size"][1] for p in links if p["size"][1] > 0.05]
     np.testing.assert_allclose(tall, [0.3, 0.4, 0.2], atol=1e-6)
 
 
@@ -127,12 +126,71 @@ def test_a_floating_base_moves(tmp_path):
     model = RobotModel.from_urdf(path, free_flyer=True)
     t = np.linspace(0.0, 1.0, 11)
     q = np.zeros((11, 9))
-    q[:, 0], q[:, 2] = t, 0.5
+    q[:, 0], q[:, 2], q[:, 7] = t, 0.5, 0.3
     q[:, 5:7] = np.column_stack([np.sin(t / 2), np.cos(t / 2)])
-    page = write_replay(model, t, q, tmp_path / "r.html").read_text(encoding="utf-8")
-    base = world_poses(commands(page), -1)[0]
+    q[5:, 3:7] *= -1  # the same turn, written in the other of two ways
+    data = shown(write_replay(model, t, q, tmp_path / "r.html").read_text(encoding="utf-8"))
+    base, turner, _ = world_poses(data["scene"]["nodes"], data["motion"]["q"][-1])
     np.testing.assert_allclose(base.translation, [1.0, 0.0, 0.5], atol=1e-6)
     np.testing.assert_allclose(pin.log3(base.rotation), [0.0, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(pin.log3(turner.rotation), [0.0, 0.0, 1.3], atol=1e-6)
+    steps = np.diff(data["motion"]["q"][:, 3:7], axis=0)
+    assert np.abs(steps).max() < 0.1
+
+
+def test_torques_are_plotted_with_gaps_and_by_the_name_of_who_predicts(arm, motion):
+    t, q = motion
+    t = np.where(t > 6.0, t + 1.0, t)
+    ours = Torques(t, q + 1.0, {"fit": q})
+    data = shown(replay(arm, t, q, torques=ours).html)["torques"]
+    assert data["labels"] == ["measured", "fit"]
+    assert [j["name"] for j in data["joints"]] == ["turn/1", "slide"]
+    assert [j["unit"] for j in data["joints"]] == ["N m", "N"]
+    assert [j["node"] for j in data["joints"]] == [1, 2]
+    holes = np.flatnonzero(np.isnan(data["values"][:, 0]))
+    assert len(holes) == 1
+    assert 1.0 < data["t"][holes[0]] < 2.0
+    residual = np.delete(data["values"][:, :2] - data["values"][:, 2:], holes, axis=0)
+    np.testing.assert_allclose(residual, 1.0, atol=1e-5)
+
+
+def test_a_gap_of_the_log_is_marked(arm, motion):
+    t, q = motion
+    t = np.where(t > 6.0, t + 1.0, t)
+    (mark,) = shown(replay(arm, t, q).html)["marks"]
+    assert (mark["kind"], mark["label"]) == ("gap", "gap of 1.01 s")
+    assert mark["t"] == pytest.approx(1.0)
+
+
+def test_masses_are_told_per_link_and_label(ur5):
+    pi = ur5.standard_parameters()
+    after = pi.copy()
+    after[:10] = 0.0
+    t = np.arange(3) / 10.0
+    page = replay(ur5, t, np.zeros((3, 6)), masses={"URDF": pi, "found": after}).html
+    before, found = shown(page)["masses"]
+    assert (before["label"], found["label"]) == ("URDF", "found")
+    assert [b["name"] for b in before["bodies"]] == list(ur5.layout.bodies)
+    assert [b["mass"] for b in before["bodies"]] == pytest.approx(pi[:60:10])
+    assert (found["bodies"][0]["fault"], found["bodies"][0]["semi_axes"]) == ("no mass", None)
+
+
+def test_parameters_over_time_come_with_their_errors(arm, motion):
+    t, q = motion
+    bands = Bands(t, ["turner.m", "slider.m"], ["kg", "kg"], q, 0.1 * q)
+    data = shown(replay(arm, t, q, bands=bands).html)["bands"]
+    assert data["names"] == ["turner.m", "slider.m"]
+    np.testing.assert_allclose(data["values"][-1], [*q[-1], *(0.1 * q[-1])], rtol=1e-6)
+
+
+def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(arm, motion):
+    from html import unescape
+
+    shown_as = replay(arm, *motion)
+    cell = shown_as._repr_html_()
+    assert 'sandbox="allow-scripts"' in cell
+    inside = re.search(r'srcdoc="([^"]*)"', cell)[1]
+    assert unescape(inside) == shown_as.html
 
 
 def test_a_long_motion_of_seven_joints_stays_below_20_mb(panda, tmp_path):

@@ -1,0 +1,85 @@
+"""Size, load time and frames per second of replay pages, in the system's Chromium.
+
+60 s logged at 1 kHz, played by itself and with everything that a page can show. Without a graphics
+card the processor draws; what it has left beside other work decides, so its time per frame is
+printed too.
+"""
+
+import argparse
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from browsing import FLAGS, NAMES
+
+from robotid.examples import example_urdf
+from robotid.model import RobotModel
+from robotid.visualization import Torques, replay
+
+FRAMES = "[replay.clock.frames, replay.clock.at / 1000]"
+
+
+def pages(seconds):
+    """Yield a name and a page: the motion alone, then all that is drawn."""
+    model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"))
+    t = np.arange(1000 * seconds) / 1000.0
+    speeds = np.array([0.5, 0.4, 0.6, 0.7, 1.0, 1.2])
+    q = 0.8 * np.sin(t[:, None] * speeds) + np.array([0, -1.2, 1.2, -1, 1, 0])
+    tau = 10.0 * np.sin(t[:, None] * speeds)
+    pi = model.standard_parameters()
+    yield "motion and torques", replay(model, t, q, torques=Torques(t, tau))
+    yield (
+        "and ghost, ellipsoids, prediction",
+        replay(
+            model, t, q, torques=Torques(t, tau, {"fit": 0.9 * tau}),
+            masses={"URDF": pi, "fit": pi}, ghost=("ghost", t, q + 0.2),
+        ),
+    )  # fmt: skip
+
+
+def processor_time(session):
+    """Return the processor time of the browser's processes so far [s]."""
+    info = session.send("SystemInfo.getProcessInfo")["processInfo"]
+    return sum(process["cpuTime"] for process in info)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="a short log, one second of playback")
+    quick = parser.parse_args().quick
+    from playwright.sync_api import sync_playwright
+
+    print(f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(f"{'page':36} {'MB':>5} {'load s':>7} {'frames/s':>9} {'processor ms/frame':>19}")
+    program = next(filter(None, map(shutil.which, NAMES)))
+    with sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
+        browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
+        session = browser.new_browser_cdp_session()
+        for name, shown in pages(6 if quick else 60):
+            path = shown.write(Path(folder) / "replay.html")
+            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            began = time.perf_counter()
+            page.goto(path.as_uri())
+            loaded = time.perf_counter() - began
+            page.wait_for_timeout(500 if quick else 3000)
+            first, spent = page.evaluate(FRAMES), processor_time(session)
+            page.wait_for_timeout(1000 if quick else 8000)
+            last, spent = page.evaluate(FRAMES), processor_time(session) - spent
+            frames = last[0] - first[0]
+            print(
+                f"{name:36} {path.stat().st_size / 1e6:5.1f} {loaded:7.2f} "
+                f"{frames / (last[1] - first[1]):9.1f} {1e3 * spent / frames:19.1f}"
+            )
+            page.close()
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

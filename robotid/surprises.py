@@ -1,0 +1,87 @@
+"""Stretches of a motion whose torque no model of the robot explains: contacts, loads, faults."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+
+__all__ = ["Surprise", "find_surprises"]
+
+_WINDOW = 0.2  # [s] over which a residual is averaged
+_TIMES = 6.0  # a mean residual so many times its median ...
+_SHARE = 0.3  # ... and above this share of the joint's torque is a surprise
+_APART = 1.0  # [s] surprises closer than this are one
+_SHORTEST = 0.05  # [s] what is shorter is a spike
+
+
+@dataclass(frozen=True)
+class Surprise:
+    """A stretch of unexplained torque.
+
+    Attributes:
+        start: When it begins [s].
+        end: When it ends [s].
+        joint: The joint that it shows most at, in shares of the joint's torque.
+        residual: Largest mean residual of that joint [N m or N].
+    """
+
+    start: float
+    end: float
+    joint: str
+    residual: float
+
+
+def find_surprises(
+    t: Array, tau: Array, predicted: Array, joints: Sequence[str]
+) -> tuple[Surprise, ...]:
+    """Return where measured and predicted torque disagree as nowhere else in a motion.
+
+    The root mean square of each joint's residual over 0.2 s is a surprise if it is six times its
+    median over the motion and 0.3 of the torque's root mean square, for 0.05 s at least.
+
+    Args:
+        t: Times, shape (N,) [s].
+        tau: Measured torques, shape (N, n) [N m or N].
+        predicted: Predicted torques, shape (N, n), NaN where there is none.
+        joints: Names of the n joints.
+
+    Returns:
+        The surprises, in order of time.
+    """
+    if len(t) < 2:
+        return ()
+    width = max(1, round(_WINDOW / float(np.median(np.diff(t)))))
+    square = (tau - predicted) ** 2
+    level = np.sqrt(_running_mean(square, width))  # (N, n)
+    known = np.isfinite(level)
+    columns = zip(level.T, known.T, strict=True)
+    median = np.array([np.median(x[k]) if k.any() else np.inf for x, k in columns])
+    size = np.sqrt(np.mean(tau**2, axis=0))
+    share = np.where(known, level, 0.0) / np.maximum(size, 1e-12)
+    is_large = known & (level > _TIMES * median) & (share > _SHARE)
+    rows = np.flatnonzero(is_large.any(axis=1))
+    if not len(rows):
+        return ()
+    found = []
+    for part in np.split(rows, np.flatnonzero(np.diff(t[rows]) > _APART) + 1):
+        start, end = float(t[part[0]]), float(t[part[-1]])
+        if end - start < _SHORTEST:
+            continue
+        k, j = divmod(int(np.argmax(np.where(is_large, share, 0.0)[part])), len(joints))
+        found.append(Surprise(start, end, joints[j], float(level[part[k], j])))
+    return tuple(found)
+
+
+def _running_mean(values: Array, width: int) -> Array:
+    """Return the mean of the numbers about each row; NaN where half of them are missing."""
+    known = np.isfinite(values)
+    sums = np.cumsum(np.vstack([np.zeros(values.shape[1]), np.where(known, values, 0.0)]), axis=0)
+    counts = np.cumsum(np.vstack([np.zeros(values.shape[1]), known]), axis=0)
+    rows = np.arange(len(values))
+    low, high = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
+    count = counts[high] - counts[low]
+    enough = count > width / 2
+    mean: Array = np.where(enough, (sums[high] - sums[low]) / np.maximum(count, 1), np.nan)
+    return mean

@@ -1,0 +1,22 @@
+"""What a replay page holds, read back from its HTML."""
+
+import base64
+import json
+import re
+
+import numpy as np
+
+
+def shown(html):
+    """Return the data of a page, arrays unpacked."""
+    data = json.loads(re.search(r'id="data">(.*?)</script>', html, re.DOTALL)[1])
+    return unpacked(data)
+
+
+def unpacked(value):
+    if isinstance(value, dict) and set(value) == {"kind", "shape", "data"}:
+        numbers = np.frombuffer(base64.b64decode(value["data"]), value["kind"])
+        return numbers.reshape(value["shape"])
+    if isinstance(value, dict):
+        return {key: unpacked(x) for key, x in value.items()}
+    return [unpacked(x) for x in value] if isinstance(value, list) else value
