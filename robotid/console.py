@@ -1,6 +1,7 @@
 """Results as text on a terminal."""
 
 import logging
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -52,7 +53,10 @@ def shown_log(*, is_verbose: bool) -> Iterator[None]:
 
 
 class _EachOnce(logging.Handler):
-    """Prints a message where the standard error stream then is, but not again what it said."""
+    """Prints a message where the standard error stream then is, once for all its figures.
+
+    Each piece of a long log would say the same again of its own number of samples.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -60,8 +64,9 @@ class _EachOnce(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
-        if text not in self._said:
-            self._said.add(text)
+        words = re.sub(r"[0-9]+", "#", text)
+        if words not in self._said:
+            self._said.add(words)
             print(f"robotid: {text}", file=sys.stderr)
 
 

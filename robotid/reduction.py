@@ -147,6 +147,11 @@ class ProcessBackend(Backend):
             yield from _collect(self._pool or self._start(), work, pieces, 2 * self.workers)
         except BaseException:
             self._cut_lifeline()  # ends the workers in the middle of their work
+            if self._pool is not None:
+                # a worker may end in the middle of a result: without this end of the pipe, the pool
+                # would wait for the rest for ever
+                results: Any = self._pool
+                results._result_queue._writer.close()
             self.close()
             raise
 
