@@ -62,7 +62,7 @@ def test_result_json_has_the_promised_shape(identified, logs):
     }
     assert len(result["base_parameters"]) == 58
     assert set(result["base_parameters"][0]) == {
-        "name", "expression", "value", "std_error", "unit",
+        "name", "expression", "value", "std_error", "interval_95", "unit",
     }  # fmt: skip
     assert len(result["standard_parameters"]) == 60
     assert {p["source"] for p in result["standard_parameters"]} <= {"data", "mixed", "prior"}
