@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import chain, islice
 
 import numpy as np
@@ -208,16 +207,18 @@ def _score_log(
     prior: Array,
     sought: Sequence[Array] = (),
 ) -> _Score:
-    """Return what is known of a log."""
+    """Return what is known of a log; refuse one without samples."""
     last = len(log.pieces) - 1
     parts = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
-    return reduce(
-        _Score.join,
-        (
-            _score(piece, parameters, prior, sought, log, parts.get(k))
-            for k, piece in enumerate(log.pieces)
-        ),
-    )
+    score: _Score | None = None
+    for k, piece in enumerate(log.pieces):
+        # the first piece with samples is shown in any case
+        part = parts.get(k, None if score and score.shown else slice(_SHOWN))
+        found = _score(piece, parameters, prior, sought, log, part)
+        score = found if score is None else score.join(found)
+    if score is None or not score.smooth:
+        raise too_short(log.path, len(log.stretches), log.header.signals)
+    return score
 
 
 def _score(
@@ -257,8 +258,6 @@ def _score(
 def _conclude(log: LongLog, score: _Score, *, is_refitted: bool = False) -> Evaluation:
     """Return the evaluation of a log."""
     header = log.header
-    if not score.smooth:
-        raise too_short(log.path, len(log.stretches), header.signals)
     motions, masks, torques = zip(*score.shown, strict=True)
     segments, number = [], 0
     for motion in motions:  # what is shown never joins what is not beside it
