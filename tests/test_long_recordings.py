@@ -170,9 +170,9 @@ def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(ur5, rng, tm
         rows_in_memory=HELD,
     )
     (log,) = survey_logs(job, [LogEntry(path)], ur5, structural_mapping(ur5))
-    assert [len(piece.read()[1].t) for piece in log.pieces] == [0, 10, 0, 0]
+    assert [len(piece.read()[1].t) for piece in log.pieces] == [0, 8, 0, 0]
     evaluation = evaluate_long(log, {"estimate": pi}, pi)
-    assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 10
+    assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 8
     assert not evaluation.recording.is_partial
 
 
