@@ -55,6 +55,11 @@ class _Header:
         check_reach(log, layout.units, layout.prismatic)
         return log
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the compiled path computes the rows: chosen for the log, not for each piece."""
+        return choose_engine(self.model, self.samples, None) == COMPILED
+
     def unwrap(self, log: Log) -> Log:
         """Return the log without full turns."""
         return unwrap(log, np.array([joint.turns_freely for joint in self.model.limits]))
@@ -138,10 +143,12 @@ class LogPiece(Piece):
         """
         _, trajectory, _ = self.read()
         header = self.header
-        # what computes the rows is chosen for the log, not for each piece
-        is_compiled = choose_engine(header.model, header.samples, None) == COMPILED
         problem = base_problem(
-            header.model, header.mapping, trajectory, self.mask(trajectory), compiled=is_compiled
+            header.model,
+            header.mapping,
+            trajectory,
+            self.mask(trajectory),
+            compiled=header.is_compiled,
         )
         return Reduction.of(problem, trajectory, threads=threads)
 

@@ -238,11 +238,22 @@ def _score_logs(
     plan: WorkPlan,
     sought: Sequence[Array] = (),
 ) -> list[_Score]:
-    """Return what is known of each log."""
+    """Return what is known of each log; refuse one without samples."""
     parts = [_parts(log) for log in logs]
     work = partial(_score, parameters=parameters, prior=prior, sought=sought)
-    scores = plan.map(work, list(chain.from_iterable(parts)), "evaluating")
-    return [reduce(_Score.join, [next(scores) for _ in own]) for own in parts]
+    found = plan.map(work, list(chain.from_iterable(parts)), "evaluating")
+    scores = []
+    for log, own in zip(logs, parts, strict=True):
+        by_piece = [next(found) for _ in own]
+        score = reduce(_Score.join, by_piece)
+        if not score.smooth:
+            raise too_short(log.path, len(log.stretches), log.header.signals)
+        if not score.shown:  # of none of the chosen pieces is a sample left: draw another one
+            filled = next(k for k, piece in enumerate(by_piece) if piece.smooth)
+            again = work(replace(own[filled], shown=slice(_SHOWN)), None)
+            score = replace(score, shown=again.shown)
+        scores.append(score)
+    return scores
 
 
 def _parts(log: LongLog) -> list[_Part]:
@@ -270,7 +281,8 @@ def _score(
     names = [*parameters, "urdf", "gravity_only"]
     torques = {name: np.empty((0, model.n_rows)) for name in names}
     if len(motion.t):
-        torques = predict_all(model, motion, parameters, prior)
+        compiled = piece.header.is_compiled
+        torques = predict_all(model, motion, parameters, prior, compiled=compiled)
     shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...] = ()
     if part is not None and len(motion.t):
         arrays = {key: getattr(motion, key)[part] for key in ("t", "q", "v", "a", "tau", "segment")}
@@ -291,8 +303,6 @@ def _score(
 def _conclude(log: LongLog, score: _Score, *, is_refitted: bool = False) -> Evaluation:
     """Return the evaluation of a log."""
     header = log.header
-    if not score.smooth:
-        raise too_short(log.path, len(log.stretches), header.signals)
     motions, masks, torques = zip(*score.shown, strict=True)
     segments, number = [], 0
     for motion in motions:  # what is shown never joins what is not beside it

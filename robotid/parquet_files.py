@@ -89,9 +89,10 @@ class _ParquetRows(RowReader):
         row = 0
         with _open(self.path, _BUFFER) as file:
             _check_types(file, [name], self.path.name)
-            for batch in file.iter_batches(_BATCH, columns=[name], use_threads=False):
-                yield _to_numpy(batch.column(0)), Place(row)
-                row += batch.num_rows
+            for group in range(file.num_row_groups):  # one by one: read ones stay in memory
+                for batch in self._batches(file, name, [group]):
+                    yield _to_numpy(batch.column(0)), Place(row)
+                    row += batch.num_rows
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
         """Return some rows; see :meth:`RowReader.read`."""
@@ -102,8 +103,8 @@ class _ParquetRows(RowReader):
             edges = np.cumsum([0, *sizes])
             groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
             for name in wanted:  # one by one: each column read holds some pages in memory
-                row, how = int(edges[groups[0]]), {"row_groups": groups, "use_threads": False}
-                for batch in file.iter_batches(_BATCH, columns=[name], **how):
+                row = int(edges[groups[0]])
+                for batch in self._batches(file, name, groups):
                     start, end = max(first - row, 0), min(stop - row, batch.num_rows)
                     if start < end:
                         part = slice(row + start - first, row + end - first)
@@ -112,6 +113,12 @@ class _ParquetRows(RowReader):
                     if row >= stop:
                         break
         return values
+
+    def _batches(self, file: Any, name: str, groups: Sequence[int]) -> Iterator[Any]:  # noqa: ANN401
+        """Yield batches of rows of one column."""
+        how = {"columns": [name], "row_groups": groups, "use_threads": False}
+        batches: Iterator[Any] = file.iter_batches(_BATCH, **how)
+        return batches
 
 
 @contextmanager

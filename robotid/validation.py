@@ -241,7 +241,12 @@ def evaluate(
 
 
 def predict_all(
-    model: RobotModel, trajectory: Trajectory, parameters: Mapping[str, Array], prior: Array
+    model: RobotModel,
+    trajectory: Trajectory,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    *,
+    compiled: bool | None = None,
 ) -> dict[str, Array]:
     """Return the torques that parameters and the baselines predict.
 
@@ -250,15 +255,19 @@ def predict_all(
         trajectory: N samples.
         parameters: Standard parameters by name, each of shape (p,).
         prior: Those of the URDF, shape (p,).
+        compiled: As of :func:`robotid.prediction.predict`.
 
     Returns:
         Torques by name, each of shape (N, n_rows): those of the parameters, "urdf" and
         "gravity_only".
     """
-    *torques, urdf = predict(model, [*parameters.values(), prior], trajectory)
+    *torques, urdf = predict(model, [*parameters.values(), prior], trajectory, compiled=compiled)
     still = np.zeros_like(trajectory.v)
     (gravity,) = predict(
-        model, [_without_drives(model, prior)], replace(trajectory, v=still, a=still)
+        model,
+        [_without_drives(model, prior)],
+        replace(trajectory, v=still, a=still),
+        compiled=compiled,
     )
     predicted = dict(zip(parameters, torques, strict=True))
     return {**predicted, "urdf": urdf, "gravity_only": gravity}

@@ -12,9 +12,11 @@ from robotid.data import Log
 from robotid.doctor import examine
 from robotid.estimator_settings import EstimatorSettings
 from robotid.exceptions import DataError, SettingsError
+from robotid.identification import structural_mapping
 from robotid.job import Job, LogEntry, job_from_settings, read_job
 from robotid.log_files import read_log, write_log
-from robotid.long_jobs import is_long
+from robotid.long_jobs import is_long, survey_logs
+from robotid.long_recordings import evaluate_long
 from robotid.signals import SignalSettings
 from robotid.workflow import run_job, validate_result
 
@@ -157,6 +159,21 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
         "fit.csv rows 550-950",
         "fit.csv rows 1100-1500",
     ]
+
+
+def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(ur5, rng, tmp_path):
+    path, pi = tmp_path / "run.parquet", truth(ur5)
+    write_log(exact_log(ur5, pi, rng, samples=1010), path)
+    job = Job(
+        urdf=Path(ur5.tree.path),
+        signals=SignalSettings(cutoff=10.0, trim=10.0),
+        rows_in_memory=HELD,
+    )
+    (log,) = survey_logs(job, [LogEntry(path)], ur5, structural_mapping(ur5))
+    assert [len(piece.read()[1].t) for piece in log.pieces] == [0, 8, 0, 0]
+    evaluation = evaluate_long(log, {"estimate": pi}, pi)
+    assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 8
+    assert not evaluation.recording.is_partial
 
 
 def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
