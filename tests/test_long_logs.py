@@ -55,7 +55,7 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     mapping = structural_mapping(model)
     found = long_log(model, path, signals, start=start, end=end, **reading)
     whole = prepare(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
-    (wanted,) = LoadedRecordings(model, [whole], []).reduce(mapping)
+    wanted = join(LoadedRecordings(model, [whole], []).reduce(mapping))
     joined = join([piece.reduce() for piece in found.pieces])
     assert found.header.signals == whole.signals
     assert joined.samples == wanted.samples
