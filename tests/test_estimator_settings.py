@@ -107,7 +107,7 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
     ("options", "text"),
     [
         ({"name": "rls", "walk": 0.1}, r"estimator 'rls' has no setting 'walk'; it has \['forg"),
-        ({"name": "wls", "margin": 1.0}, r"estimator 'wls' has no setting 'margin'; it has \[\]"),
+        ({"name": "ols", "margin": 1.0}, r"estimator 'ols' has no setting 'margin'; it has \[\]"),
         ({"name": "rls", "forgetting": 1.1}, "forgetting is 1.1, wanted 0 < x <= 1"),
         ({"name": "kalman", "walk": -1.0}, "walk is -1.0, wanted x >= 0"),
         ({"name": "kalman", "gate": True}, "gate is True, wanted 0.5 <= x < 1, or false"),

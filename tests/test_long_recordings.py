@@ -61,17 +61,26 @@ def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
     wls = one.wls.theta
     np.testing.assert_allclose(other.wls.theta, wls, rtol=0, atol=rtol * np.abs(wls).max())
     np.testing.assert_allclose(other.prior_std, one.prior_std, rtol=rtol)
-    np.testing.assert_allclose(other.standard_error, one.standard_error, rtol=1e-6)
+    # standard errors are the scatter of stretches, which pieces cut elsewhere
+    ratio = other.standard_error / one.standard_error
+    assert ((ratio > 0.5) & (ratio < 2.0)).all(), ratio
     gap = np.abs(other.standard - one.standard) / one.standard_error
     assert gap.max() < 1e-3, "standard errors"
     for key in ("verdict", "structure", "joints", "outputs"):
         assert_close(second[key], first[key], 1e-6)
     assert_close(second["inputs"], first["inputs"], 1e-14)
     for key in ("identification", "validation"):
-        assert_close(second[key], first[key], fit_rtol)
+        assert_close(without_bands(second[key]), without_bands(first[key]), fit_rtol)
         assert_close(second["wls"][key], first["wls"][key], 1e-8)
     assert {w["code"] for w in second["warnings"]} == {w["code"] for w in first["warnings"]}
     return one, other
+
+
+def without_bands(metrics):
+    """Return metrics without the bands of standard errors, which pieces cut elsewhere."""
+    if isinstance(metrics, list):
+        return [without_bands(entry) for entry in metrics]
+    return {key: value for key, value in metrics.items() if key != "band"}
 
 
 def assert_close(found, wanted, rtol):

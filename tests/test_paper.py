@@ -81,7 +81,7 @@ def test_the_figures_are_there_as_png_and_svg_and_nothing_else(written):
 
 def test_the_page_is_whole_and_offline(written):
     html = (written[0] / "paper.html").read_text()
-    assert html.count("<figure>") == html.count("<svg") == len(FIGURES)
+    assert html.count("<figure ") == html.count("<svg") == len(FIGURES)
     assert "mathdefault" not in html
     # the policy lets nothing in; no address but those of namespaces may stand there
     assert "default-src 'none'" in html
