@@ -5,6 +5,7 @@ stay behind are combinations of the chosen ones, W_2 = W_1 R1^-1 R2, and W pi = 
 beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,6 +59,25 @@ class BaseMapping:
     def unidentifiable(self) -> tuple[str, ...]:
         """Names of the standard parameters that load no joint in any motion."""
         return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
+
+    def in_words(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+        """Return how far each of some standard parameters can be known from any motion.
+
+        Args:
+            names: Standard parameters.
+
+        Returns:
+            The names by what holds of them: "alone", a base parameter of its own; "in sums", only
+            its sum with others loads a joint; "never", no motion shows it.
+        """
+        terms = np.abs(self.K) > 0
+        kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
+        for name in names:
+            rows = np.flatnonzero(terms[:, self.names.index(name)])
+            is_alone = len(rows) == 1 and terms[rows[0]].sum() == 1
+            kind = "never" if not len(rows) else "alone" if is_alone else "in sums"
+            kinds[kind] += (name,)
+        return kinds
 
     def to_base(self, pi: Array) -> Array:
         """Return the base parameters beta = K pi.

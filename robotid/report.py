@@ -6,6 +6,7 @@ from html import escape
 from pathlib import Path
 
 from robotid import __version__
+from robotid.bands import TorqueBand
 from robotid.exceptions import DataError
 from robotid.identification import Identification
 from robotid.metrics import JointMetrics, Metrics
@@ -219,7 +220,8 @@ def _torques(found: Identification) -> str:
     shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
     points = min(_LONGEST, max(200, _POINTS // (3 * model.n_rows * len(shown))))
     parts = [
-        "<p>Measured and predicted torque; below, the residual (measured − predicted). Shaded: "
+        "<p>Measured and predicted torque; below, the residual (measured − predicted) with its "
+        "95 % band, from the uncertainty of the parameters and the noise of the fit. Shaded: "
         "rows not used, because the joint stands still and the sign of its friction is unknown. "
         f"Lines end at gaps of the recording. At most about {points} points per line, extremes "
         "kept.</p>\n"
@@ -235,8 +237,9 @@ def _torques(found: Identification) -> str:
                 f"<p>A long log: {seen} of its {whole} samples are drawn, from its beginning, "
                 "middle and end; errors are of all.</p>\n"
             )
+        band = found.band(evaluation)
         figures = "".join(
-            _torque_figure(evaluation, row, name, unit, f"tau{k}-{row}", points)
+            _torque_figure(evaluation, band, row, name, unit, f"tau{k}-{row}", points)
             for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True))
         )
         parts.append(f'<div class="plots">\n{figures}</div>\n')
@@ -245,14 +248,20 @@ def _torques(found: Identification) -> str:
     return "".join(parts)
 
 
-def _torque_figure(e: Evaluation, row: int, name: str, unit: str, key: str, points: int) -> str:
+def _torque_figure(
+    e: Evaluation, band: TorqueBand, row: int, name: str, unit: str, key: str, points: int
+) -> str:
     measured = e.metrics["estimate"].per_joint.get(name)
     said = "no rows used"
     if measured is not None:
         error = percent(measured.relative_error_pct).html
-        said = f"error {error} %, RMSE {measured.rmse:.3g} {unit}"
+        recording = e.recording
+        held = band.held(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
+        said = (
+            f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band holds {100 * held:.0f} %"
+        )
     title = f"Measured and predicted torque and residual of {name} over time; {said}"
-    svg = plot_torque(e, row, unit=unit, title=title, key=key, points=points)
+    svg = plot_torque(e, row, band, unit=unit, title=title, key=key, points=points)
     return figure(f"<strong>{escape(name)}</strong>: {said}", svg)
 
 

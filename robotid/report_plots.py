@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
+from robotid.bands import REACH, TorqueBand
 from robotid.validation import Evaluation
 
 __all__ = [
@@ -59,7 +60,14 @@ STYLE: dict[Any, Any] = {
 
 
 def plot_torque(
-    evaluation: Evaluation, row: int, *, unit: str, title: str, key: str, points: int = 2000
+    evaluation: Evaluation,
+    row: int,
+    band: TorqueBand,
+    *,
+    unit: str,
+    title: str,
+    key: str,
+    points: int = 2000,
 ) -> str:
     """Return a plot of measured against predicted torque, and of the residual below it.
 
@@ -69,6 +77,7 @@ def plot_torque(
     Args:
         evaluation: A recording with predictions.
         row: Number of the torque row.
+        band: How far its predictions can be trusted; the residual's 95 % band is drawn.
         unit: Its unit.
         title: What the plot shows, for those who cannot see it.
         key: A word that no other plot on the page has.
@@ -92,6 +101,7 @@ def plot_torque(
         upper.plot(*thin(t, prediction, kept, points), color=_PREDICTED, lw=1.0, label="predicted")
         lower.plot(*thin(t, tau - prediction, kept, points), color=_RESIDUAL, lw=0.8)
         lower.axhline(0.0, color=INK, lw=0.5)
+        _draw_band(lower, t, whole, band, row)
         for axes in (upper, lower):
             _shade(axes, t, stretches(trajectory.segment, ~used))
             axes.grid(visible=True)
@@ -239,6 +249,21 @@ def _extremes(y: Array, width: int) -> NDArray[np.int_]:
     rows = np.r_[0, first + padded.argmin(axis=1), first + padded.argmax(axis=1), len(y) - 1]
     kept: NDArray[np.int_] = np.unique(np.minimum(rows, len(y) - 1))
     return kept
+
+
+def _draw_band(
+    axes: Any,  # noqa: ANN401
+    t: Array,
+    parts: Sequence[slice],
+    band: TorqueBand,
+    row: int,
+) -> None:
+    """Draw the 95 % band of a residual, stretch by stretch."""
+    half = REACH * band.total[:, row]
+    for part in parts:
+        inside = (band.samples >= part.start) & (band.samples < part.stop)
+        times = t[band.samples[inside]]
+        axes.fill_between(times, -half[inside], half[inside], color=_RESIDUAL, alpha=0.2, lw=0)
 
 
 def _shade(axes: Any, t: Array, parts: Sequence[slice]) -> None:  # noqa: ANN401

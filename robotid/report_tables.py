@@ -1,6 +1,7 @@
 """The report's tables of parameters, settings and inputs."""
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,8 @@ def base_table(found: Identification) -> str:
     headers = ["parameter", "value", "standard error", "relative %", "unit", "stands for"]
     return (
         "<p>The combinations of parameters that torque depends on. Each is named after one of "
-        "its terms; a dash as standard error: not determined by the data.</p>\n"
-        + table("Base parameters", headers, rows)
+        "its terms; a dash as standard error: not determined by the data. Standard errors rest "
+        f"on {escape(found.errors.method)}.</p>\n" + table("Base parameters", headers, rows)
     )
 
 
@@ -148,7 +149,24 @@ def open_section(found: Identification) -> str:
         f"{wls.condition:.3g} (columns scaled to unit norm).</p>\n"
         + _listed("Base parameters about which the data say nothing", found.estimate.undetermined)
         + _listed("Parameters that no motion can show", found.mapping.unidentifiable)
+        + _combinations(found)
         + _listed("Standard parameters that remain as the URDF has them, or nearly", kept)
+    )
+
+
+def _combinations(found: Identification) -> str:
+    """Return per body which parameters motion shows one by one, in sums only, or never."""
+    layout = found.model.layout
+    rows = []
+    for i, body in enumerate(layout.bodies):
+        names = layout.names[10 * i : 10 * i + 10]
+        kinds = found.mapping.in_words(names)
+        short = {key: ", ".join(n.rsplit(".", 1)[1] for n in kinds[key]) or "–" for key in kinds}
+        rows.append([code(body), *[text(short[key]) for key in ("alone", "in sums", "never")]])
+    return table(
+        "What any motion can show of each body",
+        ["body", "by itself", "only in sums with others (see base parameters)", "never"],
+        rows,
     )
 
 

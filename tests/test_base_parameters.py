@@ -150,3 +150,16 @@ def test_parameters_that_load_no_joint_are_named(ur5):
 def test_a_regressor_of_another_width_is_refused():
     with pytest.raises(DataError, match=r"W has shape \(5, 2\), wanted at least 3 rows of 3"):
         base_mapping(np.ones((5, 2)), ("a", "b", "c"))
+
+
+def test_words_tell_what_stands_alone_in_sums_or_never():
+    # columns a, 2 a + b, 0: of the first and second only sums, of the third nothing
+    W = np.random.default_rng(0).standard_normal((40, 3))
+    columns = np.column_stack([W[:, 0], W[:, 1], W[:, 0] * 2, np.zeros(40), W[:, 2]])
+    mapping = base_mapping(columns, ("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
+    found = mapping.in_words(("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
+    assert found == {
+        "alone": ("l.mcx", "l.Izz"),
+        "in sums": ("l.m", "l.Ixx"),
+        "never": ("l.Iyy",),
+    }
