@@ -124,6 +124,10 @@ def print_verdict(verdict: dict[str, Any]) -> None:
     print(f"\nverdict: {verdict['status']}")
     for reason in verdict["reasons"]:
         print(f"  - {reason}")
+    joints = verdict["per_joint"]
+    for status in dict.fromkeys(joint["status"] for joint in joints.values()):
+        names = [name for name, joint in joints.items() if joint["status"] == status]
+        print(f"  {status}: {', '.join(names)}")
 
 
 def print_files(folder: str, names: Sequence[str]) -> None:

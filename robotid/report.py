@@ -178,14 +178,14 @@ def _errors(found: Identification) -> str:
 
 def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metrics) -> str:
     headers = ["joint", "error %", "RMSE", "unit", "R²", "rows", "WLS %", "URDF %"]
-    headers += ["gravity only %", "zero %", "remark"]
-    rows = []
+    headers += ["gravity only %", "zero %", "verdict", "remark"]
+    rows, verdicts = [], found.verdict.joints
     for name in found.model.row_names:
-        m = ours.per_joint.get(name)
+        m, status = ours.per_joint.get(name), verdicts[name].status if name in verdicts else "–"
         if m is None:
             dash = number(None)
             nothing = text("does not move: no rows used")
-            rows.append([code(name), dash, dash, text(""), *[dash] * 6, nothing])
+            rows.append([code(name), dash, dash, text(""), *[dash] * 6, text(status), nothing])
             continue
         rows.append(
             [
@@ -199,6 +199,7 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
                 percent(m.baselines["urdf"]),
                 percent(m.baselines["gravity_only"]),
                 percent(None if m.relative_error_pct is None else 100.0),
+                text(status, flag=status == "poor"),
                 text(_remark(m), flag=True),
             ]
         )

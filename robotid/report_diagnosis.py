@@ -54,8 +54,8 @@ def residual_section(found: Identification) -> str:
         f"<p>Of {escape(evaluation.recording.name)}, rows used. Left: the residual's spectrum "
         "under that of the torque; a peak is a vibration or a ripple that the model lacks. Right: "
         "its autocorrelation; noise behind the filter falls to zero within the dotted time, "
-        "1/(2 cut-off). What stays longer is motion that the model does not explain, and standard "
-        "errors are then too small. The dotted frequency is the cut-off.</p>\n"
+        "1/(2 cut-off). What stays longer is motion that the model does not explain. The dotted "
+        "frequency is the cut-off.</p>\n"
         f'<div class="plots">\n{figures}</div>\n'
     )
 

@@ -90,7 +90,7 @@ def build_result(
             "identification": _metrics(identification.metrics("wls")),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
-        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons)},
+        "verdict": verdict.to_dict(),
     }
 
 

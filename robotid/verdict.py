@@ -2,10 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from robotid.metrics import JointMetrics, Metrics
 
-__all__ = ["Finding", "Verdict", "judge"]
+__all__ = ["NOT_EVALUATED", "Finding", "JointVerdict", "Verdict", "judge"]
+
+#: Status of a joint that no kept recording moves: never a pass.
+NOT_EVALUATED = "not evaluated"
 
 _GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
 _POOR = 50.0  # [%] a joint predicted worse than this is not usable
@@ -32,16 +36,42 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class JointVerdict:
+    """How far to trust the torque that is predicted for one joint.
+
+    Attributes:
+        status: "good", "usable", "poor" or "not evaluated".
+        reasons: Why, the worst first; for "good" what was checked.
+    """
+
+    status: str
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Verdict:
     """How far to trust a result.
 
     Attributes:
         status: "good", "usable" or "poor".
         reasons: Why, the worst first; for "good" what was checked.
+        joints: The same of each joint that was fitted or moves in a kept recording.
     """
 
     status: str
     reasons: tuple[str, ...]
+    joints: Mapping[str, JointVerdict] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as plain values, as result.json has it."""
+        return {
+            "status": self.status,
+            "reasons": list(self.reasons),
+            "per_joint": {
+                joint: {"status": verdict.status, "reasons": list(verdict.reasons)}
+                for joint, verdict in self.joints.items()
+            },
+        }
 
 
 def judge(
@@ -64,15 +94,26 @@ def judge(
     Returns:
         The verdict. Without a kept recording it is at best "usable".
     """
+    names = dict.fromkeys(
+        joint for m in (identification, *validation.values()) for joint in m.per_joint
+    )
     poor: list[str] = []
     doubts: list[str] = []
+    joints: dict[str, JointVerdict] = {}
     if not validation:
         doubts.append("the prediction of a new motion was not evaluated: no validation log given")
-    for log, metrics in validation.items():
-        for joint, measured in metrics.per_joint.items():
-            worse, doubt = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
-            poor += worse
-            doubts += doubt
+    for joint in names:
+        worse, doubt, errors = [], [], []
+        for log, metrics in validation.items():
+            measured = metrics.per_joint.get(joint)
+            if measured is not None:
+                found = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
+                worse += found[0]
+                doubt += found[1]
+                errors.append(_error(measured))
+        poor += worse
+        doubts += doubt
+        joints[joint] = _joint_verdict(sorted(worse, key=_rank), doubt, errors)
     poor = [*alarms, *sorted(poor, key=_rank)]
     missing = sorted(
         {joint for m in validation.values() for joint in identification.per_joint}
@@ -90,9 +131,9 @@ def judge(
             "base parameters predict torque all the same"
         )
     if poor:
-        return Verdict("poor", (*poor, *doubts))
+        return Verdict("poor", (*poor, *doubts), joints)
     if doubts:
-        return Verdict("usable", tuple(doubts))
+        return Verdict("usable", tuple(doubts), joints)
     worst = max(_error(m) for metrics in validation.values() for m in metrics.per_joint.values())
     return Verdict(
         "good",
@@ -101,7 +142,18 @@ def judge(
             "better than by a constant and than by the URDF, and every parameter is physically "
             "consistent",
         ),
+        joints,
     )
+
+
+def _joint_verdict(poor: list[str], doubts: list[str], errors: list[float]) -> JointVerdict:
+    """Return the verdict on a joint from what was found on each kept recording."""
+    if not errors:
+        return JointVerdict(NOT_EVALUATED, ("it does not move in any kept recording",))
+    if poor or doubts:
+        return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
+    said = f"predicted within {max(errors):.1f} %, better than by a constant and than by the URDF"
+    return JointVerdict("good", (said,))
 
 
 def _judge_joint(

@@ -198,7 +198,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         "result": str(path),
         "predicted_with": outputs.get("urdf", "base parameters of result.json"),
         "validation": [recording_metrics(e, "estimate") for e in evaluations],
-        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons)},
+        "verdict": verdict.to_dict(),
     }
 
 

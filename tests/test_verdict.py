@@ -57,3 +57,30 @@ def test_large_errors_and_open_parameters_make_it_usable_at_best():
     assert verdict({"a": joint(9.0)}).status == "usable"  # three times the error of the fit
     assert verdict({"a": joint(4.0)}, undetermined=["x.m"]).status == "usable"
     assert verdict({"a": joint(4.0)}, is_consistent=False).status == "usable"
+
+
+def test_each_joint_has_a_verdict_of_its_own():
+    joints = {"a": joint(4.0), "b": joint(20.0), "c": joint(40.0, constant=False)}
+    found = verdict(joints, fitted={name: joint(3.0) for name in "abcd"}).joints
+    assert {name: v.status for name, v in found.items()} == {
+        "a": "good", "b": "usable", "c": "poor", "d": "not evaluated",
+    }  # fmt: skip
+    assert found["a"].reasons[0].startswith("predicted within 4.0 %")
+    assert found["c"].reasons == ("c: worse than a constant torque on val.csv (40.0 %)",)
+    assert found["d"].reasons == ("it does not move in any kept recording",)
+
+
+def test_the_worst_of_several_recordings_decides_on_a_joint():
+    logs = {
+        "one.csv": Metrics({"a": joint(4.0)}, 1.0),
+        "two.csv": Metrics({"a": joint(60.0)}, 1.0),
+    }
+    found = judge(Metrics({"a": joint(3.0)}, 1.0), logs, undetermined=(), is_consistent=True)
+    assert found.joints["a"].status == "poor"
+    assert found.to_dict()["per_joint"]["a"]["reasons"] == [
+        "a: predicted to 60.0 % only on two.csv"
+    ]
+
+
+def test_without_a_kept_recording_no_joint_is_evaluated():
+    assert verdict(None).joints["a"].status == "not evaluated"
