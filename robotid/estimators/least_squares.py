@@ -18,6 +18,7 @@ _OPEN = 1e-2  # a parameter with a larger share in an undetermined direction is 
 _FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
 _TOLERANCE = 1e-8  # relative change of the noise levels at which WLS has converged
 _MAX_ITERATIONS = 200
+_SETTLED = 1e-5  # ... and at which it is good enough after so many iterations
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class WLS(Estimator):
             data: A problem in base parameters, or its factors.
 
         Returns:
-            The estimate.
+            The estimate. Of few rows the noise levels may settle slowly; the message says so.
 
         Raises:
             DataError: If there are fewer rows than parameters.
@@ -103,9 +104,12 @@ class WLS(Estimator):
             updated = _noise(factors, solution.theta, spent)
             change = np.max(np.abs(updated - sigma) / sigma)
             sigma = updated
-            if change < _TOLERANCE:
+            is_last = iteration == _MAX_ITERATIONS
+            if change < (_SETTLED if is_last else _TOLERANCE):
                 covariance = solution.covariance / self.independent_share
                 message = f"noise levels settled after {iteration} iterations"
+                if is_last:
+                    message += f", where they still change by {change:.1e}"
                 return _estimate(factors, solution, covariance, sigma, iteration, message)
         raise NotConvergedError(
             f"the noise levels of WLS still change by {change:.1e} after {_MAX_ITERATIONS} "
