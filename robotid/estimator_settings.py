@@ -14,6 +14,7 @@ from robotid.estimators import (
     OLS,
     PRX,
     RLS,
+    TLS,
     WLS,
     Consistent,
     Estimator,
@@ -47,6 +48,7 @@ _FOLDS = 6  # held out in turn by prior_weight = "cv"
 KEYS: Mapping[str, tuple[str, ...]] = {
     "ols": (),
     "wls": ("robust",),
+    "tls": ("regressor_noise",),
     "consistent": ("robust", *_PROJECTION),
     "log_cholesky": ("robust", *_PROJECTION, "starts", "seed"),
     "rls": ("forgetting", "physical", *_PROJECTION),
@@ -63,9 +65,11 @@ class EstimatorSettings:
     """Which estimator, and its own settings. A setting of another estimator is refused.
 
     Attributes:
-        name: "ols", "wls", "consistent", "log_cholesky", "rls", "kalman", "prx" or "gradient".
+        name: "ols", "wls", "tls", "consistent", "log_cholesky", "rls", "kalman", "prx" or
+            "gradient".
         robust: Of "wls", "consistent" and "log_cholesky": "none", or the loss of rows that fit
             badly, "huber" or "tukey".
+        regressor_noise: Of "tls": noise of the regressor's columns over their root mean square [-].
         margin: Of "consistent" and ``physical``: smallest eigenvalue of a body's pseudo-inertia
             relative to its prior size [-].
         prior: Of the same: metric of the distance from the URDF's values, "euclidean",
@@ -91,6 +95,7 @@ class EstimatorSettings:
 
     name: str = "consistent"
     robust: str = "none"
+    regressor_noise: float = 0.01
     margin: float = 1e-4
     prior_weight: float | str = 1.0
     forgetting: float = 1.0
@@ -129,6 +134,7 @@ class EstimatorSettings:
             if not isinstance(number, str) and not number > 0:
                 raise SettingsError(f"{key} is {number}, wanted a positive number")
         _check_range("forgetting", self.forgetting, 0 < self.forgetting <= 1, "0 < x <= 1")
+        _check_range("regressor_noise", self.regressor_noise, self.regressor_noise > 0, "x > 0")
         _check_range("walk", self.walk, self.walk >= 0, "x >= 0")
         _check_range("step_size", self.step_size, 0 < self.step_size < 2, "0 < x < 2")
         is_gate = self.gate is False or (self.gate is not True and 0.5 <= self.gate < 1)
@@ -186,6 +192,8 @@ def make_estimator(
     """
     if settings.name == "ols":
         return OLS(independent_share=prior.share)
+    if settings.name == "tls":
+        return TLS(settings.regressor_noise, independent_share=prior.share)
     if settings.name == "wls":
         return WLS(independent_share=prior.share)
     if settings.name in RECURSIVE:

@@ -28,7 +28,7 @@ def add_job_flags(parser: argparse.ArgumentParser) -> None:
     """
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
     flags.add_argument("--validate", nargs="+", default=[], metavar="LOG", help="logs kept apart")
-    names = "consistent (default), log_cholesky, wls, ols, rls, kalman, prx or gradient"
+    names = "consistent (default), log_cholesky, wls, ols, tls, rls, kalman, prx or gradient"
     flags.add_argument("--estimator", metavar="NAME", help=names)
     add_log_flags(flags)
 

@@ -45,6 +45,7 @@ KEYS: dict[str, Any] = {
         "solver": str,
         "check": bool,
         "robust": str,
+        "regressor_noise": _NUMBER,
         "starts": int,
         "constraints": {
             "mass": dict,

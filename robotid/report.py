@@ -57,6 +57,7 @@ _SECTIONS = {
 _ESTIMATORS = {
     "ols": "ordinary least squares (ols)",
     "wls": "weighted least squares, rows weighted by the noise of their joint (wls)",
+    "tls": "total least squares, which allows for noise of the regressor, too (tls)",
     "rls": "recursive least squares, sample by sample (rls)",
     "kalman": "a Kalman filter over the samples (kalman)",
     "prx": "steps along the gradient PRX, sample by sample (prx)",

@@ -11,11 +11,13 @@ from robotid.estimators.physical import Consistent
 from robotid.estimators.prx import PRX
 from robotid.estimators.recursive import RecursiveEstimator, fold, load_state, save_state
 from robotid.estimators.rls import RLS, RLSState
+from robotid.estimators.total_least_squares import TLS
 
 __all__ = [
     "OLS",
     "PRX",
     "RLS",
+    "TLS",
     "WLS",
     "Consistent",
     "Constraints",
