@@ -69,7 +69,7 @@ ESTIMATOR_FLOORS = {
         (
             "estimator cones priors",
             "least_squares recursive solvers constraints",
-            "programme rls kalman descent",
+            "programme rls kalman descent total_least_squares",
             "physical",
             "prx gradient weighting log_cholesky",
             "__init__",
