@@ -14,6 +14,7 @@ from robotid.base_parameters import BaseMapping
 from robotid.exceptions import ModelError
 from robotid.identification import structural_mapping
 from robotid.kinematics import Inertial, Joint, Tree
+from robotid.link_audit import audit_links
 from robotid.lumping import LinkPlace, link_places
 from robotid.model import RobotModel
 from robotid.regressor import random_regressor
@@ -121,6 +122,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         return Inspection(name, _movable(robot), None, (), tuple(findings))
     full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
     findings += _link_findings(model)
+    findings += audit_links(model)
     findings += _rounded_angles(model, robot, full)
     structure = Structure(
         standard=model.layout.n_inertial,

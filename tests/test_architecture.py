@@ -26,8 +26,8 @@ FLOORS = {
     "scene",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
     "constraint_settings task checkpoint prediction",
-    5: "bands validation sidecar estimator_settings simulation dynamics log_files probe "
-    "mass_matrix reduction",
+    5: "bands link_audit validation sidecar estimator_settings simulation dynamics log_files "
+    "probe mass_matrix reduction",
     6: "recordings closed_loop conversion explanations load_checks motion_checks cluster residuals",
     7: "robust urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs work_plan",
