@@ -1,5 +1,6 @@
 """Inertials against the geometry that a URDF has: where no body of that shape can be so."""
 
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 
 import numpy as np
@@ -33,7 +34,7 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     Yields:
         "com_outside", "density", "gyration": of a body against the box around its geometry;
         "copied_inertial": links of other size with the same inertial; "default_inertial": numbers
-        as templates have them; "geometry_unread": one note that names the bodies not compared.
+        as templates have them; "geometry_unread": one note if bodies of a file with meshes were not compared.
     """
     yield from _templates(model)
     points = body_points(model)
@@ -44,7 +45,7 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
             yield from _against_geometry(body, J_i, points[body])
     yield from _copies(model, points)
     unread = [body for body in model.layout.bodies if body not in points]
-    if unread:
+    if unread and next(ET.parse(model.tree.path).getroot().iter("mesh"), None) is not None:
         message = (
             f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing or in meshes that "
             "are not found: their mass and centre of mass were not compared with it; set "
