@@ -34,7 +34,8 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     Yields:
         "com_outside", "density", "gyration": of a body against the box around its geometry;
         "copied_inertial": links of other size with the same inertial; "default_inertial": numbers
-        as templates have them; "geometry_unread": one note if bodies of a file with meshes were not compared.
+        as templates have them; "geometry_unread": one note if bodies of a
+        file with meshes were not compared.
     """
     yield from _templates(model)
     points = body_points(model)
