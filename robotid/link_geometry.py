@@ -1,6 +1,5 @@
 """The extent of each body by the URDF's collision or visual geometry, for bounds on its mass."""
 
-import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.lumping import link_places
+from robotid.meshes import find_mesh
 from robotid.model import RobotModel
 
 __all__ = ["body_points", "box_half_spaces", "geometry_half_spaces", "hull_half_spaces"]
@@ -142,7 +142,7 @@ def _shape_points(shape: ET.Element, source: Path) -> Array | None:
         return np.vstack([ring - half, ring + half])
     if shape.tag != "mesh":
         return None
-    path = _mesh_path(shape.get("filename", ""), source)
+    path = find_mesh(shape.get("filename", ""), source)
     if path is None:
         return None
     import trimesh
@@ -150,20 +150,6 @@ def _shape_points(shape: ET.Element, source: Path) -> Array | None:
     vertices: Array = np.array(trimesh.load_mesh(path).vertices)
     scaled: Array = vertices * _three(shape.get("scale", "1 1 1"))
     return scaled
-
-
-def _mesh_path(name: str, source: Path) -> Path | None:
-    """Return the file that a URDF names: absolute, beside it, or in a package above it."""
-    path = name.split("://", 1)[-1]
-    if not name.startswith("package://"):
-        candidates = [source.parent / path]
-    else:
-        package, _, inside = path.partition("/")
-        roots = [*source.resolve().parents]
-        roots += [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
-        candidates = [root / path for root in roots]
-        candidates += [root / inside for root in roots if root.name == package]
-    return next((file for file in candidates if file.is_file()), None)
 
 
 def _origin(element: ET.Element) -> Array:
