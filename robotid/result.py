@@ -87,6 +87,7 @@ def build_result(
         "warnings": [{"code": f.code, "message": f.message, "where": f.where} for f in findings],
         "wls": {
             "base_values": identification.wls.theta.tolist(),
+            "base_std_errors": [_finite(error) for error in identification.wls.std_error],
             "identification": _metrics(identification.metrics("wls")),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
