@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ __all__ = ["audit_links"]
 _HEAVIEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: beyond solid tungsten, below foam
 _MARGIN = 0.1  # of the box's diagonal by which a centre of mass may lie outside
 _THIN = 0.01  # [m] to which each side of a box is widened: sheets have a volume, too
+_SMALL = 1e-3  # share of the robot's mass below which what is wrong of a body hardly matters
 _ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
 _ALIKE = 1e-9  # relative difference of inertials that are copies
 _SIZE = 0.05  # relative difference of boxes that are of one size
@@ -43,7 +45,9 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     J = pseudo_inertia(model.standard_parameters()[:size])
     for body, J_i in zip(model.layout.bodies, J, strict=True):
         if body in points and J_i[3, 3] > 0:
-            yield from _against_geometry(body, J_i, points[body])
+            is_small = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
+            for finding in _against_geometry(body, J_i, points[body]):
+                yield replace(finding, severity="note") if is_small else finding
     yield from _copies(model, points)
     unread = [body for body in model.layout.bodies if body not in points]
     if unread and next(ET.parse(model.tree.path).getroot().iter("mesh"), None) is not None:

@@ -67,6 +67,12 @@ def test_what_the_geometry_does_not_allow_is_named_with_its_figure(
         assert found[0].evidence == pytest.approx(evidence)
 
 
+def test_what_hardly_weighs_hardly_matters(tmp_path):
+    light = {"mass": "1e-3", "ixx": "0", "iyy": "0", "izz": "0", "com": "0.2 0 0.3"}
+    found = audit(tmp_path, **light)
+    assert {(f.code, f.severity) for f in found} == {("com_outside", "note"), ("density", "note")}
+
+
 def test_the_radius_of_gyration_is_that_of_the_inertia(tmp_path):
     (found,) = audit(tmp_path, iyy="0.56", izz="0.56")
     # the second moments add up to half the trace of the inertia
