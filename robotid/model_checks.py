@@ -26,6 +26,7 @@ _WIDTH = 0.07  # [s] about the delay, where the misfit is still a parabola
 _FINEST = 0.001  # [s] an estimate is not better than this
 _FEW = 100  # rows from which a joint has a say in the delay
 _LATE = 0.01  # [s] a shorter delay of the torque is within the errors of friction models
+_HELD = 0.75  # [samples] ... or comes from a torque that is held from row to row
 
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
@@ -83,7 +84,8 @@ def check_torque_delay(probe: Probe, cutoff: float | None, name: str) -> Iterato
     n = len(told)
     error = float(np.sqrt((n - 1) / n * np.sum((np.array(without) - np.mean(without)) ** 2)))
     error = max(error, _FINEST)
-    late = abs(delay) > max(_LATE, 3 * error)
+    step = float(np.median(np.diff(probe.motion.t)))
+    late = abs(delay) > max(_LATE, _HELD * step, 3 * error)
     message = (
         f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
         + (

@@ -6,16 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from corruptions import CASES, ROBOTS, clean_log, robot, table_of
+from corruptions import CASES, NOISE, ROBOTS, clean_log, robot, table_of
 from synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.doctor import alarming, diagnose, examine, findings_to_dict
 from robotid.examples import example_urdf
 from robotid.exceptions import SettingsError
+from robotid.excitation import random_fourier
 from robotid.job import Job, LogEntry, read_job
 from robotid.log_files import write_log
+from robotid.model import RobotModel
 from robotid.signals import SignalSettings
+from robotid.simulation import another_robot, simulate
 from robotid.tables import write_columns
 from robotid.verdict import Finding
 
@@ -259,3 +262,18 @@ def test_a_log_of_standing_still_is_said_to_be_one(ur5, tmp_path):
     write_log(still, tmp_path / "still.csv")
     found = examine(Job(Path(URDF), identification=(LogEntry(tmp_path / "still.csv"),)))
     assert {"no_motion", "static_joint"} <= loud(found)
+
+
+@pytest.mark.parametrize("name", ["finger_edu.urdf", "so101.urdf", "double_pendulum.urdf"])
+def test_a_clean_log_of_a_small_arm_at_30_hertz_raises_no_alarm(name):
+    model = RobotModel.from_urdf(example_urdf(name))
+    rng = np.random.default_rng(0)
+    size = model.layout.n_inertial
+    pi = another_robot(model, rng)
+    # no tool of 1.2 kg: these arms would rightly be said to carry a load
+    share = rng.uniform(0.8, 1.2, size // 10)
+    pi[:size] = (model.standard_parameters()[:size].reshape(-1, 10) * share[:, None]).ravel()
+    motion = random_fourier(model, rng, period=10.0)
+    log = simulate(model, pi, motion, rate=30.0, duration=20.0, rng=rng, noise=NOISE)
+    found = diagnose(model, [log], [], SignalSettings())
+    assert [f.code for f in found if f.severity != "note"] == []
