@@ -35,8 +35,6 @@ from robotid.work_plan import WorkPlan
 __all__ = ["LongRecordings", "evaluate_long"]
 
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
-
-
 _STRETCHES = 64  # of each log whose factors are kept apart
 _FACTORS = 2**26  # bytes of them all, if that leaves each log a few
 _FEW = 8

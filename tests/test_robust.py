@@ -96,6 +96,17 @@ def test_outliers_are_named_with_time_joint_and_torque(ur5, logs):
     assert [o.size for o in found] == sorted((o.size for o in found), reverse=True)
 
 
+def test_friction_that_the_filter_smears_is_no_outlier(ur5):
+    quiet = exact_log(ur5, truth(ur5), np.random.default_rng(4), samples=2000, rate=100.0)
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
+    found = identify(ur5, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
+    (evaluation,) = found.identification
+    residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
+    usual = np.median(residual, axis=0)
+    assert ((residual > 20 * usual) & evaluation.recording.mask).any()  # it is there
+    assert found.outliers == ()
+
+
 def test_exact_data_need_no_weights(ur5):
     log = exact_log(ur5, truth(ur5), np.random.default_rng(2), samples=300)
     exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
