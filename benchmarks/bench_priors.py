@@ -36,13 +36,13 @@ JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 DATA = os.environ.get("ROBOTID_DATA")
 STRETCHES = 6
 FITS = {
-    "euclidean, 1": {},
-    "riemannian, 1": {"prior": "riemannian"},
-    "entropic, 1": {"prior": "entropic"},
-    "euclidean, evidence": {"prior_weight": "evidence"},
+    "euclidean, 1": {"prior": "euclidean", "prior_weight": 1.0},
+    "riemannian, 1": {"prior": "riemannian", "prior_weight": 1.0},
+    "entropic, 1": {"prior": "entropic", "prior_weight": 1.0},
+    "euclidean, evidence": {"prior": "euclidean", "prior_weight": "evidence"},
     "riemannian, evidence": {"prior": "riemannian", "prior_weight": "evidence"},
     "entropic, evidence": {"prior": "entropic", "prior_weight": "evidence"},
-    "euclidean, cv": {"prior_weight": "cv"},
+    "euclidean, cv": {"prior": "euclidean", "prior_weight": "cv"},
     "riemannian, cv": {"prior": "riemannian", "prior_weight": "cv"},
     "entropic, cv": {"prior": "entropic", "prior_weight": "cv"},
 }

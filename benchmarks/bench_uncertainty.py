@@ -55,6 +55,7 @@ def near(model, rng):
     J = pseudo_inertia(model.standard_parameters()[:size])
     deform = np.array([scipy.linalg.expm(0.1 * rng.standard_normal((4, 4))) for _ in J])
     deform[:, 3, :3] = 0.0  # an affine map of the body's points
+    deform[:, :3, 3] *= np.sqrt(np.trace(J[:, :3, :3], axis1=1, axis2=2) / J[:, 3, 3])[:, None]
     deformed = deform @ J @ deform.transpose(0, 2, 1)
     pi[:size] = np.concatenate([inertial_from_pseudo_inertia(J_i) for J_i in deformed])
     return pi

@@ -41,8 +41,8 @@ __all__ = [
     "make_estimator",
 ]
 
-_PROJECTION = ("margin", "prior", "prior_weight", "solver", "check", "constraints")
-_WEIGHTS = ("cv", "evidence")
+_PROJECTION = ("margin", "prior", "prior_weight", "solver", "check", "draws", "constraints")
+_WEIGHTS = ("auto", "cv", "evidence")
 _FOLDS = 6  # held out in turn by prior_weight = "cv"
 #: The keys that each estimator has, beside its name.
 KEYS: Mapping[str, tuple[str, ...]] = {
@@ -75,9 +75,12 @@ class EstimatorSettings:
         prior: Of the same: metric of the distance from the URDF's values, "euclidean",
             "riemannian" or "entropic".
         prior_weight: Of the same: weight of the URDF's values [-], or how it is chosen from the
-            fitted logs: "cv" (stretches held out in turn) or "evidence".
+            fitted logs, 1 at most: "cv" (stretches held out in turn), "evidence", or "auto" ("cv",
+            or 1 for a log too short to be cut).
         solver: Of the same: "clarabel" or "scs".
         check: Of the same: whether the other solver solves it, too.
+        draws: Of the same: fits to redrawn data and prior that tell the standard errors where
+            bounds bind; 0 leaves the bounds out of them.
         constraints: Of the same: see :class:`robotid.constraint_settings.ConstraintSettings`.
         starts: Of "log_cholesky": random starts beside the one from the cone programme.
         forgetting: Of "rls": weight of a sample relative to the next one [-].
@@ -97,7 +100,7 @@ class EstimatorSettings:
     robust: str = "none"
     regressor_noise: float = 0.01
     margin: float = 1e-4
-    prior_weight: float | str = 1.0
+    prior_weight: float | str = "auto"
     forgetting: float = 1.0
     walk: float = 0.0
     gate: float | bool = 1 - 1e-7
@@ -111,6 +114,7 @@ class EstimatorSettings:
     prior: str = "euclidean"
     solver: str = "clarabel"
     check: bool = False
+    draws: int = 100
     constraints: Mapping[str, Any] = dataclass_field(default_factory=dict)
     starts: int = 0
 
@@ -144,6 +148,7 @@ class EstimatorSettings:
         _check_choice("robust", self.robust, ("none", "huber", "tukey"))
         _check_choice("prior", self.prior, METRICS)
         _check_choice("solver", self.solver, tuple(SOLVERS))
+        _check_range("draws", self.draws, self.draws == 0 or self.draws >= 10, "0, or 10 or more")
         _check_range("starts", self.starts, self.starts >= 0, "x >= 0")
         ConstraintSettings(**self.constraints)
 
@@ -239,9 +244,10 @@ def consistent_fit(
         solver=settings.solver,
         check=settings.check,
     )
-    if not isinstance(weight, str):
+    folds = gather(prior.stretches, _FOLDS)
+    if not isinstance(weight, str) or (weight == "auto" and len(folds) < 2):
         return fit
-    choice = choose_weight(fit, gather(prior.stretches, _FOLDS), weight)
+    choice = choose_weight(fit, folds, "cv" if weight == "auto" else weight)
     return replace(fit, prior_weight=choice.weight, choice=choice)
 
 

@@ -18,7 +18,8 @@ from robotid.estimator_settings import (
     consistent_fit,
     make_estimator,
 )
-from robotid.estimators import WLS, Estimate
+from robotid.estimators import WLS, Consistent, Estimate
+from robotid.estimators.log_cholesky import LogCholesky
 from robotid.exceptions import DataError
 from robotid.factors import Factors
 from robotid.lumping import held_parameters
@@ -32,7 +33,7 @@ from robotid.recordings import LoadedRecordings, Recordings
 from robotid.regressor import random_regressor
 from robotid.robust import Outlier, find_outliers, reweigh
 from robotid.signals import SignalSettings
-from robotid.standard_errors import StandardErrors, measured_errors
+from robotid.standard_errors import Redraws, StandardErrors, measured_errors
 from robotid.summaries import identification_html, identification_line, identification_text
 from robotid.validation import Evaluation, pool, prepare
 from robotid.verdict import Verdict, judge
@@ -132,7 +133,10 @@ class Identification:
     @property
     def sources(self) -> tuple[str, ...]:
         """Where each standard parameter comes from: "data", "mixed" or "prior"."""
-        share = self.standard_error / np.maximum(self.prior_std, _KNOWN)
+        # what a bound says is neither
+        unbounded = self.errors.unbounded
+        after = self.standard_error if unbounded is None else unbounded
+        share = after / np.maximum(self.prior_std, _KNOWN)
         names = np.where(
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
@@ -264,7 +268,7 @@ def conclude(
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Prior(prior, spread, share, rough.sigma, stretches)
-    estimate = _run(choice, model, mapping, before, recordings, factors, rough)
+    estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
     wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
     if choice.name in _GRADIENT and not choice.physical:
         estimate = _with_spread(estimate, wls)
@@ -278,6 +282,7 @@ def conclude(
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
             is_filter=choice.name == "kalman" or choice.forgetting < 1,
+            redraws=None if fit is None else Redraws(fit, choice.draws, np.random.default_rng(0)),
         )
     if grown != 1.0:
         estimate = replace(estimate, covariance=grown * estimate.covariance)
@@ -336,17 +341,24 @@ def _run(
     recordings: Recordings,
     factors: Factors,
     wls: Estimate,
-) -> Estimate:
-    """Return the estimate: batch estimators read the factors, recursive ones the samples."""
+) -> tuple[Estimate, Consistent | None]:
+    """Return the estimate and, if it is physically consistent, what made it so.
+
+    Batch estimators read the factors, recursive ones the samples.
+    """
     estimator = make_estimator(choice, model, mapping, prior)
+    if isinstance(estimator, LogCholesky):
+        return estimator.fit(factors), estimator.fit_in_cone
     if choice.name not in RECURSIVE:
-        return estimator.fit(factors)
+        fit = estimator if isinstance(estimator, Consistent) else None
+        return estimator.fit(factors), fit
     estimate = estimator.fit(recordings.problem(mapping, with_mass=choice.needs_mass))
     if not choice.physical:
-        return estimate
+        return estimate, None
     if choice.name in _GRADIENT:
         estimate = _with_spread(estimate, wls)
-    return consistent_fit(choice, model, mapping, prior).project(estimate)
+    fit = consistent_fit(choice, model, mapping, prior)
+    return fit.project(estimate), fit
 
 
 def _with_spread(estimate: Estimate, wls: Estimate) -> Estimate:

@@ -44,6 +44,7 @@ KEYS: dict[str, Any] = {
         "prior_weight": (*_NUMBER, str),
         "solver": str,
         "check": bool,
+        "draws": int,
         "robust": str,
         "regressor_noise": _NUMBER,
         "starts": int,

@@ -6,12 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators import Estimate
+from robotid.estimators import Consistent, Estimate
 from robotid.estimators.least_squares import solve_factor
+from robotid.exceptions import NotConvergedError
 from robotid.factors import Factors
 from robotid.uncertainty import FEWEST, Scatter, quantile, scatter
 
-__all__ = ["StandardErrors", "measured_errors"]
+__all__ = ["Redraws", "StandardErrors", "measured_errors"]
+
+_LEAST_SOLVED = 0.8  # share of the redrawn fits below which they tell nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,17 +26,35 @@ class StandardErrors:
         stretches: Number of stretches whose scores were compared.
         inflation: How much more the scores scatter than those of independent rows would [-].
         freedom: Degrees of freedom of each base parameter's standard error, shape (b,).
+        unbounded: Standard errors of the standard parameters with the bounds left out, shape (p,);
+            None if no bound binds.
     """
 
     method: str
     stretches: int
     inflation: float
     freedom: Array
+    unbounded: Array | None = None
 
     @property
     def reach(self) -> Array:
         """Standard errors that a 95 % interval of each base parameter reaches, shape (b,)."""
         return quantile(self.freedom)
+
+
+@dataclass(frozen=True, eq=False)
+class Redraws:
+    """How the spread of a physically consistent fit is told where its bounds bind.
+
+    Attributes:
+        fit: The fit.
+        draws: Fits to data and prior drawn anew; 0 leaves the bounds out.
+        rng: Source of the noise.
+    """
+
+    fit: Consistent
+    draws: int
+    rng: np.random.Generator
 
 
 def measured_errors(
@@ -45,6 +66,7 @@ def measured_errors(
     sigma: Array,
     *,
     is_filter: bool = False,
+    redraws: Redraws | None = None,
 ) -> tuple[Estimate, StandardErrors]:
     """Return an estimate with the covariance that the scatter of the stretches shows.
 
@@ -52,8 +74,9 @@ def measured_errors(
 
     * of base parameters: B M B, as of any least squares on correlated rows;
     * of standard parameters, with the prior's information L in B = (K^T H K + L)^-1:
-      B (K^T M K + L) B, the mean square error about a truth that the prior describes. Inequalities
-      are left out: they can only make it smaller;
+      B (K^T M K + L) B, the mean square error about a truth that the prior describes. Where
+      inequalities bind, fits to redrawn data and prior tell it; without ``redraws`` they are left
+      out;
     * of a filter that forgets: its own covariance, grown by the mean inflation.
 
     Args:
@@ -65,18 +88,27 @@ def measured_errors(
         K: Map to the base parameters, shape (b, p).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
         is_filter: Whether it weighs rows otherwise, too, as a filter that forgets or gates.
+        redraws: How the spread is told of an estimate whose details name active bounds.
 
     Returns:
-        The estimate, and what its standard errors rest on. With fewer than 12 stretches it is as
-        it was.
+        The estimate, and what its standard errors rest on. With fewer than 12 stretches rows count
+        as independent by that share.
+
+    Raises:
+        NotConvergedError: If more than a fifth of the redrawn fits are not solved.
     """
     b = len(factors.names)
+    binds = bool(estimate.details.get("active")) and redraws is not None and redraws.draws > 0
     if len(stretches) < FEWEST:
         method = (
             f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
             f"only {len(stretches)} stretches longer than the filter's memory"
         )
-        return estimate, StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
+        errors = StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
+        if redraws is None or not binds:
+            return estimate, errors
+        R = factors.weighted(sigma)[:b, :b]
+        return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
     is_open = ~np.isfinite(np.diag(estimate.covariance))
     C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     if len(estimate.theta) != b:
@@ -90,9 +122,44 @@ def measured_errors(
         found = scatter(stretches, estimate.theta, sigma, share * C)
         covariance = C * (share * found.inflation)
     covariance[is_open, is_open] = np.inf
+    estimate = replace(estimate, covariance=covariance)
     method = f"the scatter of the scores of {len(stretches)} stretches"
     errors = StandardErrors(method, len(stretches), found.inflation, found.freedom())
-    return replace(estimate, covariance=covariance), errors
+    if redraws is not None and binds:
+        return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
+    return estimate, errors
+
+
+def _bounded(
+    estimate: Estimate,
+    errors: StandardErrors,
+    redraws: Redraws,
+    factors: Factors,
+    sigma: Array,
+    meat: Array,
+) -> tuple[Estimate, StandardErrors]:
+    """Return the estimate with the mean square distance of redrawn fits as its covariance.
+
+    Args:
+        meat: Covariance of the score of the rows, independent ones by the share of the fit.
+    """
+    rows = redraws.fit.rows(factors, sigma)
+    found, failures = redraws.fit.redrawn(rows, estimate.theta, meat, redraws.draws, redraws.rng)
+    if len(found) < _LEAST_SOLVED * redraws.draws:
+        raise NotConvergedError(
+            f"the spread of the fit where its bounds bind is not known: Clarabel solved "
+            f"{len(found)} of {redraws.draws} fits to redrawn data; set draws = 0 for standard "
+            "errors without the bounds",
+            failures[0],
+        )
+    missing = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
+    method = f"{errors.method}; bounds bind: {len(found)} fits to redrawn data and prior{missing}"
+    freedom = 1.0 / (1.0 / errors.freedom + 1.0 / len(found))
+    covariance = found.T @ found / len(found)
+    return (
+        replace(estimate, covariance=covariance),
+        replace(errors, method=method, freedom=freedom, unbounded=estimate.std_error),
+    )
 
 
 def _about_prior(C: Array, K: Array, found: Scatter, R: Array, share: float) -> Array:

@@ -114,7 +114,7 @@ class Consistent(Estimator):
 
         Returns:
             The estimate over the p standard parameters. The covariance is that of the fit without
-            the inequalities, an upper bound where one is active; rank, condition number and the
+            the inequalities; :meth:`redrawn` tells that with them. Rank, condition number and the
             names of undetermined parameters are those of the base parameters.
 
         Raises:
@@ -219,6 +219,23 @@ class Consistent(Estimator):
             NotConvergedError: If the cone solver or Newton's method does not solve it.
         """
         return self.programme.minimise(rows, self.prior_weight)
+
+    def redrawn(
+        self, rows: Array, pi: Array, meat: Array, draws: int, rng: np.random.Generator
+    ) -> tuple[Array, list[str]]:
+        """Return how fits lie about this one whose data and prior are drawn anew.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+            pi: The fit, shape (p,).
+            meat: Covariance of the score of the rows, shape (b, b).
+            draws: How many.
+            rng: Source of the noise.
+
+        Returns:
+            See :meth:`Programme.redrawn`.
+        """
+        return self.programme.redrawn(rows, self.prior_weight, pi, meat, draws, rng)
 
     def objective(self, rows: Array, pi: Array) -> float:
         """Return what :meth:`minimise` minimises.

@@ -8,7 +8,7 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.estimators.cones import Cone, Subspace
 from robotid.estimators.priors import Penalty
-from robotid.estimators.solvers import ConeSolution, least_squares
+from robotid.estimators.solvers import ConeSolution, least_squares, nearest
 from robotid.exceptions import NotConvergedError
 from robotid.factors import Factors
 
@@ -60,7 +60,7 @@ class Programme:
         Args:
             rows: Information on the base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
-            is_exact: Whether to solve beyond the tolerance of the solver, some 1e-7 relative.
+            is_exact: Whether to solve beyond 1e-4 standard deviations.
 
         Returns:
             The solution, its x being pi, shape (p,); and the covariance without the inequalities.
@@ -88,6 +88,56 @@ class Programme:
             solution, R, count = self._settle(rows, weight, solution, tolerance, is_exact=True)
         message = f"{solution.message}, after {steps + count} Newton steps"
         return replace(solution, message=message), self._covariance(R)
+
+    def redrawn(
+        self,
+        rows: Array,
+        weight: float,
+        pi: Array,
+        meat: Array,
+        draws: int,
+        rng: np.random.Generator,
+    ) -> tuple[Array, list[str]]:
+        """Return how fits lie about this one whose data and prior are drawn anew.
+
+        Noise of the data with the covariance that their score has, and of the prior with that of
+        the penalty, moves the minimum without the inequalities; its nearest point in the cone, in
+        the metric of the fit, is the minimum with them. A penalty that is not quadratic is
+        expanded at the fit.
+
+        Args:
+            rows: Information on the base parameters, shape (k, b + 1).
+            weight: Weight of the penalty [-].
+            pi: The fit, shape (p,).
+            meat: Covariance of the score of the rows, shape (b, b).
+            draws: How many.
+            rng: Source of the noise.
+
+        Returns:
+            Distances of the fits from pi, shape (m, p), and the solver's status of those that it
+            did not find, draws - m of them.
+
+        References:
+            Bardsley, Fox (2012), An MCMC method for uncertainty quantification in nonnegativity
+            constrained inverse problems, section 3.
+        """
+        triangle, cone = self._system(rows, weight, pi)
+        R, space = triangle[:, :-1], self.space
+        at = space.basis.T @ (pi / self.scale - space.origin)
+        inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
+        # y = R (x - at): of independent rows, whose meat is their information, the noise is white
+        data = self.K * self.scale @ space.basis @ inverse
+        prior = space.basis @ inverse
+        H = weight * self._scaled_hessian(pi)
+        size, axes = np.linalg.eigh(data.T @ meat @ data + prior.T @ H @ prior)
+        noise = rng.standard_normal((draws, len(R))) * np.sqrt(np.maximum(size, 0.0)) @ axes.T
+        lowest = triangle[:, -1] - R @ at
+        y, failures = nearest(
+            lowest + noise,
+            cone.restrict(Subspace(at, inverse)),
+            max_iterations=self.max_iterations,
+        )
+        return self.scale * (y @ prior.T), failures
 
     def objective(self, rows: Array, pi: Array, weight: float) -> float:
         """Return what is minimised.
@@ -221,6 +271,21 @@ class Programme:
         self, rows: Array, weight: float, pi: Array, is_exact: bool
     ) -> tuple[ConeSolution, Array]:
         """Minimise with the penalty expanded at pi; return also R, R^T R half the Hessian."""
+        triangle, cone = self._system(rows, weight, pi)
+        solution = least_squares(
+            triangle[:, :-1],
+            triangle[:, -1],
+            cone,
+            solver=self.solver,
+            max_iterations=self.max_iterations,
+            is_exact=is_exact,
+        )
+        space = self.space
+        x = solution.x if len(triangle) == len(pi) else space.origin + space.basis @ solution.x
+        return replace(solution, x=x * self.scale), triangle[:, :-1]
+
+    def _system(self, rows: Array, weight: float, pi: Array) -> tuple[Array, Cone]:
+        """Return the triangle [R d] and the cone of what the equalities leave, expanded at pi."""
         H = weight * self._scaled_hessian(pi)
         slope = 0.5 * weight * self.penalty.gradient(pi) * self.scale
         L = scipy.linalg.cholesky(H)  # H = L^T L
@@ -232,17 +297,8 @@ class Programme:
         free = space.basis.shape[1]
         if free < len(pi):
             A, d, cone = A @ space.basis, d - A @ space.origin, cone.restrict(space)
-        triangle = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][:free]
-        solution = least_squares(
-            triangle[:, :-1],
-            triangle[:, -1],
-            cone,
-            solver=self.solver,
-            max_iterations=self.max_iterations,
-            is_exact=is_exact,
-        )
-        x = solution.x if free == len(pi) else space.origin + space.basis @ solution.x
-        return replace(solution, x=x * self.scale), triangle[:, :-1]
+        triangle: Array = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][:free]
+        return triangle, cone
 
     def _scaled_hessian(self, pi: Array) -> Array:
         """Return half the Hessian of the penalty in units of the scale."""
