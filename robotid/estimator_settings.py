@@ -114,7 +114,7 @@ class EstimatorSettings:
     prior: str = "euclidean"
     solver: str = "clarabel"
     check: bool = False
-    draws: int = 100
+    draws: int = 64
     constraints: Mapping[str, Any] = dataclass_field(default_factory=dict)
     starts: int = 0
 

@@ -140,8 +140,7 @@ def _bounded(
 ) -> tuple[Estimate, StandardErrors]:
     """Return the estimate with the mean square distance of redrawn fits as its covariance.
 
-    Args:
-        meat: Covariance of the score of the rows, independent ones by the share of the fit.
+    The meat is that of the rows as :meth:`Consistent.rows` has them, of which a share counts.
     """
     rows = redraws.fit.rows(factors, sigma)
     found, failures = redraws.fit.redrawn(rows, estimate.theta, meat, redraws.draws, redraws.rng)

@@ -91,9 +91,10 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
         "physical": True,
         "margin": 1e-4,
         "prior": "euclidean",
-        "prior_weight": 1.0,
+        "prior_weight": "auto",
         "solver": "clarabel",
         "check": False,
+        "draws": 64,
         "constraints": {},
     }
     assert "a Kalman filter" in (tmp_path / "out" / "report.html").read_text()

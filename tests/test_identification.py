@@ -34,7 +34,9 @@ def test_the_consistent_result_is_possible_and_says_where_it_comes_from(ur5, rng
     assert source["shoulder_link.m"] == "prior"
     assert set(found.sources) == {"data", "mixed", "prior"}
     i = ur5.layout.names.index("shoulder_link.m")
-    assert found.standard_error[i] == pytest.approx(found.prior_std[i], rel=1e-6)
+    assert found.errors.unbounded[i] == pytest.approx(found.prior_std[i], rel=1e-6)
+    # 64 draws know a spread to 9 %; a body next to others cannot be lighter than nothing
+    assert 0.6 < found.standard_error[i] / found.prior_std[i] < 1.3
 
 
 def test_what_least_squares_leaves_open_is_as_wide_as_the_prior(ur5, rng):

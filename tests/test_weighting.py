@@ -106,17 +106,20 @@ def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
         weights, scores = np.array(prior["curve"]).T
         assert prior["weight"] == weights[np.argmin(scores)]
         assert (np.diff(weights) > 0).all()
-        assert len(weights) >= 12
+        assert len(weights) >= 5
+        assert weights.max() == 1.0
 
 
 def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
     fit, problem = case
     stretches = cut(problem, 4)
     true = fit.fit(compress(problem)).theta
+    wrong = true + 30.0 * fit.prior_std
     for how in ("cv", "evidence"):
         good = choose_weight(replace(fit, prior=true), stretches, how).weight
-        bad = choose_weight(fit, stretches, how).weight
-        assert good >= 30 * bad, how
+        bad = choose_weight(replace(fit, prior=wrong), stretches, how).weight
+        assert good == 1.0
+        assert bad <= 0.1, how
 
 
 def test_one_stretch_is_too_few(case):
@@ -135,7 +138,7 @@ def test_poor_excitation_is_predicted_better_than_by_wls(ur5, rng):
     pi = truth(ur5)
     short = exact_log(ur5, pi, rng, samples=100, noise=NOISE)
     new = exact_log(ur5, pi, rng, noise=NOISE)
-    for settings in (EstimatorSettings(), EstimatorSettings(prior_weight="cv")):
+    for settings in (EstimatorSettings(), EstimatorSettings(prior_weight=1.0)):
         found = identify(ur5, [short], validation=[new], signals=EXACT, estimator=settings)
         measured = found.validation[0].metrics
         ours, wls = (

@@ -60,7 +60,7 @@ class Programme:
         Args:
             rows: Information on the base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
-            is_exact: Whether to solve beyond 1e-4 standard deviations.
+            is_exact: Whether to solve beyond 1e-3 standard deviations.
 
         Returns:
             The solution, its x being pi, shape (p,); and the covariance without the inequalities.

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
@@ -10,6 +10,9 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.estimators.cones import Cone, Subspace
 from robotid.exceptions import MissingDependencyError, NotConvergedError
+
+if TYPE_CHECKING:
+    import clarabel
 
 __all__ = ["SOLVERS", "ConeSolution", "least_squares", "nearest"]
 
@@ -24,7 +27,7 @@ _SCS_STATUS = {
     -6: "DualInfeasible",
     -7: "PrimalInfeasible",
 }
-_NEAREST = 1e-4  # tolerance of points in units of their spread
+_NEAREST = 1e-6  # gap at which a point in units of its spread is right to 1e-3
 _SCS_ITERATIONS = 100  # of SCS for one of an interior-point method: each is a back-substitution
 
 
@@ -63,7 +66,7 @@ def least_squares(
         cone: Where x must lie.
         solver: One of ``SOLVERS``.
         max_iterations: Bound on its iterations.
-        is_exact: Whether to solve for the corrections, too. If not, Clarabel solves it to 1e-4 of
+        is_exact: Whether to solve for the corrections, too. If not, Clarabel solves it to 1e-3 of
             the unit of A x, in half the time; of weighted rows that is a standard deviation.
 
     Returns:
@@ -104,7 +107,7 @@ def least_squares(
 def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Array, list[str]]:
     """Return the point of a cone that is nearest to each of several points, by Clarabel.
 
-    To 1e-4 or so: coordinates are wanted whose unit is a standard deviation.
+    To 1e-3 or so: coordinates are wanted whose unit is a standard deviation.
 
     Args:
         points: The points, shape (k, p).
@@ -183,7 +186,7 @@ def _cones(cone: Cone) -> list[Any]:
     return [clarabel.NonnegativeConeT(len(cone.h)), *matrices]
 
 
-def _clarabel_settings(max_iterations: int, gap: float) -> Any:
+def _clarabel_settings(max_iterations: int, gap: float) -> "clarabel.DefaultSettings":
     """Return Clarabel's settings: silent, one thread, a tolerance on the duality gap."""
     import clarabel
 

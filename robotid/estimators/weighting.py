@@ -14,6 +14,7 @@ __all__ = ["choose_weight", "held_out_error", "log_evidence"]
 
 _LIGHTEST, _HEAVIEST = -4.0, 0.0  # decades of the weights tried
 _LIGHTEST_ENTROPIC = -1.0  # below, each fit of a penalty that is not quadratic takes a second
+_PATIENCE = 2  # decades without a better score that end the search
 _STEPS = (0.5, 0.25)  # decades by which the best one is refined
 
 
@@ -23,9 +24,10 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
     * "cv": the weight with the smallest :func:`held_out_error`.
     * "evidence": the weight with the largest :func:`log_evidence`.
 
-    Weights from 1e-4 (entropic: 0.1) to 1 are tried, by decades, then around the best one. None is
-    heavier: a good prediction shows that most parameters are near the prior, not that all are, and
-    standard errors must hold for those that are not, as of a link with a tool.
+    Weights are tried from 1 down to 1e-4 (entropic: 0.1) at most, by decades until two in a row
+    are worse than those before, then around the best one. None is heavier than 1: a good
+    prediction shows that most parameters are near the prior, not that all are, and standard
+    errors must hold for those that are not, as of a link with a tool.
 
     Args:
         fit: The fit, whose own weight does not matter.
@@ -106,9 +108,12 @@ def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
 
 
 def _search(score: Callable[[float], float], how: str, lightest: float) -> WeightChoice:
-    """Return the weight with the smallest score, from a decade upwards."""
-    decades = np.arange(lightest, _HEAVIEST + 1).tolist()
-    tried = {k: score(10.0**k) for k in decades}
+    """Return the weight with the smallest score, from 1 down by decades until it only grows."""
+    tried: dict[float, float] = {}
+    decade = _HEAVIEST
+    while decade >= lightest and _is_promising(tried):
+        tried[decade] = score(10.0**decade)
+        decade -= 1.0
     for step in _STEPS:
         best = min(tried, key=lambda k: tried[k])
         for k in (best - step, best + step):
@@ -117,3 +122,9 @@ def _search(score: Callable[[float], float], how: str, lightest: float) -> Weigh
     best = min(tried, key=lambda k: tried[k])
     curve = tuple((float(10.0**k), tried[k]) for k in sorted(tried))
     return WeightChoice(float(10.0**best), how, curve)
+
+
+def _is_promising(tried: dict[float, float]) -> bool:
+    """Return whether one of the last two weights had the smallest score."""
+    scores = list(tried.values())
+    return len(scores) <= _PATIENCE or min(scores[-_PATIENCE:]) < min(scores[:-_PATIENCE])
