@@ -221,7 +221,7 @@ def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # n
         f"joint {joint.name!r} has {key} {text}, wanted 0 or more; robotid does not use it, but "
         f"{harm}: mend the sign"
     )
-    yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message)
+    yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message, {key: float(text)})
 
 
 def _mimic(joint: Any, names: set[str]) -> Finding:  # noqa: ANN401
@@ -283,17 +283,21 @@ def _impossible(link: str, inertial: Inertial, matters: bool) -> Iterator[Findin
     at, mass = f"link {link}", inertial.mass
     if mass < 0:
         message = f"link {link!r} has the mass {mass:g} kg, wanted more than 0; mend the sign"
-        yield Finding("negative_mass", "error", at, message)
+        yield Finding("negative_mass", "error", at, message, {"mass": mass})
     if mass == 0:
         message = (
             f"link {link!r} has the mass 0 kg, wanted more than 0; write its mass, or remove the "
             "<inertial> if the link is a mere frame"
         )
         yield Finding("zero_mass", "warning" if matters else "note", at, message)
-    fault = _inertia_fault(_principal(inertial))
+    moments = _principal(inertial)
+    fault = _inertia_fault(moments)
     if fault and (mass != 0 or any(inertial.inertia)):
         severity = "note" if fault.startswith("flat") else "error"
-        yield Finding("not_positive_definite", severity, at, f"link {link!r}: {fault}")
+        A, B, C = (float(moment) for moment in moments)
+        evidence = {"smallest": A, "middle": B, "largest": C, "triangle": A + B - C}
+        message = f"link {link!r}: {fault}"
+        yield Finding("not_positive_definite", severity, at, message, evidence)
 
 
 def _principal(inertial: Inertial) -> Array:
@@ -344,7 +348,8 @@ def _rounded_angles(
                 "only noise would fix their values; robotid leaves them out, other tools may not"
             )
         message = f"joint {name!r} has rpy {' '.join(angles)!r}, rounded: write {wanted}; {effect}"
-        yield Finding("rounded_rpy", severity, f"joint {name}", message)
+        evidence = {"largest_error": max(abs(float(word) - exact[word]) for word in exact)}
+        yield Finding("rounded_rpy", severity, f"joint {name}", message, evidence)
 
 
 def _carrying(tree: Tree) -> set[str]:
@@ -366,7 +371,7 @@ def _exact(angle: float) -> float | None:
     return exact if turns and _EXACT < abs(angle - exact) < _ROUNDED else None
 
 
-def _plain(finding: Finding) -> Mapping[str, str]:
+def _plain(finding: Finding) -> Mapping[str, Any]:
     kind, name = finding.where.split(" ", 1)
     place = {} if kind == "file" else {kind: name}
     return {
@@ -374,4 +379,5 @@ def _plain(finding: Finding) -> Mapping[str, str]:
         "severity": finding.severity,
         **place,
         "message": finding.message,
+        "evidence": {key: float(value) for key, value in finding.evidence.items()},
     }

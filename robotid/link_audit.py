@@ -108,7 +108,8 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
             f"link {link!r} has the mass {inertial.mass:g} kg and {ixx:g} kg m^2 about every axis, "
             "as templates have; take mass, centre and inertia from CAD, or identify them"
         )
-        yield Finding("default_inertial", "warning", f"link {link}", message)
+        evidence = {"mass": inertial.mass, "moment": ixx}
+        yield Finding("default_inertial", "warning", f"link {link}", message, evidence)
 
 
 def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:

@@ -88,7 +88,8 @@ def test_every_example_robot_can_be_inspected():
         content = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
         assert set(content) == {"robot", "joints", "structure", "base_groups", "findings"}
         for finding in content["findings"]:
-            wanted = {"code", "severity", "message"} | set(finding) & {"link", "joint"}
+            wanted = {"code", "severity", "message", "evidence"}
+            wanted |= set(finding) & {"link", "joint"}
             assert set(finding) == wanted
             assert finding["severity"] in ("note", "warning", "error")
         if content["structure"] is None:
@@ -121,6 +122,7 @@ def test_masses_of_zero_and_less_are_named(tmp_path):
     (finding,) = found(inspected(tmp_path, ('"2"/>', '"-2"/>')), "negative_mass")
     assert (finding["link"], finding["severity"]) == ("upper", "error")
     assert "has the mass -2 kg, wanted more than 0; mend the sign" in finding["message"]
+    assert finding["evidence"] == {"mass": -2.0}
 
 
 def test_an_impossible_inertia_is_named_with_what_it_breaks(tmp_path):
@@ -128,6 +130,7 @@ def test_an_impossible_inertia_is_named_with_what_it_breaks(tmp_path):
     assert (finding["link"], finding["severity"]) == ("upper", "error")
     assert "break the triangle inequality" in finding["message"]
     assert "add up to 0.22, wanted more than 0.23" in finding["message"]
+    assert finding["evidence"]["triangle"] == pytest.approx(-0.01)
     (finding,) = found(inspected(tmp_path, ('ixy="0"', 'ixy="0.2"')), "not_positive_definite")
     assert "are not all positive, wanted > 0 (-0.09" in finding["message"]
     (finding,) = found(inspected(tmp_path, ('izz="0.11"', 'izz="0.22"')), "not_positive_definite")
