@@ -2,7 +2,8 @@
 
     python benchmarks/bench_uncertainty.py [--runs 200] [--quick]
 
-Each run draws a robot near the URDF, simulates a log of 24 s at 200 Hz with noise on the torque,
+Each run draws a robot near the URDF (bodies deformed by 10 % of their size) or far from it (moved
+by 10 cm, more than the size of a wrist), always with a tool of 1.2 kg and friction, simulates a log of 24 s at 200 Hz with noise on the torque,
 and identifies it: "filtered" with the default signal settings, without Coulomb friction, whose sign
 the filter does not smooth; "raw" without a filter, with Coulomb friction. Noises: "white", the same
 share of each joint's torque; "unequal", from 0.3 to 30 % over the joints; "coloured", AR(1) with
@@ -36,6 +37,7 @@ CHAINS = {
 }
 NOISES = ("white", "unequal", "coloured")
 RATE, DURATION = 200.0, 24.0
+MOVED = 0.1  # [m]
 
 
 def noise(kind, size, rng):
@@ -48,14 +50,19 @@ def noise(kind, size, rng):
     return share * np.std(size, axis=0) * white
 
 
-def near(model, rng):
-    """Return a robot as far from the URDF as a good URDF may be: bodies deformed by some 10 %."""
+def another(model, rng, moved):
+    """Return a robot whose bodies differ from the URDF by 10 % of their size, or are far off.
+
+    Args:
+        moved: By how much their points are moved [m]; None: by 10 % of the body's size.
+    """
     size = model.layout.n_inertial
     pi = another_robot(model, rng)
     J = pseudo_inertia(model.standard_parameters()[:size])
     deform = np.array([scipy.linalg.expm(0.1 * rng.standard_normal((4, 4))) for _ in J])
     deform[:, 3, :3] = 0.0  # an affine map of the body's points
-    deform[:, :3, 3] *= np.sqrt(np.trace(J[:, :3, :3], axis1=1, axis2=2) / J[:, 3, 3])[:, None]
+    gyration = np.sqrt(np.trace(J[:, :3, :3], axis1=1, axis2=2) / J[:, 3, 3])
+    deform[:, :3, 3] *= gyration[:, None] if moved is None else 10.0 * moved
     deformed = deform @ J @ deform.transpose(0, 2, 1)
     pi[:size] = np.concatenate([inertial_from_pseudo_inertia(J_i) for J_i in deformed])
     return pi
@@ -64,7 +71,7 @@ def near(model, rng):
 class Study:
     """One robot, chain and noise: estimates of many runs beside the truth of each."""
 
-    def __init__(self, name, chain, kind, runs):
+    def __init__(self, name, chain, kind, runs, moved=None):
         signals, terms = CHAINS[chain]
         self.model = setting.robot(name, terms=terms)
         self.mapping = structural_mapping(self.model)
@@ -77,7 +84,7 @@ class Study:
         found = {"wls": [], "consistent": []}
         for run in range(runs):
             draw = np.random.default_rng([1, run])
-            pi = near(self.model, draw)
+            pi = another(self.model, draw, moved)
             tau = (W @ pi).reshape(v.shape)
             log = Log(
                 t=t, q=q, tau=tau + noise(kind, tau, draw), joints=self.model.joints, v=v, a=a
@@ -121,13 +128,15 @@ def main():
     robots, runs = (["UR10"], 4) if options.quick else (options.robots, options.runs)
     print(setting.machine())
     print(f"{runs} runs each; ratio = reported standard error / root mean square of the error")
-    print("robot  signals  noise     estimator    ratio: min, median, max, share in 0.8-1.3;")
+    print("robot  signals  noise     URDF  estimator    ratio: min, median, max, share in 0.8-1.3;")
     print("coverage; band of the torque: ratio, coverage")
-    for name in robots:
-        for chain, kind in itertools.product(CHAINS, NOISES):
-            study = Study(name, chain, kind, runs)
-            for key in study.found:
-                print(f"{name:6} {chain:8} {kind:9} {key:12} {study.row(key)}", flush=True)
+    cases = [(*case, None) for case in itertools.product(robots, CHAINS, NOISES)]
+    cases += [(name, chain, "white", MOVED) for name, chain in itertools.product(robots, CHAINS)]
+    for name, chain, kind, moved in cases:
+        study = Study(name, chain, kind, runs, moved)
+        urdf = "near" if moved is None else "far"
+        for key in study.found:
+            print(f"{name:6} {chain:8} {kind:9} {urdf:5} {key:12} {study.row(key)}", flush=True)
 
 
 if __name__ == "__main__":
