@@ -167,7 +167,7 @@ class Identification:
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
         """Rows of the fitted recordings that the estimate does not explain, the worst first."""
-        return find_outliers(self.model, self.identification)
+        return find_outliers(self.model, self.identification, self.standard)
 
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.

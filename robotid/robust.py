@@ -9,6 +9,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
+from robotid.columns import drive_columns
 from robotid.estimators import WLS
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.model import RobotModel
@@ -183,12 +184,18 @@ def reweigh(
     )
 
 
-def find_outliers(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple[Outlier, ...]:
+def find_outliers(
+    model: RobotModel, evaluations: Sequence[Evaluation], standard: Array
+) -> tuple[Outlier, ...]:
     """Return the rows that the fit does not explain, the worst first.
+
+    Near a change of direction a row may also be off by the step of Coulomb friction: where a drive
+    sticks, its friction is anywhere between the two bounds.
 
     Args:
         model: The robot.
         evaluations: Recordings with the torque that the estimate predicts.
+        standard: The estimate, shape (p,).
 
     Returns:
         Outliers of 12 times the joint's usual residual and 10 % of its torque, and more; rows
@@ -198,9 +205,12 @@ def find_outliers(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple
     for e in evaluations:
         motion, mask = e.recording.trajectory, e.recording.mask
         prediction = e.torques["estimate"]
-        residual = np.abs(motion.tau - prediction)
+        scales = _scales([motion.tau - prediction], [mask])
+        step = _friction_step(model, standard)
+        turning = np.abs(motion.v) * (e.recording.signals.cutoff or np.inf) <= np.abs(motion.a)
+        excess = np.abs(motion.tau - prediction) - np.where(turning, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
-        sizes = np.where(residual >= _MATTERS * rms, residual / _scales([residual], [mask]), 0.0)
+        sizes = np.where(excess >= _MATTERS * rms, excess / scales, 0.0)
         for j, joint in enumerate(model.row_names):
             rows = np.flatnonzero((sizes[:, j] >= _OUTLIER) & mask[:, j])
             edges = np.flatnonzero(np.diff(motion.t[rows]) > _NEAR) + 1
@@ -218,6 +228,17 @@ def find_outliers(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple
                     )
                 )
     return tuple(sorted(found, key=lambda outlier: -outlier.size))
+
+
+def _friction_step(model: RobotModel, standard: Array) -> Array:
+    """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
+    step = np.zeros(model.n_rows)
+    drives = drive_columns(model.layout, model.n_rows)
+    for value, drive in zip(standard[model.layout.n_inertial :], drives, strict=True):
+        if drive.term == "coulomb":
+            for row, ratio in drive.ratios.items():
+                step[row] += 2.0 * abs(ratio * value)
+    return step
 
 
 def _scaled_residuals(

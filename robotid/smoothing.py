@@ -11,6 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.data import Log, Trajectory
 from robotid.exceptions import DataError
+from robotid.reversals import acting_directions
 from robotid.signal_settings import SignalSettings
 
 __all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"]
@@ -18,7 +19,7 @@ __all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"
 #: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
 SPLINE = 64
 _FORGOTTEN = 42.0  # e-folds after which nothing is left of a filter's transient: 6e-19
-_REST = 1e-6  # [rad/s or m/s] slower than this is rest: the sign of rounding is no direction
+_LONGEST = 8.0  # periods of the filter: what is slow for longer is not taken to stick
 _ALL = slice(None)
 
 
@@ -71,8 +72,8 @@ def process_stretches(
 
     Returns:
         The trajectory, of no samples if no stretch is long enough; the segment numbers of its
-        samples are those of their stretches. Its directions are the signs of the speeds behind the
-        filter of the torque: None without speeds or without a filter.
+        samples are those of their stretches. Its directions are those that Coulomb friction acts
+        in, behind the filter of the torque: None without speeds or without a filter.
     """
     n = len(log.joints)
     ratios = np.empty((0, n)) if speeds is None or settings.cutoff is None else speeds
@@ -94,7 +95,8 @@ def process_stretches(
 def filter_reach(settings: SignalSettings) -> float:
     """Return how long before and after a row others have a say in its smooth value [s].
 
-    That is twice as far as the filter reaches: the sign of a smooth speed is filtered once more.
+    That is more than twice as far as the filter reaches: the sign of a smooth speed depends on how
+    long a drive may stick, and is filtered once more.
 
     Args:
         settings: The settings, resolved.
@@ -111,7 +113,7 @@ def filter_reach(settings: SignalSettings) -> float:
     poles = butter(order, cutoff, fs=rate, output="zpk")[1]
     digital = 1 / (-np.log(np.abs(poles).max()) * rate)
     analog = 1 / (2 * np.pi * cutoff * np.sin(np.pi / (2 * order)))  # on a finer grid
-    return late + 2.0 * _FORGOTTEN * float(max(digital, analog))
+    return late + 2.0 * _FORGOTTEN * float(max(digital, analog)) + _LONGEST / cutoff
 
 
 def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError:
@@ -165,8 +167,9 @@ def _process_part(
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
     # the sharp sign goes through the torque's filter before any row is left out
-    w = v @ speeds.T
-    direction = _filter(np.where(np.abs(w) < _REST, 0.0, np.sign(w)), grid, settings)
+    longest = _LONGEST / (settings.cutoff or np.inf)
+    acting = acting_directions(times, v @ speeds.T, settings.min_velocity, longest)
+    direction = _filter(acting, grid, settings)
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
     if grid.keep_every > 1:
         inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
