@@ -20,8 +20,8 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
     It is the sign of the speed. A drive that sticks comes to rest at once and leaves again later:
     its friction holds whatever torque there is, from one bound to the other, while a smooth speed
     rings about zero. There the direction goes linearly in time from the sign before to that after.
-    A drive has stuck if it was in the band for longer than its slopes where it entered and left say:
-    twice if it reverses, four times if it goes on as before.
+    A drive has stuck if it was in the band longer than its slopes where it entered and left say: by
+    a factor of two if it reverses, of four if it goes on as before.
 
     Args:
         t: Times, shape (N,) [s].
