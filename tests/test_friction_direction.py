@@ -7,12 +7,13 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 from synthetic import exact_log, truth
 
+from robotid.bands import torque_band
 from robotid.columns import friction_directions, friction_speeds
 from robotid.data import Log, Trajectory
 from robotid.estimator_settings import EstimatorSettings
 from robotid.examples import example_urdf
 from robotid.exceptions import DataError
-from robotid.identification import conclude, identify
+from robotid.identification import conclude, identify, structural_mapping
 from robotid.model import RobotModel
 from robotid.parameters import Coupling
 from robotid.recordings import LoadedRecordings
@@ -230,3 +231,14 @@ def test_estimates_from_filtered_logs_scatter_as_their_standard_errors_say(ur5):
         z = (found.base - found.mapping.to_base(pi)) / found.base_error
         deviations.append(z[drives])
     assert 0.7 < np.sqrt(np.mean(np.square(deviations))) < 1.3
+
+
+def test_the_band_of_a_prediction_follows_the_filtered_sign(ur5):
+    log = exact_log(ur5, truth(ur5), np.random.default_rng(6), samples=400)
+    motion = prepare(ur5, log, SignalSettings()).trajectory
+    mapping = structural_mapping(ur5)
+    C = np.diag([float(name == "elbow_joint.coulomb") for name in mapping.base_names])
+    band = torque_band(ur5, mapping, motion, C, np.zeros(6))
+    expected = np.abs(motion.direction[band.samples])
+    np.testing.assert_allclose(band.parameters[:, 2], expected[:, 2], atol=1e-12)
+    assert np.abs(expected[:, 2] - 1.0).max() > 0.2
