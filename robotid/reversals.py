@@ -10,7 +10,7 @@ __all__ = ["acting_directions"]
 
 _REST = 1e-6  # [rad/s or m/s] slower than this is rest: the sign of rounding is no direction
 # A drive that sticks is slow for so many times as long as its slopes at the edge of the band say.
-_REVERSAL = 2.0  # a straight line through zero has 1
+_REVERSAL = 2.0  # a straight line through zero has 1, a cubic that rests there 3
 _RETURN = 4.0  # a parabola from zero to the far edge of the band has 2 to 4
 
 

@@ -14,15 +14,20 @@ PART = 700  # rows
 SPEEDS = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, -1.0]])  # two joints, and a drive of both
 
 
-def recording(rng, *, jitter=0.2, gaps=(), start=0.0, samples=5000):
-    """Return a noisy log of two joints, with gaps of half a second behind some rows."""
+def recording(rng, *, jitter=0.2, gaps=(), start=0.0, samples=5000, pause=0.0):
+    """Return a noisy log of two joints, with gaps of half a second behind some rows.
+
+    Every two seconds the joints rest for a while.
+    """
     step = np.full(samples - 1, 1 / RATE) * (1 + jitter * rng.uniform(-1, 1, samples - 1))
     step[list(gaps)] = 0.5
     t = start + np.concatenate([[0.0], np.cumsum(step)])
     w = 2 * np.pi * np.array([0.4, 0.7])
-    q = np.sin(t[:, None] * w) + 1e-5 * rng.standard_normal((samples, 2))
-    v = w * np.cos(t[:, None] * w) + 1e-3 * rng.standard_normal((samples, 2))
-    a = -(w**2) * np.sin(t[:, None] * w)
+    moved = (t // 2.0 * (2.0 - pause) + np.minimum(t % 2.0, 2.0 - pause))[:, None]
+    moves = (t % 2.0 < 2.0 - pause)[:, None].astype(float)
+    q = np.sin(moved * w) + 1e-5 * rng.standard_normal((samples, 2))
+    v = moves * w * np.cos(moved * w) + 1e-3 * rng.standard_normal((samples, 2))
+    a = -moves * (w**2) * np.sin(moved * w)
     return Log(t=t, q=q, tau=q + 0.1 * rng.standard_normal(q.shape), joints=("a", "b"), v=v, a=a)
 
 
@@ -65,6 +70,8 @@ CASES = {
     "gaps": ({"gaps": (300, 700, 720, 723, 2099, 2100, 4998)}, {}),
     "long trim and gaps": ({"gaps": (300, 700, 720, 2100)}, {"trim": 0.9}),
     "delays": ({}, {"torque_delay": 0.31, "velocity_delay": -0.13}),
+    "drives that stick": ({"pause": 0.4}, {}),
+    "long rests": ({"pause": 1.5}, {}),
     "uniform": ({"jitter": 0.0}, {}),
     "clock of the epoch": ({"start": 1.7e9, "jitter": 0.0}, {}),
     "delayed rows": ({}, {"cutoff": None, "torque_delay": 0.1}),
