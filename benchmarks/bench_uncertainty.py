@@ -3,11 +3,10 @@
     python benchmarks/bench_uncertainty.py [--runs 200] [--quick]
 
 Each run draws a robot near the URDF (bodies deformed by 10 % of their size) or far from it (moved
-by 10 cm, more than the size of a wrist), always with a tool of 1.2 kg and friction, simulates a log of 24 s at 200 Hz with noise on the torque,
-and identifies it: "filtered" with the default signal settings, without Coulomb friction, whose sign
-the filter does not smooth; "raw" without a filter, with Coulomb friction. Noises: "white", the same
-share of each joint's torque; "unequal", from 0.3 to 30 % over the joints; "coloured", AR(1) with
-0.9 at 200 Hz.
+by 10 cm, more than the size of a wrist), always with a tool of 1.2 kg and friction, simulates a log
+of 24 s at 200 Hz with noise on the torque, and identifies it: "filtered" with the default signal
+settings, "raw" without a filter. Noises: "white", the same share of each joint's torque; "unequal",
+from 0.3 to 30 % over the joints; "coloured", AR(1) with 0.9 at 200 Hz.
 The ratio of a base parameter is its reported standard error, root mean square over the runs, over
 the root mean square of its error; wanted 0.8-1.3. Coverage is how often the 95 % interval holds
 the truth; wanted 92-98 %. "band" is the same of the predicted torque on another motion.
@@ -31,10 +30,7 @@ from robotid.signals import SignalSettings
 from robotid.simulation import another_robot
 from robotid.uncertainty import quantile
 
-CHAINS = {
-    "filtered": (SignalSettings(), ("armature", "viscous", "offset")),
-    "raw": (SignalSettings(cutoff=None), ("armature", "viscous", "coulomb", "offset")),
-}
+CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}
 NOISES = ("white", "unequal", "coloured")
 RATE, DURATION = 200.0, 24.0
 MOVED = 0.1  # [m]
@@ -72,8 +68,7 @@ class Study:
     """One robot, chain and noise: estimates of many runs beside the truth of each."""
 
     def __init__(self, name, chain, kind, runs, moved=None):
-        signals, terms = CHAINS[chain]
-        self.model = setting.robot(name, terms=terms)
+        self.model = setting.robot(name)
         self.mapping = structural_mapping(self.model)
         rng = np.random.default_rng(0)
         t = np.arange(round(RATE * DURATION)) / RATE
@@ -89,7 +84,7 @@ class Study:
             log = Log(
                 t=t, q=q, tau=tau + noise(kind, tau, draw), joints=self.model.joints, v=v, a=a
             )
-            identification = identify(self.model, [log], signals=signals)
+            identification = identify(self.model, [log], signals=CHAINS[chain])
             truth = self.mapping.to_base(pi)
             reach = identification.errors.reach
             wls, consistent = identification.wls, identification

@@ -78,7 +78,8 @@ def torque_band(
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
     q, v, a = (getattr(trajectory, key)[samples] for key in ("q", "v", "a"))
-    W = joint_torque_regressor(model, q, v, a)[:, mapping.independent]
+    direction = None if trajectory.direction is None else trajectory.direction[samples]
+    W = joint_torque_regressor(model, q, v, a, direction)[:, mapping.independent]
     variance = np.einsum("ij,ij->i", W @ covariance, W)
     std = np.sqrt(np.maximum(variance, 0.0)).reshape(len(samples), -1)
     return TorqueBand(samples, std, np.asarray(noise))

@@ -2,13 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.exceptions import DataError
 from robotid.parameters import ParameterLayout
 
-__all__ = ["DriveColumn", "RowPlan", "drive_columns", "plan_rows"]
+__all__ = [
+    "DriveColumn",
+    "RowPlan",
+    "drive_columns",
+    "friction_directions",
+    "friction_speeds",
+    "plan_rows",
+]
 
 
 @dataclass(frozen=True)
@@ -18,25 +27,30 @@ class DriveColumn:
     Attributes:
         term: Which f, one of ``DRIVE_TERMS``.
         ratios: Ratio by row [-]; a drive of one joint has a single row and ratio 1.
+        number: Which of the directions a Coulomb column follows; None for other terms.
     """
 
     term: str
     ratios: dict[int, float]
+    number: int | None = None
 
-    def values(self, v: Array, a: Array) -> Array:
+    def values(self, v: Array, a: Array, direction: Array) -> Array:
         """Return f(w) at each instant: dw/dt, w, sign w or 1.
 
         Args:
             v: Velocities, shape (N, n_rows) [rad/s, m/s].
             a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+            direction: Signs of the speeds, shape (N, c), as of :func:`friction_directions`.
 
         Returns:
             Values, shape (N,).
         """
         if self.term == "offset":
             return np.ones(len(v))
-        w = self.speed(a if self.term == "armature" else v)
-        return np.sign(w) if self.term == "coulomb" else w
+        if self.number is not None:
+            sign: Array = direction[:, self.number]
+            return sign
+        return self.speed(a if self.term == "armature" else v)
 
     def speed(self, v: Array) -> Array:
         """Return w = sum_r ratio_r v_r, shape (N,).
@@ -83,15 +97,62 @@ def drive_columns(layout: ParameterLayout, n_rows: int) -> tuple[DriveColumn, ..
     """
     first = n_rows - len(layout.joints)
     rows = {joint: first + j for j, joint in enumerate(layout.joints)}
-    own = [
-        DriveColumn(term, {rows[joint]: 1.0}) for joint in layout.joints for term in layout.terms
-    ]
+    own = [(term, {rows[joint]: 1.0}) for joint in layout.joints for term in layout.terms]
     coupled = [
-        DriveColumn(term, {rows[joint]: ratio for joint, ratio in coupling.ratios})
+        (term, {rows[joint]: ratio for joint, ratio in coupling.ratios})
         for coupling in layout.couplings
         for term in layout.coupling_terms
     ]
-    return tuple(own + coupled)
+    numbers = count()
+    return tuple(
+        DriveColumn(term, ratios, next(numbers) if term == "coulomb" else None)
+        for term, ratios in own + coupled
+    )
+
+
+def friction_speeds(layout: ParameterLayout) -> Array:
+    """Return the speeds that Coulomb friction follows: those of joints, then of couplings.
+
+    Args:
+        layout: The standard parameters of a robot with n joints.
+
+    Returns:
+        Their ratios to the speeds of the joints, w = ratios v, shape (c, n) [-]; c is the number of
+        Coulomb parameters.
+    """
+    n = len(layout.joints)
+    drives = [drive for drive in drive_columns(layout, n) if drive.number is not None]
+    ratios = np.zeros((len(drives), n))
+    for row, drive in zip(ratios, drives, strict=True):
+        row[list(drive.ratios)] = list(drive.ratios.values())
+    return ratios
+
+
+def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
+    """Return what the Coulomb columns hold: the directions given, or else the signs of the speeds.
+
+    Args:
+        layout: The standard parameters.
+        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
+        direction: Filtered signs of the speeds, shape (N, c), or None.
+
+    Returns:
+        Directions, shape (N, c) [-].
+
+    Raises:
+        DataError: If the shape of those given is another one.
+    """
+    speeds = friction_speeds(layout)
+    if direction is None:
+        signs: Array = np.sign(v[:, v.shape[1] - speeds.shape[1] :] @ speeds.T)
+        return signs
+    wanted = (len(v), len(speeds))
+    if direction.shape != wanted:
+        raise DataError(
+            f"direction has shape {direction.shape}, wanted {wanted}: a column for each Coulomb "
+            "parameter of the model; process the log with the speeds of this model"
+        )
+    return direction
 
 
 def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:

@@ -100,7 +100,9 @@ class CompiledWriter:
         states = self._work[-bodies * (12 + 6 * depth) * lanes.LANES :]
         _prepare(states.reshape(bodies, 12 + 6 * depth, lanes.LANES), model, tree)
 
-    def load(self, q: Array, v: Array, a: Array, tau: Array, weights: Array | None) -> None:
+    def load(
+        self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
+    ) -> None:
         """Take the samples of the next blocks.
 
         Args:
@@ -108,6 +110,7 @@ class CompiledWriter:
             v: Velocities, shape (N, n_rows) [rad/s, m/s].
             a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
             tau: Torques, shape (N, n_rows) [N m, N].
+            direction: Signs that the Coulomb columns hold, shape (N, c).
             weights: Weights, shape (N, n_rows); None: all 1.
         """
         self._base = np.zeros((12, 0))
@@ -120,6 +123,7 @@ class CompiledWriter:
         # copies that Numba finds writable and in C order: another kind would be compiled again
         self._q, self._tau = np.array(q, dtype=float, order="C"), np.array(tau, float, order="C")
         self._v, self._a = np.hstack([v, v @ drives.T]), np.hstack([a, a @ drives.T])
+        self._direction = np.array(direction, float, order="C")
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:
@@ -135,8 +139,8 @@ class CompiledWriter:
             *motion, self._base, self._work, self._out, (start, stop),
         )  # fmt: skip
         lanes.finish_rows(
-            self._terms, self._ratios, self._widths, self._v, self._a, self._tau, self._weights,
-            self._root, self._out, (start, stop),
+            self._terms, self._ratios, self._widths, self._v, self._a, self._direction, self._tau,
+            self._weights, self._root, self._out, (start, stop),
         )  # fmt: skip
 
 
@@ -225,6 +229,7 @@ def _terms(
         for place, drive in row:
             coupled = drive.ratios in couplings
             source = n_rows + couplings.index(drive.ratios) if coupled else j
+            source = source if drive.number is None else drive.number
             terms.append((place, kinds.index(drive.term), source))
             ratios.append(drive.ratios[j])
         terms.append((plan.torques[j], kinds.index("torque"), j))

@@ -119,6 +119,9 @@ class Trajectory:
         joints: Names of the n joints, in the order of the columns.
         rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
         segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
+        direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
+            shape (N, c) [-], in the order of :func:`robotid.columns.friction_speeds`; None: the
+            sign of the speed itself.
     """
 
     t: Array
@@ -129,6 +132,7 @@ class Trajectory:
     joints: tuple[str, ...]
     rate: float | None
     segment: Array
+    direction: Array | None = None
 
     def __post_init__(self) -> None:
         _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
@@ -139,6 +143,16 @@ class Trajectory:
                 f"of shape {self.t.shape}"
             )
         object.__setattr__(self, "segment", _frozen(segment, np.int_))
+        if self.direction is not None:
+            direction = _frozen(self.direction)
+            if direction.ndim != 2 or len(direction) != len(self.t):
+                raise DataError(
+                    f"trajectory: direction has shape {direction.shape}, wanted ({len(self.t)}, c)"
+                    ": a column for each speed that Coulomb friction follows"
+                )
+            names = [f"direction {k}" for k in range(direction.shape[1])]
+            require_finite(direction, self.t, names, "trajectory")
+            object.__setattr__(self, "direction", direction)
         if self.rate is not None and not 0 < self.rate < np.inf:
             raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
 
@@ -159,7 +173,8 @@ class Trajectory:
         """
         window = slice(start, stop)
         arrays = {key: getattr(self, key)[window] for key in ("t", "q", "v", "a", "tau")}
-        return replace(self, segment=self.segment[window], **arrays)
+        direction = None if self.direction is None else self.direction[window]
+        return replace(self, segment=self.segment[window], direction=direction, **arrays)
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

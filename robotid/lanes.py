@@ -278,7 +278,7 @@ def inertial_rows(parents, depths, slots, leaders, joints, places, q, v, a, base
 
 
 @_compile
-def finish_rows(terms, ratios, widths, v, a, tau, weights, root, out, span):
+def finish_rows(terms, ratios, widths, v, a, direction, tau, weights, root, out, span):
     """Write drive columns and torques of a block, and weigh its rows.
 
     Args:
@@ -287,6 +287,7 @@ def finish_rows(terms, ratios, widths, v, a, tau, weights, root, out, span):
         widths: Number of columns that each row has in ``out``, shape (n_rows,), int.
         v: Velocities, then those of coupled drives, shape (N, n_rows + couplings) [rad/s, m/s].
         a: Accelerations likewise [rad/s^2, m/s^2].
+        direction: Signs that the Coulomb columns hold, shape (N, c).
         tau: Torques, shape (N, n_rows) [N m, N].
         weights: Weights, shape (N, n_rows), or (0, 0) if all are 1.
         root: Work space, shape (k,).
@@ -303,7 +304,7 @@ def finish_rows(terms, ratios, widths, v, a, tau, weights, root, out, span):
             elif kind == 1:
                 value = v[first + k, column]
             elif kind == 2:
-                value = np.sign(v[first + k, column])
+                value = direction[first + k, column]
             elif kind == 3:
                 value = 1.0
             else:

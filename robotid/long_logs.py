@@ -15,6 +15,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
+from robotid.columns import friction_speeds
 from robotid.data import Log, Trajectory
 from robotid.exceptions import DataError
 from robotid.log_files import LogLayout
@@ -113,6 +114,7 @@ class LogPiece(Piece):
             self.header.signals,
             first=self.span[0],
             own=slice(self.first, self.stop),
+            speeds=friction_speeds(self.header.model.layout),
         )
         rows = slice(self.first - self.span[0], self.stop - self.span[0])
         own = np.hstack([raw.q[rows], raw.tau[rows]])

@@ -283,9 +283,8 @@ def _score(
         torques = predict_all(model, motion, parameters, prior, compiled=compiled)
     shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...] = ()
     if part is not None and len(motion.t):
-        arrays = {key: getattr(motion, key)[part] for key in ("t", "q", "v", "a", "tau", "segment")}
         kept = {name: torque[part] for name, torque in torques.items()}
-        shown = ((replace(motion, **arrays), mask[part], kept),)
+        shown = ((motion.part(*part.indices(len(motion.t))[:2]), mask[part], kept),)
     return _Score(
         sums=torque_sums(motion, mask, torques, list(parameters)),
         smooth=len(motion.t),
@@ -308,7 +307,8 @@ def _conclude(log: LongLog, score: _Score, *, is_refitted: bool = False) -> Eval
         number = int(segments[-1][-1]) + 1
     joined = {
         key: np.concatenate([getattr(motion, key) for motion in motions])
-        for key in ("t", "q", "v", "a", "tau")
+        for key in ("t", "q", "v", "a", "tau", "direction")
+        if getattr(motions[0], key) is not None
     }
     trajectory = replace(motions[0], **joined, segment=np.concatenate(segments))
     extent = Extent(

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.columns import drive_columns
+from robotid.columns import drive_columns, friction_directions
 from robotid.compiled import work_per_sample
 from robotid.data import Trajectory
 from robotid.model import RobotModel
@@ -32,7 +32,7 @@ def predict(
     Args:
         model: The robot.
         parameters: Vectors of standard parameters, each of shape (p,), possible ones or not.
-        trajectory: N samples of q, v, a.
+        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
         compiled: As of :func:`robotid.regressor.build_problem`.
 
     Returns:
@@ -87,10 +87,11 @@ def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> A
         torque_k[:] = rnea(pin_model, data, *motion_k)
     if not is_plain:
         torque = torque @ G  # tau = G^T tau_pinocchio
+    signs = friction_directions(model.layout, v, trajectory.direction)
     drives = drive_columns(model.layout, model.n_rows)
     for value, drive in zip(pi[model.layout.n_inertial :], drives, strict=True):
         if value != 0.0:
-            values = value * drive.values(v, a)
+            values = value * drive.values(v, a, signs)
             for row, ratio in drive.ratios.items():
                 torque[:, row] += ratio * values
     return torque

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.columns import drive_columns
+from robotid.columns import drive_columns, friction_directions
 from robotid.data import Trajectory
 from robotid.exceptions import DataError
 from robotid.model import RobotModel
@@ -27,7 +27,9 @@ __all__ = [
 _BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
-def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+def joint_torque_regressor(
+    model: RobotModel, q: Array, v: Array, a: Array, direction: Array | None = None
+) -> Array:
     """Return the regressor Y with tau = Y pi at each of N instants.
 
     The columns are the ten inertial parameters of each body, from Pinocchio, and then
@@ -38,6 +40,8 @@ def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> A
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
         v: Velocities, shape (N, n_rows) [rad/s, m/s].
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: What stands for the signs in the c Coulomb columns, shape (N, c), as
+            ``Trajectory.direction``; None: the signs.
 
     Returns:
         Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
@@ -54,7 +58,7 @@ def joint_torque_regressor(model: RobotModel, q: Array, v: Array, a: Array) -> A
         raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
     Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
     _write_inertial(model, q, v, a, Y[:, :, : model.layout.n_inertial])
-    _write_drives(model, v, a, Y[:, :, model.layout.n_inertial :])
+    _write_drives(model, v, a, direction, Y[:, :, model.layout.n_inertial :])
     return Y.reshape(len(q) * model.n_rows, -1)
 
 
@@ -138,7 +142,7 @@ class InstantRegressor:
         for term, place in zip(layout.terms, self._places, strict=True):
             Y[rows, place] = np.sign(v) if term == "coulomb" else value[term]
         if layout.couplings:
-            _write_drives(model, v[None], a[None], Y[None, :, layout.n_inertial :])
+            _write_drives(model, v[None], a[None], None, Y[None, :, layout.n_inertial :])
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
@@ -192,7 +196,11 @@ def build_problem(
         for start in range(0, shape[0], length):
             part = slice(start, start + length)
             W = joint_torque_regressor(
-                model, trajectory.q[part], trajectory.v[part], trajectory.a[part]
+                model,
+                trajectory.q[part],
+                trajectory.v[part],
+                trajectory.a[part],
+                None if trajectory.direction is None else trajectory.direction[part],
             )
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
@@ -234,11 +242,14 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     return joint_torque_regressor(model, q, v, a)
 
 
-def _write_drives(model: RobotModel, v: Array, a: Array, out: Array) -> None:
+def _write_drives(
+    model: RobotModel, v: Array, a: Array, direction: Array | None, out: Array
+) -> None:
     """Write the columns of armature, viscous, coulomb, offset, shape (N, n_rows, drive)."""
     out[:] = 0.0
+    signs = friction_directions(model.layout, v, direction)
     for k, drive in enumerate(drive_columns(model.layout, model.n_rows)):
-        values = drive.values(v, a)
+        values = drive.values(v, a, signs)
         for row, ratio in drive.ratios.items():
             out[:, row, k] = ratio * values
 

@@ -189,8 +189,8 @@ def find_outliers(
 ) -> tuple[Outlier, ...]:
     """Return the rows that the fit does not explain, the worst first.
 
-    Near a change of direction a row may also be off by the step of Coulomb friction, which the
-    filter smears over time in the torque, but not in the model.
+    Near a change of direction a row may also be off by the step of Coulomb friction: where a drive
+    sticks, its friction is anywhere between the two bounds.
 
     Args:
         model: The robot.

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.columns import RowPlan, plan_rows
+from robotid.columns import RowPlan, friction_directions, plan_rows
 from robotid.compiled import (
     LONG_ENOUGH,
     CompiledWriter,
@@ -150,7 +150,11 @@ class TrajectoryRows(RowSource):
         writer = self._writer(out)
         motion, part = self.trajectory, slice(start, stop)
         weights = self.weights[part] if self._is_weighted else None
-        writer.load(motion.q[part], motion.v[part], motion.a[part], motion.tau[part], weights)
+        direction = None if motion.direction is None else motion.direction[part]
+        direction = friction_directions(self.model.layout, motion.v[part], direction)
+        writer.load(
+            motion.q[part], motion.v[part], motion.a[part], motion.tau[part], direction, weights
+        )
         for k in range(0, stop - start, length):
             end = min(k + length, stop - start)
             writer.write(k, end)
@@ -225,18 +229,22 @@ class _PinocchioWriter:
         self._wanted = np.concatenate(wanted)
         self._raw = np.empty((out.shape[1], end))
 
-    def load(self, q: Array, v: Array, a: Array, tau: Array, weights: Array | None) -> None:
+    def load(
+        self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
+    ) -> None:
         """Take the samples of the next blocks; see :meth:`CompiledWriter.load`."""
         self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
+        self._direction = direction
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop; see :meth:`CompiledWriter.write`."""
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
         out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]
+        direction = self._direction[part]
         for j, drives in enumerate(self._plan.drives):
             for place, drive in drives:
-                np.multiply(drive.ratios[j], drive.values(v, a), out=out[place])
+                np.multiply(drive.ratios[j], drive.values(v, a, direction), out=out[place])
         out[list(self._plan.torques)] = self._tau[part].T
         if self._weights is not None:
             for root, (i, j) in zip(

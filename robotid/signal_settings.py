@@ -22,7 +22,7 @@ class SignalSettings:
             the log has it and its velocity is used.
         trim: Time cut at each end of each uninterrupted stretch [s].
         min_velocity: Joint speed below which its rows are left out while Coulomb friction is
-            identified [rad/s or m/s]; 0 keeps all rows.
+            identified [rad/s or m/s], and within which a drive may stick; 0 keeps all rows.
         max_gap: A longer step between two rows is a gap [s]; None: 2.5 median steps, or a quarter
             of the filter's period if that is longer.
         torque_delay: How late the log has the torque against the position [s]; it is moved back.

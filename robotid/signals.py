@@ -115,12 +115,14 @@ def decide(
     return replace(settings, rate=rate, velocity=velocity, acceleration=acceleration, max_gap=gap)
 
 
-def process(log: Log, settings: SignalSettings) -> Trajectory:
+def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> Trajectory:
     """Return the smooth trajectory of a log.
 
     Args:
         log: The log.
         settings: The settings; what is automatic in them is resolved first.
+        speeds: As of :func:`robotid.smoothing.process_stretches`; a model with Coulomb friction
+            needs them wherever a filter smears its torque.
 
     Returns:
         The trajectory; rows of one uninterrupted stretch share a ``segment`` number.
@@ -136,7 +138,7 @@ def process(log: Log, settings: SignalSettings) -> Trajectory:
         Stretch(first, stop, float(log.t[first]), float(log.t[stop - 1]), number)
         for number, (first, stop) in enumerate(pairwise(edges))
     ]
-    trajectory = process_stretches(log, stretches, settings)
+    trajectory = process_stretches(log, stretches, settings, speeds=speeds)
     if len(trajectory.t) == 0:
         raise too_short(log.path or "log", len(stretches), settings)
     numbers = np.unique(trajectory.segment, return_inverse=True)[1]

@@ -11,6 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.data import Log, Trajectory
 from robotid.exceptions import DataError
+from robotid.reversals import acting_directions
 from robotid.signal_settings import SignalSettings
 
 __all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"]
@@ -18,6 +19,7 @@ __all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"
 #: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
 SPLINE = 64
 _FORGOTTEN = 42.0  # e-folds after which nothing is left of a filter's transient: 6e-19
+_LONGEST = 8.0  # periods of the filter: what is slow for longer is not taken to stick
 _ALL = slice(None)
 
 
@@ -52,6 +54,7 @@ def process_stretches(
     *,
     first: int = 0,
     own: slice = _ALL,
+    speeds: Array | None = None,
 ) -> Trajectory:
     """Return the smooth motion of uninterrupted stretches, or of a part of them.
 
@@ -64,28 +67,36 @@ def process_stretches(
         settings: The settings, resolved.
         first: Row number that the log's first row has in the stretches.
         own: Rows wanted, numbered as in the stretches; the log must have the row that follows.
+        speeds: Ratios of the speeds that Coulomb friction follows to those of the joints, shape
+            (c, n), as of :func:`robotid.columns.friction_speeds`.
 
     Returns:
         The trajectory, of no samples if no stretch is long enough; the segment numbers of its
-        samples are those of their stretches.
+        samples are those of their stretches. Its directions are those that Coulomb friction acts
+        in, behind the filter of the torque: None without speeds or without a filter.
     """
+    n = len(log.joints)
+    ratios = np.empty((0, n)) if speeds is None or settings.cutoff is None else speeds
     parts, counts = [], []
     for stretch in stretches:
         rows = slice(max(stretch.first - first, 0), min(stretch.stop - first, len(log.t)))
-        part = _process_part(log, rows, stretch, settings, first, own)
+        part = _process_part(log, rows, stretch, settings, first, own, ratios)
         counts.append(0 if part is None else len(part[0]))
         parts += [] if part is None else [part]
-    n = len(log.joints)
-    nothing = (np.empty(0), *[np.empty((0, n))] * 4)
-    t, q, v, a, tau = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
+    nothing = (np.empty(0), *[np.empty((0, n))] * 4, np.empty((0, len(ratios))))
+    t, q, v, a, tau, direction = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
     return Trajectory(
         t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
         segment=np.repeat([stretch.number for stretch in stretches], counts),
+        direction=direction if len(ratios) else None,
     )  # fmt: skip
 
 
 def filter_reach(settings: SignalSettings) -> float:
     """Return how long before and after a row others have a say in its smooth value [s].
+
+    That is more than twice as far as the filter reaches: the sign of a smooth speed depends on how
+    long a drive may stick, and is filtered once more.
 
     Args:
         settings: The settings, resolved.
@@ -102,7 +113,7 @@ def filter_reach(settings: SignalSettings) -> float:
     poles = butter(order, cutoff, fs=rate, output="zpk")[1]
     digital = 1 / (-np.log(np.abs(poles).max()) * rate)
     analog = 1 / (2 * np.pi * cutoff * np.sin(np.pi / (2 * order)))  # on a finer grid
-    return late + _FORGOTTEN * float(max(digital, analog))
+    return late + 2.0 * _FORGOTTEN * float(max(digital, analog)) + _LONGEST / cutoff
 
 
 def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError:
@@ -125,9 +136,15 @@ def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError
 
 
 def _process_part(
-    log: Log, rows: slice, stretch: Stretch, settings: SignalSettings, first: int, own: slice
-) -> tuple[Array, Array, Array, Array, Array] | None:
-    """Return t, q, v, a, tau of the own rows of a stretch, None if it has none or is too short."""
+    log: Log,
+    rows: slice,
+    stretch: Stretch,
+    settings: SignalSettings,
+    first: int,
+    own: slice,
+    speeds: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array] | None:
+    """Return t, q, v, a, tau and direction of the own rows, None if none is left."""
     t = log.t[rows]
     if stretch.rows < 5 or stretch.end - stretch.start <= 2 * settings.trim:
         return None
@@ -149,6 +166,10 @@ def _process_part(
     }
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
+    # the sharp sign goes through the torque's filter before any row is left out
+    longest = _LONGEST / (settings.cutoff or np.inf)
+    acting = acting_directions(times, v @ speeds.T, settings.min_velocity, longest)
+    direction = _filter(acting, grid, settings)
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
     if grid.keep_every > 1:
         inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
@@ -159,7 +180,8 @@ def _process_part(
     kept = np.flatnonzero(inside)
     if len(kept) == 0:
         return None
-    return times[kept], smooth["q"][kept], v[kept], a[kept], smooth["tau"][kept]
+    q, tau = smooth["q"][kept], smooth["tau"][kept]
+    return times[kept], q, v[kept], a[kept], tau, direction[kept]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
+from robotid.columns import friction_speeds
 from robotid.data import Log, Trajectory
 from robotid.metrics import Metrics, TorqueSums
 from robotid.model import RobotModel
@@ -124,7 +125,7 @@ def prepare(model: RobotModel, log: Log, settings: SignalSettings) -> Recording:
     """
     log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
     resolved = resolve(log, settings)
-    trajectory = process(log, resolved)
+    trajectory = process(log, resolved, friction_speeds(model.layout))
     mask = row_mask(model, trajectory, resolved.min_velocity)
     extent = Extent(
         samples=len(log.t),
@@ -266,7 +267,7 @@ def predict_all(
     (gravity,) = predict(
         model,
         [_without_drives(model, prior)],
-        replace(trajectory, v=still, a=still),
+        replace(trajectory, v=still, a=still, direction=None),
         compiled=compiled,
     )
     predicted = dict(zip(parameters, torques, strict=True))

@@ -18,7 +18,7 @@ FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
     "innovations online_settings job_keys lanes lapack log_source console signal_settings "
-    "progress work_flags versions report_page replay_page surprises",
+    "progress work_flags versions report_page replay_page surprises reversals",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
     "time_stamps compiled columns array_tables csv_files parquet_files bags summaries meshes "
     "ellipsoids",

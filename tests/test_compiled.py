@@ -6,6 +6,7 @@ import pinocchio as pin
 import pytest
 
 from robotid import compiled, rows
+from robotid.columns import friction_speeds
 from robotid.data import Trajectory
 from robotid.estimators import WLS
 from robotid.examples import example_urdf
@@ -38,11 +39,12 @@ ROBOTS = {
 }
 
 
-def motion(model, rng, samples, reach=3.0):
+def motion(model, rng, samples, reach=3.0, direction=None):
     n = len(model.joints)
     q = rng.uniform(-reach, reach, (samples, n))
     v, a, tau = rng.uniform(-2, 2, (3, samples, model.n_rows))
     values = {"t": np.arange(samples) / 100, "v": v, "a": a, "tau": tau, "joints": model.joints}
+    values["direction"] = direction
     if model.free_flyer:  # logs of a floating base are not read yet
         pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
         return SimpleNamespace(q=np.hstack([pose, q]), **values)
@@ -62,7 +64,9 @@ def stacked(source, start=0, stop=None):
 
 
 def assert_is_pinocchio(model, trajectory):
-    W = joint_torque_regressor(model, trajectory.q, trajectory.v, trajectory.a)
+    W = joint_torque_regressor(
+        model, trajectory.q, trajectory.v, trajectory.a, trajectory.direction
+    )
     W = W.reshape(len(trajectory.t), model.n_rows, -1)
     for engine in (COMPILED, "Pinocchio"):
         found = source(model, trajectory, engine)
@@ -84,6 +88,8 @@ def test_compiled_rows_are_pinocchios(case, rng):
     model = RobotModel.from_urdf(example_urdf(name), **options)
     assert compiled.why_not(model) is None
     assert_is_pinocchio(model, motion(model, rng, 150))  # two groups of lanes and a part
+    direction = rng.uniform(-1.2, 1.2, (150, len(friction_speeds(model.layout))))
+    assert_is_pinocchio(model, motion(model, rng, 150, direction=direction))
 
 
 LINK = (

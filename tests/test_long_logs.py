@@ -65,6 +65,12 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     size = np.abs(other.theta).max()
     np.testing.assert_allclose(one.theta, other.theta, rtol=1e-9, atol=1e-10 * size)
     np.testing.assert_allclose(one.std_error, other.std_error, rtol=1e-8)
+    if signals.cutoff is None:
+        assert whole.trajectory.direction is None
+    else:
+        directions = [piece.read()[1].direction for piece in found.pieces]
+        wanted = whole.trajectory.direction
+        np.testing.assert_allclose(np.concatenate(directions), wanted, rtol=0, atol=1e-10)
     return found, whole
 
 

@@ -156,6 +156,7 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
     assert recording.trajectory.t[0] == pytest.approx(0.22)
     assert recording.trajectory.t[-1] == pytest.approx(29.98 - 0.22)
     assert recording.trajectory.segment.tolist() == [0] * 100 + [1] * 100 + [2] * 100
+    assert recording.trajectory.direction.shape == (300, 6)
     rows = evaluation.metrics["estimate"].per_joint["elbow_joint"].rows
     assert 1000 < rows <= recording.extent.smooth == 1478
     page = (tmp_path / "report.html").read_text()

@@ -5,6 +5,7 @@ import pytest
 from test_compiled import ROBOTS, motion
 
 from robotid import prediction
+from robotid.columns import friction_speeds
 from robotid.compiled import is_installed
 from robotid.examples import example_urdf
 from robotid.exceptions import DataError
@@ -26,7 +27,9 @@ def vectors(model, rng):
 
 
 def assert_is_regressor_times(model, parameters, trajectory, **options):
-    W = joint_torque_regressor(model, trajectory.q, trajectory.v, trajectory.a)
+    W = joint_torque_regressor(
+        model, trajectory.q, trajectory.v, trajectory.a, trajectory.direction
+    )
     for torque, pi in zip(
         predict(model, parameters, trajectory, **options), parameters, strict=True
     ):
@@ -38,7 +41,8 @@ def assert_is_regressor_times(model, parameters, trajectory, **options):
 def test_predicted_torque_is_the_regressor_times_the_parameters(case, rng):
     path, options = ROBOTS[case]
     model = RobotModel.from_urdf(example_urdf(path), **options)
-    trajectory = motion(model, rng, 70)
+    direction = rng.uniform(-1.2, 1.2, (70, len(friction_speeds(model.layout))))
+    trajectory = motion(model, rng, 70, direction=direction)
     possible, heavier, base_only = vectors(model, rng)
     assert_is_regressor_times(model, [possible], trajectory, compiled=False)  # inverse dynamics
     assert_is_regressor_times(model, [possible, heavier, base_only], trajectory, compiled=False)

@@ -96,10 +96,23 @@ def test_outliers_are_named_with_time_joint_and_torque(ur5, logs):
     assert [o.size for o in found] == sorted((o.size for o in found), reverse=True)
 
 
-def test_friction_that_the_filter_smears_is_no_outlier(ur5):
+def test_friction_that_the_filter_smears_leaves_no_residual(ur5):
     quiet = exact_log(ur5, truth(ur5), np.random.default_rng(4), samples=2000, rate=100.0)
     noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
     found = identify(ur5, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
+    (evaluation,) = found.identification
+    residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
+    usual = np.median(residual, axis=0)
+    assert (np.where(evaluation.recording.mask, residual, 0.0) < 10 * usual).all()
+
+
+def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
+    pi = truth(ur5)
+    quiet = exact_log(ur5, pi, np.random.default_rng(4), samples=2000, rate=100.0)
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
+    step = pi[[name.endswith(".coulomb") for name in ur5.layout.names]]
+    smooth = step * (np.tanh(quiet.v / 0.03) - np.sign(quiet.v))
+    found = identify(ur5, [replace(quiet, tau=quiet.tau + noise + smooth)], estimator="wls")
     (evaluation,) = found.identification
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)

@@ -1,0 +1,58 @@
+"""Which way Coulomb friction acts: the sign of the speed, and between two signs while it sticks."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from robotid._typing import Array
+
+__all__ = ["acting_directions"]
+
+_REST = 1e-6  # [rad/s or m/s] slower than this is rest: the sign of rounding is no direction
+# A drive that sticks is slow for so many times as long as its slopes at the edge of the band say.
+_REVERSAL = 2.0  # a straight line through zero has 1, a cubic that rests there 3
+_RETURN = 4.0  # a parabola from zero to the far edge of the band has 2 to 4
+
+
+def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
+    """Return the direction of Coulomb friction at each instant, between -1 and 1.
+
+    It is the sign of the speed. A drive that sticks comes to rest at once and leaves again later:
+    its friction holds whatever torque there is, from one bound to the other, while a smooth speed
+    rings about zero. There the direction goes linearly in time from the sign before to that after.
+    A drive has stuck if it was in the band longer than its slopes where it entered and left say: by
+    a factor of two if it reverses, of four if it goes on as before.
+
+    Args:
+        t: Times, shape (N,) [s].
+        w: Smooth speeds, shape (N, c) [rad/s or m/s].
+        band: Speed from which the sign is sure [rad/s or m/s]; 0: everywhere.
+        longest: Longest time that a drive sticks; what is slow for longer keeps its signs [s].
+
+    Returns:
+        Directions, shape (N, c) [-].
+
+    References:
+        Karnopp (1985), Computer simulation of stick-slip friction in mechanical dynamic systems.
+    """
+    directions = np.where(np.abs(w) < _REST, 0.0, np.sign(w))
+    for x, direction in zip(w.T, directions.T, strict=True):
+        edges = np.flatnonzero(np.diff(np.abs(x) < band)) + 1
+        for i, k in pairwise(edges):
+            if abs(x[i]) >= band:  # fast from here on
+                continue
+            before, after = np.sign(x[i - 1]), np.sign(x[k])
+            enters = _crossing(t[i - 1 : i + 1], x[i - 1 : i + 1], before * band)
+            leaves = _crossing(t[k - 1 : k + 1], x[k - 1 : k + 1], after * band)
+            slow = leaves[0] - enters[0]
+            least = _REVERSAL if before != after else _RETURN
+            if least * band * (1 / enters[1] + 1 / leaves[1]) <= slow <= longest:
+                share = (t[i:k] - enters[0]) / slow
+                direction[i:k] = before + (after - before) * share
+    return directions
+
+
+def _crossing(t: Array, x: Array, level: float) -> tuple[float, float]:
+    """Return when x is at the level between two instants, and how steep it is there."""
+    slope = (x[1] - x[0]) / (t[1] - t[0])
+    return float(t[0] + (level - x[0]) / slope), float(abs(slope))
