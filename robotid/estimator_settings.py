@@ -111,7 +111,7 @@ class EstimatorSettings:
     seed: int = 0
     step_size: float = 1.0
     physical: bool = False
-    prior: str = "riemannian"
+    prior: str = "euclidean"
     solver: str = "clarabel"
     check: bool = False
     draws: int = 64

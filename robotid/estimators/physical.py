@@ -80,7 +80,7 @@ class Consistent(Estimator):
     prior_weight: float = 1.0
     independent_share: float = 1.0
     max_iterations: int = 200
-    metric: str = "riemannian"
+    metric: str = "euclidean"
     constraints: Constraints = field(default_factory=Constraints)
     solver: str = "clarabel"
     check: bool = False
