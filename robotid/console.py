@@ -21,14 +21,15 @@ __all__ = [
 
 
 def print_error(error: BaseException, words: str = "") -> None:
-    """Print an error in one line on the standard error stream, with what was noted on its way.
+    """Print an error on the standard error stream, with what was noted on its way.
 
     Args:
         error: The error.
         words: What to say of it, if it does not say so itself.
     """
     notes = getattr(error, "__notes__", ())
-    print("robotid:", "; ".join([words or str(error), *notes]), file=sys.stderr)
+    separator = "; " if words else "\n  "
+    print("robotid:", separator.join([words or str(error), *notes]), file=sys.stderr)
 
 
 @contextmanager

@@ -74,6 +74,11 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
     low, high = float(pair[0]), float(pair[1])
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise SettingsError(
+            f"{what} is [{low:g}, {high:g}] kg, wanted finite numbers; write a large one for no "
+            "upper bound"
+        )
     if not low <= high:
         raise SettingsError(
             f"{what} is [{low:g}, {high:g}] kg: the first is above the second; write the smaller "

@@ -135,8 +135,8 @@ class EstimatorSettings:
             )
         for key in ("margin", "prior_weight", "passes"):
             number = getattr(self, key)
-            if not isinstance(number, str) and not number > 0:
-                raise SettingsError(f"{key} is {number}, wanted a positive number")
+            if not isinstance(number, str) and not 0 < number < np.inf:
+                raise SettingsError(f"{key} is {number}, wanted a positive, finite number")
         _check_range("forgetting", self.forgetting, 0 < self.forgetting <= 1, "0 < x <= 1")
         _check_range("regressor_noise", self.regressor_noise, self.regressor_noise > 0, "x > 0")
         _check_range("walk", self.walk, self.walk >= 0, "x >= 0")

@@ -109,14 +109,16 @@ class Identification:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether every body and drive of the standard parameters is physically possible.
+        """Whether every body, every drive and the mass matrix are physically possible.
 
-        A body must be so without its links on locked joints, which keep their own inertials.
+        A body must be so without its links on locked joints, which keep their own inertials; the
+        mass matrix must be positive definite at random poses.
         """
         size = self.model.layout.n_inertial
         J = pseudo_inertia(self.standard[:size] - held_parameters(self.model))
         signs = self.standard[self.model.layout.is_nonnegative()]
-        return bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
+        is_possible = bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
+        return is_possible and self.mass_matrix.is_positive
 
     @cached_property
     def mass_matrix(self) -> MassMatrixCheck:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
 from robotid.exceptions import ModelError
 from robotid.identification import structural_mapping
-from robotid.kinematics import Inertial, Joint, Tree
+from robotid.inertial_audit import impossible_inertial, negative_masses
+from robotid.kinematics import Joint, Tree
 from robotid.link_audit import audit_links
 from robotid.lumping import LinkPlace, link_places
 from robotid.model import RobotModel
@@ -27,7 +27,6 @@ _MOVABLE = ("revolute", "continuous", "prismatic")
 _ROUNDED = 1e-3  # [rad] nearer to a multiple of pi/2 than this is meant to be one
 _EXACT = 1e-7  # [rad] nearer than this is one
 _NOISE = 1e-10  # pivots below this share of the largest are rounding
-_SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
 # the attributes that hold numbers, by the element they are in
 _NUMBERS = {
     ("link", "inertial/mass"): ("value",),
@@ -109,7 +108,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         The inspection. A file that no model can be built from gives a finding, not an error.
     """
     robot = _parse(Path(path))
-    findings = list(_numbers(robot)) if robot is not None else []
+    findings = [*_numbers(robot), *negative_masses(robot)] if robot is not None else []
     model = None
     try:
         model = RobotModel.from_urdf(path, free_flyer=free_flyer)
@@ -251,7 +250,7 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
         for place in members:
             if place.link in inertials:
                 matters = body >= 0 and not any(inertials[link].mass > 0 for link in having)
-                yield from _impossible(place.link, inertials[place.link], matters)
+                yield from impossible_inertial(place.link, inertials[place.link], matters)
             elif body >= 0:
                 yield _missing(place.link, having)
         lumped = [p.link for p in members if p.role == "fixed" and p.link in inertials]
@@ -276,55 +275,6 @@ def _missing(link: str, having: list[str]) -> Finding:
         "its body counts as massless; add an estimate of mass, centre and inertia"
     )
     return Finding("missing_inertial", "warning", f"link {link}", message)
-
-
-def _impossible(link: str, inertial: Inertial, matters: bool) -> Iterator[Finding]:
-    """Yield what no body can have; a mass of 0 matters where nothing else gives its body one."""
-    at, mass = f"link {link}", inertial.mass
-    if mass < 0:
-        message = f"link {link!r} has the mass {mass:g} kg, wanted more than 0; mend the sign"
-        yield Finding("negative_mass", "error", at, message, {"mass": mass})
-    if mass == 0:
-        message = (
-            f"link {link!r} has the mass 0 kg, wanted more than 0; write its mass, or remove the "
-            "<inertial> if the link is a mere frame"
-        )
-        yield Finding("zero_mass", "warning" if matters else "note", at, message)
-    moments = _principal(inertial)
-    fault = _inertia_fault(moments)
-    if fault and (mass != 0 or any(inertial.inertia)):
-        severity = "note" if fault.startswith("flat") else "error"
-        A, B, C = (float(moment) for moment in moments)
-        evidence = {"smallest": A, "middle": B, "largest": C, "triangle": A + B - C}
-        message = f"link {link!r}: {fault}"
-        yield Finding("not_positive_definite", severity, at, message, evidence)
-
-
-def _principal(inertial: Inertial) -> Array:
-    ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
-    moments: Array = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-    return moments  # ascending
-
-
-def _inertia_fault(moments: Array) -> str | None:
-    """Return what keeps a body with these principal moments of inertia from being possible."""
-    A, B, C = (float(moment) for moment in moments)
-    stated = f"principal moments of inertia {A:.4g}, {B:.4g}, {C:.4g} kg m^2"
-    advice = "take the inertia from CAD, about the centre of mass and in the stated frame"
-    margin = A + B - C
-    if min(A, 0.0) < -_SLACK * abs(C):
-        return f"its {stated} are not all positive, wanted > 0 ({A:.4g} is not); {advice}"
-    if margin < -_SLACK * abs(C):
-        return (
-            f"its {stated} break the triangle inequality: the two smaller ones add up to "
-            f"{A + B:.4g}, wanted more than {C:.4g}; {advice}"
-        )
-    if margin <= _SLACK * abs(C):
-        return (
-            f"flat or thin: of its {stated} the two smaller ones add up to no more than the third, "
-            "so the pseudo-inertia is singular; give it some thickness"
-        )
-    return None
 
 
 def _rounded_angles(

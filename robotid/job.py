@@ -98,6 +98,12 @@ class Job:
             )
         if self.workers is not None and self.workers < 1:
             raise SettingsError(f"reduction: workers is {self.workers}, wanted at least 1")
+        if self.free_flyer:
+            raise SettingsError(
+                "free_flyer is true, but no log format that robotid reads has the pose and motion "
+                "of a floating base; fix the base (free_flyer = false), or build the rows from "
+                "your own Trajectory with RobotModel.from_urdf(..., free_flyer=True)"
+            )
 
     def model(self) -> RobotModel:
         """Return the robot.

@@ -26,6 +26,7 @@ KEYS: dict[str, Any] = {
         "acceleration": str,
         "trim": _NUMBER,
         "min_velocity": _NUMBER,
+        "friction_band": _NUMBER,
         "max_gap": _NUMBER,
         "torque_delay": _NUMBER,
         "velocity_delay": _NUMBER,

@@ -259,6 +259,8 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
         for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     ]
     (value,) = _numbers(mass.get("value", ""), 1, f"{at} mass")
+    if value < 0:
+        raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; mend the sign")
     return Inertial(value, tuple(com), tuple(rpy), tuple(moments))
 
 

@@ -37,13 +37,19 @@ def drive_table(found: Identification) -> str:
     names = found.model.layout.drive_names
     if not names:
         return "<p>None was identified.</p>\n"
+    sources = found.sources
     rows = [
-        [code(name), *_value(found.standard[i], found.standard_error[i]), text(unit)]
+        [
+            code(name),
+            *_value(found.standard[i], found.standard_error[i]),
+            text(unit),
+            text(sources[i]),
+        ]
         for i, (name, unit) in enumerate(
             zip(names, found.model.layout.units[first:], strict=True), start=first
         )
     ]
-    headers = ["parameter", "value", "standard error", "relative %", "unit"]
+    headers = ["parameter", "value", "standard error", "relative %", "unit", "from"]
     return table("Armature, friction and torque offset", headers, rows)
 
 

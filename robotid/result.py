@@ -241,16 +241,7 @@ def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
 
 
 def _standard_parameters(identification: Identification) -> list[dict[str, Any]]:
-    size = identification.model.layout.n_inertial
-    return [
-        {**entry, "prior": float(prior), "source": source}
-        for entry, prior, source in zip(
-            _entries(identification, slice(0, size)),
-            identification.prior,
-            identification.sources,
-            strict=False,
-        )
-    ]
+    return _entries(identification, slice(0, identification.model.layout.n_inertial))
 
 
 def _drive_parameters(identification: Identification) -> list[dict[str, Any]]:
@@ -260,12 +251,21 @@ def _drive_parameters(identification: Identification) -> list[dict[str, Any]]:
 def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:
     layout = identification.model.layout
     return [
-        {"name": name, "value": float(value), "std_error": _finite(error), "unit": unit}
-        for name, value, error, unit in zip(
+        {
+            "name": name,
+            "value": float(value),
+            "std_error": _finite(error),
+            "unit": unit,
+            "prior": float(prior),
+            "source": source,
+        }
+        for name, value, error, unit, prior, source in zip(
             layout.names[part],
             identification.standard[part],
             identification.standard_error[part],
             layout.units[part],
+            identification.prior[part],
+            identification.sources[part],
             strict=True,
         )
     ]

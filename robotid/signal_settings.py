@@ -23,6 +23,8 @@ class SignalSettings:
         trim: Time cut at each end of each uninterrupted stretch [s].
         min_velocity: Joint speed below which its rows are left out while Coulomb friction is
             identified [rad/s or m/s], and within which a drive may stick; 0 keeps all rows.
+        friction_band: Speed from which Coulomb friction has its full size [rad/s or m/s]: it
+            changes linearly between that speed and its negative; 0: at once, as Coulomb has it.
         max_gap: A longer step between two rows is a gap [s]; None: 2.5 median steps, or a quarter
             of the filter's period if that is longer.
         torque_delay: How late the log has the torque against the position [s]; it is moved back.
@@ -36,6 +38,7 @@ class SignalSettings:
     acceleration: str = "auto"
     trim: float = 0.2
     min_velocity: float = 0.02
+    friction_band: float = 0.0
     max_gap: float | None = None
     torque_delay: float = 0.0
     velocity_delay: float = 0.0
@@ -51,7 +54,7 @@ class SignalSettings:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise SettingsError(f"{name} is {value}, wanted a positive number")
-        for name in ("trim", "min_velocity"):
+        for name in ("trim", "min_velocity", "friction_band"):
             value = getattr(self, name)
             if not value >= 0:
                 raise SettingsError(f"{name} is {value}, wanted 0 or a positive number")

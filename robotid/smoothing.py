@@ -73,10 +73,11 @@ def process_stretches(
     Returns:
         The trajectory, of no samples if no stretch is long enough; the segment numbers of its
         samples are those of their stretches. Its directions are those that Coulomb friction acts
-        in, behind the filter of the torque: None without speeds or without a filter.
+        in, behind the filter of the torque: None without speeds, and where they are plain signs.
     """
     n = len(log.joints)
-    ratios = np.empty((0, n)) if speeds is None or settings.cutoff is None else speeds
+    is_sharp = settings.cutoff is None and settings.friction_band == 0
+    ratios = np.empty((0, n)) if speeds is None or is_sharp else speeds
     parts, counts = [], []
     for stretch in stretches:
         rows = slice(max(stretch.first - first, 0), min(stretch.stop - first, len(log.t)))
@@ -166,10 +167,8 @@ def _process_part(
     }
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
-    # the sharp sign goes through the torque's filter before any row is left out
-    longest = _LONGEST / (settings.cutoff or np.inf)
-    acting = acting_directions(times, v @ speeds.T, settings.min_velocity, longest)
-    direction = _filter(acting, grid, settings)
+    # through the torque's filter before any row is left out
+    direction = _filter(_acting(times, v @ speeds.T, settings), grid, settings)
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
     if grid.keep_every > 1:
         inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
@@ -230,6 +229,15 @@ class _Grid:
             return np.arange(first, first + len(t))
         start = 0 if first == 0 else self.number_of(float(t[0]))
         return np.arange(start, self.count if is_last else self.number_of(float(t[-1])))
+
+
+def _acting(t: Array, w: Array, settings: SignalSettings) -> Array:
+    """Return the direction that Coulomb friction acts in, before any filter."""
+    if settings.friction_band > 0:
+        linear: Array = np.clip(w / settings.friction_band, -1.0, 1.0)
+        return linear
+    longest = _LONGEST / (settings.cutoff or np.inf)
+    return acting_directions(t, w, settings.min_velocity, longest)
 
 
 def _resample(t: Array, values: Array, grid: Array) -> Array:

@@ -4,7 +4,8 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from robotid.checkpoint_inputs import checkpoint_inputs
 from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.identification import Identification, conclude, identify, structural_mapping
+from robotid.inertial_audit import impossible_inertials
 from robotid.job import Job, LogEntry, job_from_settings
 from robotid.long_jobs import is_long, survey_logs
 from robotid.long_recordings import LongRecordings, evaluate_long
@@ -109,9 +111,10 @@ def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding
     kept = [job.read(entry, model) for entry in job.validation]
     diagnosis = diagnose(model, logs, kept, job.signals)
     alarms = alarming(diagnosis, job.ignore)
-    identification = identify(
-        model, logs, validation=kept, signals=job.signals, estimator=job.estimator
-    )
+    with _explained(diagnosis):
+        identification = identify(
+            model, logs, validation=kept, signals=job.signals, estimator=job.estimator
+        )
     return _with_alarms(job, model, identification, [*logs, *kept], diagnosis, alarms)
 
 
@@ -131,11 +134,23 @@ def _identify_long(
     alarms = alarming(diagnosis, job.ignore)
     pieces = [piece for log in logs for piece in log.pieces]
     checkpoint = Checkpoint.open(folder, checkpoint_inputs(job), pieces, resume=plan.resume)
-    with plan:
+    with plan, _explained(diagnosis):
         recordings = LongRecordings(model, logs, kept, plan, checkpoint)
         identification = conclude(model, recordings, job.estimator)
     heads = [log.head for log in (*logs, *kept)]
     return *_with_alarms(job, model, identification, heads, diagnosis, alarms), checkpoint
+
+
+@contextmanager
+def _explained(diagnosis: Sequence[Finding]) -> Iterator[None]:
+    """Add what the doctor found to the error of a fit that fails."""
+    try:
+        yield
+    except (DataError, NotConvergedError, RankDeficientError) as error:
+        for finding in diagnosis:
+            if finding.severity != "note":
+                error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
+        raise
 
 
 def _with_alarms(
@@ -148,6 +163,7 @@ def _with_alarms(
 ) -> tuple[Identification, list[Finding]]:
     """Return the identification with its alarms, and what is worth a word so far."""
     findings = [*_locked_findings(job, model), *_log_findings(logs)]
+    findings += impossible_inertials(model)
     findings += [finding for finding in diagnosis if finding.severity != "note"]
     messages = tuple(finding.message for finding in alarms)
     return replace(identification, alarms=messages), findings

@@ -25,7 +25,7 @@ FLOORS = {
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces "
     "scene",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
-    "constraint_settings task checkpoint prediction",
+    "constraint_settings task checkpoint prediction inertial_audit",
     5: "bands link_audit validation sidecar estimator_settings simulation dynamics log_files "
     "probe mass_matrix reduction",
     6: "recordings closed_loop conversion explanations load_checks motion_checks cluster residuals",

@@ -67,6 +67,8 @@ def test_result_json_has_the_promised_shape(identified, logs):
     assert len(result["standard_parameters"]) == 60
     assert {p["source"] for p in result["standard_parameters"]} <= {"data", "mixed", "prior"}
     assert len(result["drive_parameters"]) == 24
+    assert {p["source"] for p in result["drive_parameters"]} <= {"data", "mixed"}
+    assert {p["prior"] for p in result["drive_parameters"]} == {0.0}
     assert result["consistency"]["is_consistent"] is True
     assert result["consistency"]["links"][0]["min_eigenvalue"] > 0
     joint = result["identification"]["per_joint"]["elbow_joint"]

@@ -152,6 +152,25 @@ def test_a_part_of_a_trajectory_keeps_its_directions(ur5):
         motion.direction[0] = 1.0
 
 
+@pytest.mark.parametrize("cutoff", [8.0, None])
+def test_friction_that_needs_some_speed_to_be_full_is_found_again(ur5, cutoff):
+    pi = truth(ur5)
+    band = 0.1  # [rad/s]
+    log = exact_log(ur5, pi, np.random.default_rng(1), samples=4000, rate=200.0)
+    step = pi[[name.endswith(".coulomb") for name in ur5.layout.names]]
+    smooth = step * (np.clip(log.v / band, -1.0, 1.0) - np.sign(log.v))
+    log = replace(log, tau=log.tau + smooth)
+    told, untold = (
+        coulomb_errors(ur5, [prepare(ur5, log, settings)], pi).max()
+        for settings in (
+            SignalSettings(cutoff=cutoff, friction_band=band, min_velocity=0.0),
+            SignalSettings(cutoff=cutoff, min_velocity=0.0),
+        )
+    )
+    assert untold > 5e-3
+    assert told < 0.1 * untold
+
+
 # --- which way friction acts ----------------------------------------------------------------------
 
 T = np.linspace(-1.0, 1.0, 401)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic import exact_log, truth
@@ -106,6 +108,10 @@ def test_no_log_and_too_few_rows_are_refused(ur5, rng):
     short = exact_log(ur5, truth(ur5), rng, samples=9)
     with pytest.raises(DataError, match="54 torque rows for 58 parameters"):
         identify(ur5, [short], signals=EXACT)
+    still = exact_log(ur5, truth(ur5), rng, samples=300)
+    still = replace(still, v=0.0 * still.v)
+    with pytest.raises(DataError, match="0 torque rows for 58 parameters: no joint moves faster"):
+        identify(ur5, [still], signals=SignalSettings(cutoff=None))
 
 
 def test_an_unknown_estimator_is_refused():
@@ -113,6 +119,17 @@ def test_an_unknown_estimator_is_refused():
         EstimatorSettings("lsq")
     with pytest.raises(SettingsError, match="prior_weight is 0"):
         EstimatorSettings(prior_weight=0)
+    with pytest.raises(SettingsError, match="prior_weight is inf, wanted a positive, finite"):
+        EstimatorSettings(prior_weight=float("inf"))
+
+
+def test_parameters_with_an_indefinite_mass_matrix_are_not_consistent(ur5, rng):
+    found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT)
+    assert found.is_consistent
+    check = replace(found.mass_matrix, positive_share=0.64)
+    other = replace(found)
+    other.__dict__["mass_matrix"] = check  # as if it had been found so
+    assert not other.is_consistent
 
 
 def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5):

@@ -14,7 +14,7 @@ from robotid.workflow import run_job
 
 JOBS = Path(__file__).parent / "jobs"
 # validation error per joint [%] reached with plain numpy and weighted least squares on the same
-# splits; the measured figure may be at most 1.16 times that, for WLS and for the consistent fit
+# splits; the measured figure may be at most 1.15 times that, for WLS and for the consistent fit
 REACHED = {
     "ur10e": (6.7, 3.2, 3.2, 3.7, 5.5, 4.2),
     "tx40": (6.4, 6.0, 9.7, 8.8, 30.0, 21.0),
@@ -51,7 +51,7 @@ def test_a_new_motion_is_predicted_as_well_as_plain_numpy_does(run, name, estima
     identification, _, _ = run(name)
     (kept,) = identification.validation
     reached = errors(kept.metrics[estimate])
-    assert (reached <= 1.16 * np.array(REACHED[name])).all(), reached
+    assert (reached <= 1.15 * np.array(REACHED[name])).all(), reached
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -113,6 +113,11 @@ def require_rows(rows: int, columns: int, n_joints: int) -> None:
     Raises:
         DataError: If there are fewer rows than parameters.
     """
+    if rows == 0:
+        raise DataError(
+            f"0 torque rows for {columns} parameters: no joint moves faster than min_velocity, or "
+            "trim leaves nothing of the logs ([signals]); record a motion of every joint"
+        )
     if rows < columns:
         raise DataError(
             f"{rows} torque rows for {columns} parameters: too few rows to fit; record at least "

@@ -1,0 +1,51 @@
+"""From job to result where the URDF or the logs are at fault: what is said of them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.exceptions import DataError
+from robotid.job import Job, LogEntry
+from robotid.log_files import write_log
+from robotid.workflow import run_job
+
+
+def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(ur5, rng, tmp_path, capsys):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0)
+    still = np.zeros_like(log.q)
+    write_log(replace(log, q=still, v=still, a=still), tmp_path / "rest.csv")
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "rest.csv"),))
+    with pytest.raises(DataError, match="0 torque rows") as caught:
+        run_job(job, tmp_path / "out")
+    notes = caught.value.__notes__
+    assert any("static_joint" in note and "elbow_joint stands still" in note for note in notes)
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["identify", ur5.tree.path, str(tmp_path / "rest.csv"), *out]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("robotid: 0 torque rows")
+    assert lines[1].startswith("  doctor: warning: ")
+
+
+def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refused(
+    ur5, rng, tmp_path, capsys
+):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0)
+    write_log(log, tmp_path / "log.csv")
+    text, urdf = Path(ur5.tree.path).read_text(), tmp_path / "robot.urdf"
+    command = ["identify", str(urdf), str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]
+    urdf.write_text(text.replace('mass value="2.275"', 'mass value="-2.275"', 1))
+    assert main(command) == 1
+    assert "link 'forearm_link': inertial mass is -2.275 kg" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    urdf.write_text(text.replace('izz="0.004095"', 'izz="-0.004095"', 1))
+    assert main(command) == 0
+    warnings = json.loads((tmp_path / "out" / "result.json").read_text())["warnings"]
+    (finding,) = [w for w in warnings if w["code"] == "not_positive_definite"]
+    assert finding["where"] == "link forearm_link"
+    assert "are not all positive" in finding["message"]
+    assert "takes the nearest possible body" in finding["message"]
