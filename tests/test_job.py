@@ -115,7 +115,7 @@ WRONG = {
     "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
     "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
-    "floating base": ("[signals]", "free_flyer = true\n[signals]", "free_flyer is true, but no log"),
+    "floating base": ("[signals]", "free_flyer = true\n[signals]", "free_flyer is true, but no"),
     "no urdf": ('urdf = "robot.urdf"', "", "has no key 'urdf'"),
     "joints text": ('joints = ["a", "b"]', 'joints = "a"', "joints is 'a', wanted a list"),
     "unit": ('time = "ms"', 'time = "sec"', "time is 'sec', wanted one of"),
