@@ -8,6 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.kinematics import Inertial
+from robotid.lumping import link_places
 from robotid.model import RobotModel
 from robotid.verdict import Finding
 
@@ -38,7 +39,7 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
 
 
 def impossible_inertials(model: RobotModel) -> list[Finding]:
-    """Return the inertials of a URDF that no body can have, as warnings about a fit to it.
+    """Return the moving inertials of a URDF that no body can have, as warnings about a fit to it.
 
     Args:
         model: The robot.
@@ -46,11 +47,13 @@ def impossible_inertials(model: RobotModel) -> list[Finding]:
     Returns:
         The findings.
     """
+    inertials = model.tree.inertials
     effect = "; a consistent fit takes the nearest possible body for what the URDF says"
     return [
         replace(finding, severity="warning", message=finding.message + effect)
-        for link, inertial in model.tree.inertials.items()
-        for finding in impossible_inertial(link, inertial, matters=False)
+        for place in link_places(model)
+        if place.body >= 0 and place.link in inertials
+        for finding in impossible_inertial(place.link, inertials[place.link], matters=False)
         if finding.severity == "error"
     ]
 

@@ -146,8 +146,8 @@ def _failure(name: str, status: str, cone: Cone) -> NotConvergedError:
     families = ", ".join(cone.families)
     if "PrimalInfeasible" in status:
         return NotConvergedError(
-            f"no parameters meet all constraints ({families}), says {name}; loosen the bounds in "
-            "[constraints], or the margin",
+            f"no parameters meet all constraints ({families}, beside known masses and pinned "
+            f"links), says {name}; loosen the bounds in [estimator.constraints], or the margin",
             status,
         )
     return NotConvergedError(
