@@ -47,7 +47,9 @@ def consistency_findings(identification: Identification) -> list[Finding]:
             f"the data push against the bounds {bounds}: check these bounds, the torque scale "
             "(gains) and the payload"
         )
-        findings.append(Finding("bound_binds", "note", "estimator", message))
+        stated = _stated(identification)
+        severity = "warning" if stated.intersection(bounds) else "note"
+        findings.append(Finding("bound_binds", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:
         message = (
@@ -59,3 +61,13 @@ def consistency_findings(identification: Identification) -> list[Finding]:
 
 
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
+
+
+def _stated(identification: Identification) -> set[str]:
+    """Return the bounds that the user states; those of the links' geometry may well bind."""
+    stated = identification.estimator.constraints
+    return {
+        "total_mass all",
+        *(f"mass {link}" for link in stated.get("mass", ())),
+        *(f"centre_of_mass {link}" for link in stated.get("com", ())),
+    }

@@ -36,7 +36,7 @@ from robotid.signals import SignalSettings
 from robotid.standard_errors import Redraws, StandardErrors, measured_errors
 from robotid.summaries import identification_html, identification_line, identification_text
 from robotid.validation import Evaluation, pool, prepare
-from robotid.verdict import Verdict, judge
+from robotid.verdict import Doubt, Verdict, judge
 
 __all__ = [
     "ESTIMATORS",
@@ -74,6 +74,7 @@ class Identification:
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
+        doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
     """
 
@@ -93,6 +94,7 @@ class Identification:
     errors: StandardErrors
     factors: Factors
     alarms: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     report: str = ""
 
     def __repr__(self) -> str:
@@ -200,7 +202,9 @@ class Identification:
             {e.recording.name: e.metrics["estimate"] for e in kept},
             undetermined=self.estimate.undetermined,
             is_consistent=self.is_consistent,
+            joints=self.model.joints,
             alarms=self.alarms,
+            doubts=self.doubts,
         )
 
 

@@ -1,12 +1,12 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from robotid.metrics import JointMetrics, Metrics
 
-__all__ = ["NOT_EVALUATED", "Finding", "JointVerdict", "Verdict", "judge"]
+__all__ = ["NOT_EVALUATED", "Doubt", "Finding", "JointVerdict", "Verdict", "judge"]
 
 #: Status of a joint that no kept recording moves: never a pass.
 NOT_EVALUATED = "not evaluated"
@@ -36,6 +36,21 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """Why a result may be wrong although it predicts torque well.
+
+    Attributes:
+        code: Code of the finding that it comes from.
+        joint: The joint that it is about; empty for all of the result.
+        message: Why, in words.
+    """
+
+    code: str
+    joint: str
+    message: str
+
+
+@dataclass(frozen=True)
 class JointVerdict:
     """How far to trust the torque that is predicted for one joint.
 
@@ -55,12 +70,16 @@ class Verdict:
     Attributes:
         status: "good", "usable" or "poor".
         reasons: Why, the worst first; for "good" what was checked.
-        joints: The same of each joint that was fitted or moves in a kept recording.
+        joints: The same of each joint of the model.
+        alarms: Faults of the recordings that it was told of.
+        doubts: Doubts that it was told of.
     """
 
     status: str
     reasons: tuple[str, ...]
     joints: Mapping[str, JointVerdict] = field(default_factory=dict)
+    alarms: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain values, as result.json has it."""
@@ -71,6 +90,8 @@ class Verdict:
                 joint: {"status": verdict.status, "reasons": list(verdict.reasons)}
                 for joint, verdict in self.joints.items()
             },
+            "alarms": list(self.alarms),
+            "doubts": [asdict(doubt) for doubt in self.doubts],
         }
 
 
@@ -80,7 +101,9 @@ def judge(
     *,
     undetermined: Sequence[str],
     is_consistent: bool,
+    joints: Sequence[str] = (),
     alarms: Sequence[str] = (),
+    doubts: Sequence[Doubt] = (),
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -89,14 +112,29 @@ def judge(
         validation: Metrics of each kept recording, by its name.
         undetermined: Base parameters about which the data say nothing.
         is_consistent: Whether the parameters are physically possible.
+        joints: The model's joints; one without a row in any recording is not evaluated.
         alarms: Faults of the recordings that make any result of them wrong.
+        doubts: Why the result may be wrong however well it predicts.
 
     Returns:
-        The verdict. Without a kept recording it is at best "usable".
+        The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
+        of a joint with a doubt.
     """
-    names = dict.fromkeys(
-        joint for m in (identification, *validation.values()) for joint in m.per_joint
-    )
+    found = _judge(identification, validation, undetermined, is_consistent, joints, alarms, doubts)
+    return replace(found, alarms=tuple(alarms), doubts=tuple(doubts))
+
+
+def _judge(
+    identification: Metrics,
+    validation: Mapping[str, Metrics],
+    undetermined: Sequence[str],
+    is_consistent: bool,
+    all_joints: Sequence[str],
+    alarms: Sequence[str],
+    suspicions: Sequence[Doubt],
+) -> Verdict:
+    moved = [joint for m in (identification, *validation.values()) for joint in m.per_joint]
+    names = dict.fromkeys([*all_joints, *moved])
     poor: list[str] = []
     doubts: list[str] = []
     joints: dict[str, JointVerdict] = {}
@@ -113,13 +151,20 @@ def judge(
                 errors.append(_error(measured))
         poor += worse
         doubts += doubt
-        joints[joint] = _joint_verdict(sorted(worse, key=_rank), doubt, errors)
+        doubt += [f"{joint}: {d.message} ({d.code})" for d in suspicions if d.joint == joint]
+        joints[joint] = _joint_verdict(
+            sorted(worse, key=_rank), doubt, errors, is_still=joint not in moved
+        )
+    doubts += _in_words(suspicions)
     poor = [*alarms, *sorted(poor, key=_rank)]
-    missing = sorted(
-        {joint for m in validation.values() for joint in identification.per_joint}
-        - {joint for m in validation.values() for joint in m.per_joint}
-    )
-    if missing:
+    kept = {joint for m in validation.values() for joint in m.per_joint}
+    still = [joint for joint in names if joint not in moved]
+    missing = [joint for joint in names if joint in moved and joint not in kept]
+    if still and identification.per_joint:
+        doubts.append(f"the joints {still} move in no recording: not evaluated")
+    elif still and validation:
+        missing = still
+    if missing and validation:
         doubts.append(f"the joints {missing} do not move in any validation log: not evaluated")
     if undetermined:
         doubts.append(
@@ -146,14 +191,28 @@ def judge(
     )
 
 
-def _joint_verdict(poor: list[str], doubts: list[str], errors: list[float]) -> JointVerdict:
+def _joint_verdict(
+    poor: list[str], doubts: list[str], errors: list[float], *, is_still: bool
+) -> JointVerdict:
     """Return the verdict on a joint from what was found on each kept recording."""
     if not errors:
-        return JointVerdict(NOT_EVALUATED, ("it does not move in any kept recording",))
+        where = "recording" if is_still else "kept recording"
+        return JointVerdict(NOT_EVALUATED, (f"it does not move in any {where}", *doubts))
     if poor or doubts:
         return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
     said = f"predicted within {max(errors):.1f} %, better than by a constant and than by the URDF"
     return JointVerdict("good", (said,))
+
+
+def _in_words(doubts: Sequence[Doubt]) -> list[str]:
+    """Return one sentence per kind of doubt, with the joints that share it."""
+    shared: dict[tuple[str, str], list[str]] = {}
+    for doubt in doubts:
+        shared.setdefault((doubt.message, doubt.code), []).append(doubt.joint)
+    return [
+        f"{', '.join(joints)}: {message} ({code})" if any(joints) else f"{message} ({code})"
+        for (message, code), joints in shared.items()
+    ]
 
 
 def _judge_joint(

@@ -15,6 +15,7 @@ from robotid.checkpoint_inputs import checkpoint_inputs
 from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
+from robotid.doubts import doubts_of, is_outvoted
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.identification import Identification, conclude, identify, structural_mapping
 from robotid.inertial_audit import impossible_inertials
@@ -34,7 +35,7 @@ from robotid.result import (
 from robotid.sidecar import load_identified
 from robotid.urdf import write_urdf
 from robotid.validation import evaluate, prepare
-from robotid.verdict import Finding, judge
+from robotid.verdict import Doubt, Finding, judge
 from robotid.work_plan import WorkPlan
 
 __all__ = ["run_job", "validate_result"]
@@ -82,6 +83,7 @@ def run_job(
             )
         identification, findings = _identify(job, model)
     findings += _fit_findings(identification)
+    identification = replace(identification, doubts=_doubts(job, identification, findings))
     target.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=".robotid-", dir=target))
     try:
@@ -165,8 +167,19 @@ def _with_alarms(
     findings = [*_locked_findings(job, model), *_log_findings(logs)]
     findings += impossible_inertials(model)
     findings += [finding for finding in diagnosis if finding.severity != "note"]
-    messages = tuple(finding.message for finding in alarms)
+    is_robust = job.estimator.robust != "none"
+    messages = tuple(f.message for f in alarms if not (is_robust and is_outvoted(f)))
     return replace(identification, alarms=messages), findings
+
+
+def _doubts(
+    job: Job, identification: Identification, findings: Sequence[Finding]
+) -> tuple[Doubt, ...]:
+    """Return what makes the result doubtful, but for what the user knows better."""
+    kept = [Path(e.recording.log.path).name for e in identification.validation if not e.is_refitted]
+    told = [finding for finding in findings if finding.code not in job.ignore]
+    is_robust = job.estimator.robust != "none"
+    return doubts_of(told, identification.model.joints, kept, is_robust=is_robust)
 
 
 def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
@@ -209,6 +222,13 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         {e.recording.name: e.metrics["estimate"] for e in evaluations},
         undetermined=result["structure"]["undetermined"],
         is_consistent=result["consistency"]["is_consistent"],
+        joints=source.joints,
+        alarms=result["verdict"].get("alarms", ()),
+        doubts=[
+            Doubt(**doubt)
+            for doubt in result["verdict"].get("doubts", ())
+            if doubt["code"] != "repeated_motion"
+        ],
     )
     return {
         "result": str(path),
@@ -295,5 +315,9 @@ def _fit_findings(identification: Identification) -> list[Finding]:
                 f"{wls.per_joint[joint].rmse:.3g} of unconstrained WLS: physics and data disagree "
                 "there; check the torque scale (gains), the drive model and the payload"
             )
-            findings.append(Finding("constraint_costs", "warning", joint, message))
+            evidence = {
+                "error_pct": measured.relative_error_pct or 0.0,
+                "wls_error_pct": wls.per_joint[joint].relative_error_pct or 0.0,
+            }
+            findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
     return findings

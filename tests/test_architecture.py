@@ -23,7 +23,7 @@ FLOORS = {
     "time_stamps compiled columns array_tables csv_files parquet_files bags summaries meshes "
     "ellipsoids",
     3: "uncertainty array_files estimators plant lumping prior rows log_checks signals pieces "
-    "scene",
+    "scene doubts",
     4: "standard_errors regressor excitation tables channel_checks link_geometry "
     "constraint_settings task checkpoint prediction inertial_audit",
     5: "bands link_audit validation sidecar estimator_settings simulation dynamics log_files "

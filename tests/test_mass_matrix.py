@@ -85,7 +85,7 @@ def test_the_second_solver_and_active_bounds_are_reported(ur5, rng):
     assert check["torque_difference"] < 1e-4
     assert abs(check["objective_difference"]) < 1e-5
     (finding,) = consistency_findings(found)
-    assert (finding.code, finding.severity) == ("bound_binds", "note")
+    assert (finding.code, finding.severity) == ("bound_binds", "warning")
     assert "mass forearm_link" in finding.message
 
 

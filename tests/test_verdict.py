@@ -1,5 +1,5 @@
 from robotid.metrics import JointMetrics, Metrics
-from robotid.verdict import judge
+from robotid.verdict import Doubt, judge
 
 
 def joint(error, *, urdf=100.0, constant=True):
@@ -84,3 +84,45 @@ def test_the_worst_of_several_recordings_decides_on_a_joint():
 
 def test_without_a_kept_recording_no_joint_is_evaluated():
     assert verdict(None).joints["a"].status == "not evaluated"
+
+
+def test_a_joint_that_moves_nowhere_is_not_evaluated():
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0),
+        {"val.csv": Metrics({"a": joint(4.0)}, 1.0)},
+        undetermined=(),
+        is_consistent=True,
+        joints=("a", "b"),
+    )
+    assert found.status == "usable"
+    assert found.reasons == ("the joints ['b'] move in no recording: not evaluated",)
+    assert found.joints["b"].status == "not evaluated"
+    assert found.joints["b"].reasons == ("it does not move in any recording",)
+
+
+def test_a_result_that_is_validated_later_knows_only_what_was_kept():
+    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
+    found = judge(Metrics({}, 0.0), kept, undetermined=(), is_consistent=True, joints=("a", "b"))
+    assert found.reasons == ("the joints ['b'] do not move in any validation log: not evaluated",)
+
+
+def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
+    fit = {name: joint(3.0) for name in "abc"}
+    logs = {"val.csv": Metrics({"a": joint(4.0), "b": joint(4.0), "c": joint(60.0)}, 1.0)}
+    doubts = [Doubt("clipped", name, "it is clipped") for name in "bc"]
+    found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=doubts)
+    assert {name: v.status for name, v in found.joints.items()} == {
+        "a": "good", "b": "usable", "c": "poor",
+    }  # fmt: skip
+    assert found.joints["b"].reasons == ("b: it is clipped (clipped)",)
+    assert "b, c: it is clipped (clipped)" in found.reasons
+    assert found.status == "poor"
+    whole = [Doubt("urdf_mismatch", "", "run.csv: masses do not fit")]
+    logs = {"val.csv": Metrics({name: joint(4.0) for name in "abc"}, 1.0)}
+    found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=whole)
+    assert found.status == "usable"
+    assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
+    assert {v.status for v in found.joints.values()} == {"good"}
+    assert found.to_dict()["doubts"] == [
+        {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
+    ]
