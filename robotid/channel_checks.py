@@ -63,23 +63,32 @@ def check_quantisation(log: Log) -> Iterator[Finding]:
 
 
 def check_clipping(log: Log) -> Iterator[Finding]:
-    """Yield torques that stay at their largest value.
+    """Yield torques that stay at their largest value, or at one value throughout.
 
     Args:
         log: The log.
 
     Yields:
-        A warning "clipped" per joint and limit.
+        A warning "clipped" per joint and limit, or "constant_torque" per joint.
     """
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
+        if moving.any() and np.ptp(x) == 0:
+            message = (
+                f"{_name(log)}: the torque of {joint} is {x[0] + 0.0:.6g} in every row while the "
+                "robot moves: the channel is dead, and nothing of this joint's drive can be "
+                f"identified; log tau_{joint}, or leave the joint out"
+            )
+            evidence = {"value": float(x[0]) + 0.0}
+            yield Finding("constant_torque", "warning", f"{_name(log)}: {joint}", message, evidence)
+            continue
         for limit in (float(x.max()), float(x.min())):
             at = (x == limit) & moving
             if at.mean() < _CLIPPED or _longest_run(at) < _PLATEAU or _steps(x) < _COARSE:
                 continue
             message = (
                 f"{_name(log)}: the torque of {joint} stays at its limit {limit:.6g} in "
-                f"{100 * at.mean():.2g} % of the rows while the robot moves: it is clipped, and "
+                f"{100 * at.mean():.3g} % of the rows while the robot moves: it is clipped, and "
                 "those rows are wrong; record a gentler motion or cut them out"
             )
             evidence = {"limit": limit, "share": float(at.mean())}

@@ -59,8 +59,9 @@ def examine(job: Job) -> tuple[Finding, ...]:
 
     Raises:
         ModelError: If the URDF cannot be used.
-        SettingsError: If a setting does not fit.
+        SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
+    alarming([], job.ignore)
     model = job.model()
     findings: list[Finding] = []
     read = _look if is_long(job, (*job.identification, *job.validation)) else _read

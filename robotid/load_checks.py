@@ -197,7 +197,8 @@ def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
         without[j] = 1.0
         if _is_this_robot(model, *model.fit(without)[:2]):
             kept = without
-    return other[kept[other] != 1.0]
+    needed: Array = other[kept[other] != 1.0]
+    return needed
 
 
 def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:

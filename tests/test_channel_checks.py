@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotid.channel_checks import check_spikes
+from robotid.channel_checks import check_clipping, check_spikes
 from robotid.data import Log
 from robotid.job import LogEntry, read_job
 
@@ -64,3 +64,10 @@ def test_joints_at_rest_in_a_real_recording_raise_no_alarm(recordings, monkeypat
     job = read_job(JOB)
     path = recordings / "ur10e" / f"jointwise_{number}.parquet"
     assert "error" not in {f.severity for f in check_spikes(job.read(LogEntry(path), job.model()))}
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, 3.0])
+def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
+    (found,) = check_clipping(log_of_two(tau=np.full(N, value)))
+    assert (found.code, found.where) == ("constant_torque", "run.csv: b")
+    assert f"the torque of b is {abs(value):g} in every row" in found.message
