@@ -24,6 +24,9 @@ _PLATEAU = 5  # rows in a row at the very limit of a channel that are no coincid
 _CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
 _SPIKE = 15.0  # a row this many times farther off its neighbours than usual is a spike
 _BEYOND = 1.5  # ... if it is also farther off than this many times what the channel ever is
+_RESTING = 3.0  # within so many times its noise a channel stays at a value
+_LEAST = {"q": 1e-3, "dq": 0.02}  # [rad or m, rad/s or m/s] less than this is standing still
+_LEAST_TORQUE = 0.01  # of the median joint's torque that is as good as none
 _ABSURD = 5.0  # a spike this many times what the channel ever is cannot be motion
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque tells little
@@ -60,23 +63,32 @@ def check_quantisation(log: Log) -> Iterator[Finding]:
 
 
 def check_clipping(log: Log) -> Iterator[Finding]:
-    """Yield torques that stay at their largest value.
+    """Yield torques that stay at their largest value, or at one value throughout.
 
     Args:
         log: The log.
 
     Yields:
-        A warning "clipped" per joint and limit.
+        A warning "clipped" per joint and limit, or "constant_torque" per joint.
     """
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
+        if moving.any() and np.ptp(x) == 0:
+            message = (
+                f"{_name(log)}: the torque of {joint} is {x[0] + 0.0:.6g} in every row while the "
+                "robot moves: the channel is dead, and nothing of this joint's drive can be "
+                f"identified; log tau_{joint}, or leave the joint out"
+            )
+            evidence = {"value": float(x[0]) + 0.0}
+            yield Finding("constant_torque", "warning", f"{_name(log)}: {joint}", message, evidence)
+            continue
         for limit in (float(x.max()), float(x.min())):
             at = (x == limit) & moving
             if at.mean() < _CLIPPED or _longest_run(at) < _PLATEAU or _steps(x) < _COARSE:
                 continue
             message = (
                 f"{_name(log)}: the torque of {joint} stays at its limit {limit:.6g} in "
-                f"{100 * at.mean():.2g} % of the rows while the robot moves: it is clipped, and "
+                f"{100 * at.mean():.3g} % of the rows while the robot moves: it is clipped, and "
                 "those rows are wrong; record a gentler motion or cut them out"
             )
             evidence = {"limit": limit, "share": float(at.mean())}
@@ -93,8 +105,11 @@ def check_spikes(log: Log) -> Iterator[Finding]:
         "spikes" per channel: an error where they are absurd and strong enough to ruin a fit.
     """
     for kind, values in _channels(log):
-        for joint, x in zip(log.joints, values.T, strict=True):
-            rows, height, reach = _spikes(log.t, x)
+        reaches = [_reach(log.t, x) for x in values.T]
+        least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(reaches)))
+        for joint, x, own in zip(log.joints, values.T, reaches, strict=True):
+            reach = max(own, least)
+            rows, height = _spikes(log.t, x, reach)
             if len(rows) == 0:
                 continue
             energy = float(np.sum(height**2) / np.sum((x - np.median(x)) ** 2))
@@ -235,16 +250,31 @@ def _longest_run(flags: Array) -> int:
     return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
 
 
-def _spikes(t: Array, x: Array) -> tuple[Array, Array, float]:
-    """Return the rows that jump away from their neighbours, how far, and the channel's reach."""
+def _spikes(t: Array, x: Array, reach: float) -> tuple[Array, Array]:
+    """Return the rows that jump away from their neighbours, and how far."""
+    off = x - _without_spikes(x)
+    usual = max(1.48 * float(np.median(np.abs(off))), _noise(t, x))
+    rows = np.flatnonzero(np.abs(off) > max(_SPIKE * usual, _BEYOND * reach))
+    return rows, off[rows]
+
+
+def _reach(t: Array, x: Array) -> float:
+    """Return how far a channel goes from its usual value, spikes apart.
+
+    A joint that rests most of the log is judged by the rest of it.
+    """
+    usual = np.median(x)
+    away = np.abs(_without_spikes(x) - usual)
+    away = away[away > _RESTING * _noise(t, x)]
+    ever = np.abs(x - usual)
+    return max(float(np.quantile(part, 0.995)) for part in (ever, away) if len(part))
+
+
+def _without_spikes(x: Array) -> Array:
     from scipy.ndimage import median_filter
 
-    off = x - median_filter(x, size=5, mode="nearest")
-    usual = max(1.48 * float(np.median(np.abs(off))), _noise(t, x))
-    reach = float(np.quantile(np.abs(x - np.median(x)), 0.995))
-    bound = max(_SPIKE * usual, _BEYOND * reach)
-    rows = np.flatnonzero(np.abs(off) > bound)
-    return rows, off[rows], reach
+    smooth: Array = median_filter(x, size=5, mode="nearest")
+    return smooth
 
 
 def _noise(t: Array, x: Array) -> float:

@@ -42,12 +42,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The words after ``robotid``; those of the process if None.
 
     Returns:
-        Exit code: 0 done, 1 the data or the model do not allow it, 2 wrong usage, 130 Ctrl-C.
+        Exit code: 0 done, 1 the data or the model do not allow it or the doctor found an error
+        that is not ignored, 2 wrong usage, 130 Ctrl-C.
     """
     options = _parser().parse_args(arguments)
     try:
         with shown_log(is_verbose=getattr(options, "verbose", False)):
-            options.run(options)
+            code: int | None = options.run(options)
     except SettingsError as error:
         print_error(error)
         return 2
@@ -57,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         print_error(error, "interrupted")
         return 130
-    return 0
+    return code or 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -288,17 +289,21 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
         print("\nended", file=sys.stderr)
 
 
-def _doctor(options: argparse.Namespace) -> None:
-    from robotid.doctor import examine, findings_to_dict
+def _doctor(options: argparse.Namespace) -> int:
+    from robotid.doctor import alarming, examine, findings_to_dict
 
-    content = findings_to_dict(examine(job_from_flags(options)))
+    job = job_from_flags(options)
+    findings = examine(job)
+    content = findings_to_dict(findings)
+    code = 1 if alarming(findings, job.ignore) else 0
     if options.json:
         print(json.dumps(content, allow_nan=False))
-        return
+        return code
     for severity in ("error", "warning", "note"):
         for finding in content["findings"]:
             if finding["severity"] == severity:
                 print(f"{severity}: {finding['code']}: {finding['message']}")
+    return code
 
 
 def _validate(options: argparse.Namespace) -> None:

@@ -31,10 +31,11 @@ from robotid.log_checks import (
 )
 from robotid.long_jobs import is_long, survey_logs
 from robotid.model import RobotModel
-from robotid.model_checks import check_torque_delay, check_torques
+from robotid.model_checks import check_torques
 from robotid.motion_checks import check_excitation, check_repeated_motion
 from robotid.probe import Probe, smooth_motion, take_probe
 from robotid.signals import SignalSettings
+from robotid.torque_delay import check_torque_delay
 from robotid.verdict import Finding
 
 __all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
@@ -45,7 +46,6 @@ CODES = (
     "torque_order", "torque_sign", "velocity_order",
 )  # fmt: skip
 _RANK = {"error": 0, "warning": 1, "note": 2}
-_FINE = 1500  # instants for the delay of the torque
 
 
 def examine(job: Job) -> tuple[Finding, ...]:
@@ -59,8 +59,9 @@ def examine(job: Job) -> tuple[Finding, ...]:
 
     Raises:
         ModelError: If the URDF cannot be used.
-        SettingsError: If a setting does not fit.
+        SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
+    alarming([], job.ignore)
     model = job.model()
     findings: list[Finding] = []
     read = _look if is_long(job, (*job.identification, *job.validation)) else _read
@@ -199,15 +200,14 @@ def _examine_log(
     findings += check_standstill(log, motion.t, motion.v)
     findings += check_static(log, motion.q, motion.v, model.layout.prismatic)
     probe = take_probe(model, motion)
-    fine = take_probe(model, motion, samples=_FINE)
-    if probe is None or fine is None:
+    if probe is None:
         message = f"{name}: too little moves to judge torques by; record motion of every joint"
         findings.append(Finding("no_motion", "warning", name, message))
         return motion, None
     torques = list(check_torques(probe, name))
     findings += torques
     if not any(finding.severity == "error" for finding in torques):
-        findings += check_torque_delay(fine, signals.cutoff, name)
+        findings += check_torque_delay(model, motion, signals, name)
     return motion, probe
 
 

@@ -1,17 +1,16 @@
-"""Do the torques fit the model: signs, order of columns, gravity, positions, delay, excitation."""
+"""Do the torques fit the model: signs, order of columns, gravity, positions."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from robotid._typing import Array
 from robotid.explanations import Explanation, explanations
 from robotid.load_checks import check_loads
 from robotid.probe import Probe
 from robotid.verdict import Finding
 
-__all__ = ["check_torque_delay", "check_torques"]
+__all__ = ["check_torques"]
 
 _CERTAIN = 2.5  # gain in the logarithm of the unexplained share, a factor 12, that is no chance
 _EXPLAINED = 0.2  # a reading that explains no torque better than this proves nothing
@@ -21,12 +20,6 @@ _TILT = 5.0  # [deg] gravity farther than this off is worth a warning
 _TURNED = 30.0  # [deg] ... and farther than this gives wrong answers
 _HINT = 0.7  # gain from which a tilt is believed
 _UNEXPLAINED = 0.25  # share of a torque's variance that no physics explains
-_LONGEST = 0.1  # [s] delays are sought up to this
-_WIDTH = 0.07  # [s] about the delay, where the misfit is still a parabola
-_FINEST = 0.001  # [s] an estimate is not better than this
-_FEW = 100  # rows from which a joint has a say in the delay
-_LATE = 0.01  # [s] a shorter delay of the torque is within the errors of friction models
-_HELD = 0.75  # [samples] ... or comes from a torque that is held from row to row
 
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
@@ -54,48 +47,6 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     if not found:
         yield from check_loads(probe, loaded.share, name)
         yield from _unexplained(probe, loaded, name)
-
-
-def check_torque_delay(probe: Probe, cutoff: float | None, name: str) -> Iterator[Finding]:
-    """Yield how late the torque is against the position.
-
-    The delay minimises what the regressor leaves of the delayed torque, rows near a change of
-    direction apart; its uncertainty is the jackknife's over the joints.
-
-    Args:
-        probe: The motion.
-        cutoff: Cut-off of the filter that smoothed it [Hz], or None.
-        name: What the log is called.
-
-    Yields:
-        At most one "torque_delay".
-    """
-    delays = np.linspace(-_LONGEST, _LONGEST, 41)
-    torques = np.array([probe.torque_after(d) for d in delays])  # (D, N, n)
-    width = 1.0 / (cutoff or 20.0)
-    curves = [_residual_curve(probe, torques, j, width) for j in range(probe.tau.shape[1])]
-    told = np.array([curve for curve in curves if curve is not None])
-    if len(told) < 2:
-        return
-    delay = _centre(delays, told)
-    without = [_centre(delays, np.delete(told, j, axis=0)) for j in range(len(told))]
-    if not np.isfinite([delay, *without]).all():
-        return
-    n = len(told)
-    error = float(np.sqrt((n - 1) / n * np.sum((np.array(without) - np.mean(without)) ** 2)))
-    error = max(error, _FINEST)
-    step = float(np.median(np.diff(probe.motion.t)))
-    late = abs(delay) > max(_LATE, _HELD * step, 3 * error)
-    message = (
-        f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
-        + (
-            f"; mend the logger's clock, or state [signals] torque_delay = {delay:.4f}"
-            if late
-            else ", no more than unmodelled friction may feign; nothing needs doing"
-        )
-    )
-    evidence = {"delay": delay, "std_error": error}
-    yield Finding("torque_delay", "warning" if late else "note", name, message, evidence)
 
 
 def _no_finding(*_: object) -> Iterator[Finding]:
@@ -234,57 +185,3 @@ def _unexplained(probe: Probe, stated: Explanation, name: str) -> Iterator[Findi
         )
         where = f"{name}: {joint}"
         yield Finding("unexplained_torque", "warning", where, message, {"share": share})
-
-
-def _residual_curve(probe: Probe, torques: Array, j: int, width: float) -> Array | None:
-    """Return log of what is unexplained of joint j's torque at each delay, shape (D,)."""
-    rows = _steady_rows(probe, j, width)
-    if rows.sum() < _FEW:
-        return None
-    tau = torques[:, rows, j]
-    tau = tau - tau.mean(axis=1, keepdims=True)
-    size = np.einsum("dk,dk->d", tau, tau)
-    v = probe.v[:, j]
-    top = float(np.abs(v).max())
-    if size.min() <= 0:
-        return None
-    # friction of any odd curve of the speed, so that it is not taken for a delay
-    friction = np.column_stack([np.tanh(v / (0.1 * top)), np.tanh(v / (0.3 * top)), v * np.abs(v)])
-    carried = probe.model.support()[j, : probe.model.layout.n_inertial]
-    X = np.hstack([probe.regressor()[:, j][:, carried], probe.drive(j), friction])[rows]
-    length = np.linalg.norm(X, axis=0)
-    U, s, _ = np.linalg.svd(X / np.where(length > 0, length, 1.0), full_matrices=False)
-    Q = U[:, s > 1e-5 * s[0]]
-    share = 1 - np.einsum("db,db->d", tau @ Q, tau @ Q) / size
-    curve: Array = np.log(np.maximum(share, 0.0) + 1e-5)
-    return curve
-
-
-def _steady_rows(probe: Probe, j: int, width: float) -> Array:
-    """Return the rows farther than a width from a change of joint j's direction, (N,), bool."""
-    t, sign = probe.motion.t, np.sign(probe.motion.v[:, j])
-    turns = t[np.flatnonzero(np.diff(sign) != 0)]
-    at = t[probe.rows]
-    bounds = np.concatenate([[-np.inf], turns, [np.inf]])
-    after = np.searchsorted(bounds, at)
-    distance = np.minimum(at - bounds[after - 1], bounds[after] - at)
-    steady: Array = (distance > width) & (np.abs(probe.v[:, j]) > 0.02)
-    return steady
-
-
-def _centre(delays: Array, curves: Array) -> float:
-    """Return where the joints' curves are smallest together, NaN if nowhere inside.
-
-    Each curve is taken relative to its smallest value, and a parabola is fitted to the sum, once
-    over all delays and once near that centre: noise makes ripples that a single minimum follows.
-    """
-    total = np.exp(curves - curves.min(axis=1, keepdims=True)).sum(axis=0)
-    centre, width = 0.0, np.inf
-    for _ in range(2):
-        near = np.abs(delays - centre) <= width
-        square, slope, _ = np.polyfit(delays[near], total[near], 2)
-        centre = -slope / (2 * square) if square > 0 else np.nan
-        if not abs(centre) < _LONGEST:
-            return float("nan")
-        width = _WIDTH
-    return float(centre)

@@ -12,7 +12,9 @@ from robotid.signals import SignalSettings, process, resolve, unwrap
 
 __all__ = ["Probe", "smooth_motion", "take_probe"]
 
-_MARGIN = 0.15  # [s] rows this near to the end of a stretch are left out: delays shift into them
+_MARGIN = (
+    0.15  # [s] rows this near to the end of a stretch are left out: the filter is not settled there
+)
 _STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
 
 
@@ -78,18 +80,6 @@ class Probe:
         friction = np.tanh(v / _STILL)
         own = np.column_stack([self.a[:, j], v, friction, one, -one])
         return np.hstack([own, self.drives[:, j]])
-
-    def torque_after(self, delay: float) -> Array:
-        """Return the torque that was logged a delay later than the motion.
-
-        Args:
-            delay: The delay [s]; smaller than the margin kept at the ends of each stretch.
-
-        Returns:
-            Torques, shape (N, n) [N m or N].
-        """
-        t = self.motion.t[self.rows] + delay
-        return np.column_stack([np.interp(t, self.motion.t, tau) for tau in self.motion.tau.T])
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion.

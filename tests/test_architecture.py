@@ -28,7 +28,8 @@ FLOORS = {
     "constraint_settings task checkpoint prediction inertial_audit",
     5: "bands link_audit validation sidecar estimator_settings simulation dynamics log_files "
     "probe mass_matrix reduction",
-    6: "recordings closed_loop conversion explanations load_checks motion_checks cluster residuals",
+    6: "recordings closed_loop conversion explanations load_checks motion_checks cluster residuals "
+    "torque_delay",
     7: "robust urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks long_logs work_plan",
     8: "identification diagnosis_plots",

@@ -205,16 +205,19 @@ URDF = str(example_urdf("ur5_robot.urdf"))
 
 
 def test_doctor_prints_findings_as_json_and_as_text(wrong_sign, tmp_path, capsys):
-    assert main(["doctor", URDF, wrong_sign, "--json"]) == 0
+    assert main(["doctor", URDF, wrong_sign, "--json"]) == 1
     (first, *_) = json.loads(capsys.readouterr().out)["findings"]
     assert set(first) == {"code", "severity", "where", "message", "evidence"}
     assert (first["code"], first["severity"]) == ("torque_sign", "error")
-    assert main(["doctor", URDF, wrong_sign]) == 0
+    assert main(["doctor", URDF, wrong_sign]) == 1
     assert capsys.readouterr().out.startswith("error: torque_sign: run.csv: the torque of elbow")
     job = tmp_path / "job.toml"
     job.write_text(f'urdf = "{URDF}"\n[[identification]]\nlog = "{wrong_sign}"\n')
-    assert main(["doctor", str(job)]) == 0
+    assert main(["doctor", str(job)]) == 1
     assert "torque_sign" in capsys.readouterr().out
+    assert main(["doctor", str(job), "--ignore", "torque_sign"]) == 0
+    assert main(["doctor", str(job), "--ignore", "torque_sgn"]) == 2
+    assert main(["doctor", URDF, str(tmp_path / "none.csv")]) == 1
 
 
 def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
