@@ -1,5 +1,6 @@
 """The simulated plant: forward dynamics with drives, a tracking controller, sensor noise -> Log."""
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +16,8 @@ from robotid.plant import RobotPlant
 __all__ = ["Motion", "Noise", "another_robot", "simulate"]
 
 _BANDWIDTH = 20.0  # [rad/s] of the tracking controller
-_SUBSTEPS = 2  # Runge-Kutta steps per sample
+_SUBSTEPS = 2  # Runge-Kutta steps per sample, at least
+_LONGEST_STEP = 0.005  # [s] of Runge-Kutta, whatever the rate of the log
 
 
 class Motion(Protocol):
@@ -73,17 +75,18 @@ def simulate(
     """
     plant = _TrackedPlant(model, pi)
     t = np.arange(round(duration * rate) + 1) / rate
-    h = 1.0 / rate / _SUBSTEPS
-    q_r, v_r, a_r = motion.evaluate(h / 2 * np.arange(2 * _SUBSTEPS * (len(t) - 1) + 1))
+    substeps = max(_SUBSTEPS, math.ceil(1.0 / rate / _LONGEST_STEP - 1e-9))
+    h = 1.0 / rate / substeps
+    q_r, v_r, a_r = motion.evaluate(h / 2 * np.arange(2 * substeps * (len(t) - 1) + 1))
     state = np.concatenate([q_r[0], v_r[0]])
     n = len(model.joints)
     q, v, tau = (np.empty((len(t), n)) for _ in range(3))
     for k in range(len(t)):
-        first = 2 * _SUBSTEPS * k  # index on the grid of half steps
+        first = 2 * substeps * k  # index on the grid of half steps
         q[k], v[k] = state[:n], state[n:]
         tau[k] = plant.torque(state, q_r[first], v_r[first], a_r[first])
         if k + 1 < len(t):
-            for step in range(_SUBSTEPS):
+            for step in range(substeps):
                 i = first + 2 * step
                 state = plant.advance(state, q_r[i : i + 3], v_r[i : i + 3], a_r[i : i + 3], h)
         if not np.isfinite(state).all():
