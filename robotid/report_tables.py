@@ -145,12 +145,33 @@ def open_section(found: Identification) -> str:
     wls, layout = found.wls, found.model.layout
     kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
-        f"<p>The data determine {wls.rank} of {len(found.base)} base parameters; condition number "
-        f"{wls.condition:.3g} (columns scaled to unit norm).</p>\n"
-        + _listed("Base parameters about which the data say nothing", found.estimate.undetermined)
+        f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
+        f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
+        + _not_told_apart(found)
         + _listed("Parameters that no motion can show", found.mapping.unidentifiable)
         + _combinations(found)
         + _listed("Standard parameters that remain as the URDF has them, or nearly", kept)
+    )
+
+
+def _not_told_apart(found: Identification) -> str:
+    """Return which base parameters the data do not tell apart, and what of them they determine."""
+    rows = [
+        [
+            Cell(", ".join(code(name).html for name in group.names), "code"),
+            Cell("<br>".join(code(str(c)).html for c in group.combinations) or "nothing", "code"),
+        ]
+        for group in found.determination.merged
+    ]
+    title = "Base parameters that the data do not determine by themselves"
+    if not rows:
+        return f'<h3>{title}</h3>\n<p class="code">none</p>\n'
+    return (
+        f"<h3>{title}</h3>\n<p>A direction counts as determined if the data shrink its plausible "
+        "spread by a tenth or more. Of the parameters in a row only the sums beside them are "
+        "determined, in SI units; terms of less than 5 % of the largest, each times its spread, "
+        "are left out. result.json has all terms.</p>\n"
+        + table(title, ["parameters", "only determined"], rows)
     )
 
 

@@ -87,7 +87,7 @@ def judge(
     Args:
         identification: Metrics over the fitted recordings.
         validation: Metrics of each kept recording, by its name.
-        undetermined: Base parameters about which the data say nothing.
+        undetermined: Base parameters that the data do not determine by themselves.
         is_consistent: Whether the parameters are physically possible.
         alarms: Faults of the recordings that make any result of them wrong.
 
@@ -123,7 +123,8 @@ def judge(
         doubts.append(f"the joints {missing} do not move in any validation log: not evaluated")
     if undetermined:
         doubts.append(
-            f"the data say nothing about {len(undetermined)} base parameters: {list(undetermined)}"
+            f"the data do not determine {len(undetermined)} base parameters by themselves: "
+            f"{list(undetermined)}"
         )
     if not is_consistent:
         doubts.append(
