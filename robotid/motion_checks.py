@@ -27,7 +27,8 @@ _SHARE = 0.3  # of the validation motion that has been seen before
 _INSTANTS = 300
 _ROWS = 5000  # of a log, that tell what its motion determines
 _ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion could be better
-_RICHER = "of all joints together, back and forth and as fast as they may"
+_RICHER = "a richer motion, of all joints together, back and forth and as fast as they may,"
+_LOST = "the motion is rich, but this hardly loads a joint and is lost in the noise"
 
 
 def check_repeated_motion(
@@ -84,7 +85,8 @@ def check_excitation(
         name: What the logs are called.
 
     Yields:
-        One "excitation": a warning if some are not determined by themselves, else a note.
+        One "excitation": a warning if the motion leaves some open, a note if they are lost in the
+        noise of a rich one or all are determined.
     """
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [_every(step, motion) for motion in motions]
@@ -116,16 +118,18 @@ def check_excitation(
         f"{name}: the motion determines {known.rank} of {len(mapping.K)} base parameters "
         f"(condition number {found.condition:.3g})"
     )
+    is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
     if known.groups:
-        message += f": {known.in_words()}; record a richer motion, {_RICHER}"
-    elif found.condition > _ILL_CONDITIONED:
-        message += (
-            f"; the least known of their sums keeps {100 * known.shrinkage[-1]:.2g} % of its "
-            f"plausible spread; a richer motion would do better, {_RICHER}"
-        )
+        advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
+        message += f": {known.in_words()}; {advice}"
+    elif is_poor:
+        left = 100 * known.shrinkage[-1]
+        message += f"; the least known sum keeps {left:.2g} % of its plausible spread: {_RICHER}"
+        message += " would tell more"
     else:
         message += "; nothing needs doing"
-    yield Finding("excitation", "warning" if known.groups else "note", name, message, evidence)
+    severity = "warning" if known.groups and is_poor else "note"
+    yield Finding("excitation", severity, name, message, evidence)
 
 
 def _every(step: int, motion: Trajectory) -> Trajectory:

@@ -20,14 +20,14 @@ EXACT = SignalSettings(cutoff=None, trim=0.0)
 NOISE = 0.1  # [N m]
 
 
-def moved(model, change, *, samples=600, pi=None):
+def moved(model, change, *, samples=600, noise=NOISE):
     """Return a log of a motion that was changed, with its own torques and noise."""
     rng = np.random.default_rng(1)
     log = exact_log(model, truth(model), rng, samples=samples)
     q, v, a = (np.array(x) for x in (log.q, log.v, log.a))
     change(log.t, q, v, a)
     tau = (joint_torque_regressor(model, q, v, a) @ truth(model)).reshape(q.shape)
-    tau += NOISE * rng.standard_normal(q.shape)
+    tau += noise * rng.standard_normal(q.shape)
     return Log(t=log.t, q=q, v=v, a=a, tau=tau, joints=log.joints)
 
 
@@ -134,8 +134,8 @@ def test_moving_along_a_weak_direction_changes_no_torque_and_no_named_sum(ur5, w
             terms = [places[name] for name in c.names]
             size = np.abs(np.array(c.coefficients) * known.spread[terms]).max()
             assert abs(np.array(c.coefficients) @ change[terms]) < 0.01 * size
-    wrong = known.spread * np.abs(known.weak[:, 0] + 1e-3)  # any other direction shows
-    assert np.abs(W @ wrong).max() > 1.0
+    strong = np.ones(58) - known.weak @ known.weak.sum(axis=0)  # any other direction shows
+    assert np.abs(W @ (known.spread * strong)).max() > 1.0
 
 
 def test_a_joint_that_turns_one_way_leaves_friction_and_offset_a_sum(pan):
@@ -207,7 +207,18 @@ def test_an_ill_conditioned_motion_is_not_passed_over(ur5, monkeypatch):
     monkeypatch.setattr("robotid.motion_checks._ILL_CONDITIONED", 1.0)
     (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
     assert "nothing needs doing" not in finding.message
-    assert "a richer motion would do better" in finding.message
+    assert finding.severity == "note"
+    assert "% of its plausible spread: a richer motion, of all joints" in finding.message
+
+
+def test_what_is_lost_in_the_noise_of_a_rich_motion_is_a_note(ur5):
+    log = moved(ur5, lambda *motion: None, noise=10.0)
+    motion, mapping = process(log, resolve(log, EXACT)), structural_mapping(ur5)
+    (finding,) = check_excitation(ur5, mapping, [motion], EXACT, "run.csv")
+    assert finding.severity == "note"
+    assert finding.evidence["rank"] < 58
+    assert finding.evidence["condition"] < 100
+    assert "is lost in the noise: faster motion would show more" in finding.message
 
 
 def test_too_few_rows_are_said(ur5):
