@@ -156,23 +156,25 @@ def open_section(found: Identification) -> str:
 
 def _not_told_apart(found: Identification) -> str:
     """Return which base parameters the data do not tell apart, and what of them they determine."""
-    rows = [
-        [
-            Cell(", ".join(code(name).html for name in group.names), "code"),
-            Cell("<br>".join(code(str(c)).html for c in group.combinations) or "nothing", "code"),
-        ]
-        for group in found.determination.merged
-    ]
+    groups = found.determination.merged
     title = "Base parameters that the data do not determine by themselves"
-    if not rows:
-        return f'<h3>{title}</h3>\n<p class="code">none</p>\n'
-    return (
+    if not groups:
+        return _listed(title, ())
+    parts = [
         f"<h3>{title}</h3>\n<p>A direction counts as determined if the data shrink its plausible "
-        "spread by a tenth or more. Of the parameters in a row only the sums beside them are "
-        "determined, in SI units; terms of less than 5 % of the largest, each times its spread, "
-        "are left out. result.json has all terms.</p>\n"
-        + table(title, ["parameters", "only determined"], rows)
-    )
+        "spread by a tenth or more. Factors are in SI units; terms of less than 5 % of the largest "
+        "one, each times its spread, are left out. result.json has all.</p>\n"
+    ]
+    for group in groups:
+        names = ", ".join(code(name).html for name in group.names)
+        sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
+        parts.append(
+            f'<p>Of</p>\n<p class="code">{names}</p>\n<p>only this is determined:</p>\n'
+            f'<p class="code">{sums}</p>\n'
+            if sums
+            else f'<p>Nothing is determined of</p>\n<p class="code">{names}</p>\n'
+        )
+    return "".join(parts)
 
 
 def _combinations(found: Identification) -> str:
