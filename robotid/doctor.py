@@ -97,7 +97,8 @@ def diagnose(
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     if probes:
         names = ", ".join(_name(log) for log in fitted)
-        findings += check_excitation(structural_mapping(model), probes, names)
+        moving = [probe.motion for probe in probes]
+        findings += check_excitation(model, structural_mapping(model), moving, signals, names)
     return _sorted(findings)
 
 

@@ -48,15 +48,18 @@ class RankDeficientError(RobotIdError):
     Attributes:
         rank: Number of parameters that the data determine.
         undetermined: Names of the parameters they leave open.
+        total: Number of parameters.
     """
 
-    def __init__(self, rank: int, undetermined: Sequence[str], total: int) -> None:
+    def __init__(self, rank: int, undetermined: Sequence[str], total: int, words: str = "") -> None:
         self.rank = rank
         self.undetermined = tuple(undetermined)
+        self.total = total
         super().__init__(
             f"the data excite {rank} of {total} base parameters; undetermined: "
-            f"{list(self.undetermined)}. Record a richer trajectory, or use the "
-            "'consistent' estimator, which keeps the URDF's value where the data say nothing"
+            f"{list(self.undetermined)}{f' ({words})' if words else ''}. Record a richer "
+            "trajectory, or use the 'consistent' estimator, which keeps the URDF's value where the "
+            "data say nothing"
         )
 
 

@@ -10,6 +10,7 @@ from robotid._typing import Array
 from robotid.bands import TorqueBand, torque_band
 from robotid.base_parameters import BaseMapping, base_mapping
 from robotid.data import Log
+from robotid.determination import Determination, base_spread, determine
 from robotid.estimator_settings import (
     ESTIMATORS,
     RECURSIVE,
@@ -20,7 +21,7 @@ from robotid.estimator_settings import (
 )
 from robotid.estimators import WLS, Consistent, Estimate
 from robotid.estimators.log_cholesky import LogCholesky
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, RankDeficientError
 from robotid.factors import Factors
 from robotid.lumping import held_parameters
 from robotid.mass_matrix import MassMatrixCheck, check_mass_matrix
@@ -33,7 +34,7 @@ from robotid.recordings import LoadedRecordings, Recordings
 from robotid.regressor import random_regressor
 from robotid.robust import Outlier, find_outliers, reweigh
 from robotid.signals import SignalSettings
-from robotid.standard_errors import Redraws, StandardErrors, measured_errors
+from robotid.standard_errors import Redraws, StandardErrors, measured_errors, with_wls_errors
 from robotid.summaries import identification_html, identification_line, identification_text
 from robotid.validation import Evaluation, pool, prepare
 from robotid.verdict import Doubt, Verdict, judge
@@ -73,6 +74,7 @@ class Identification:
         validation: The same of the recordings that were kept apart.
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
+        determination: Which base parameters the fitted rows determine.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
         doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
@@ -93,6 +95,7 @@ class Identification:
     validation: tuple[Evaluation, ...]
     errors: StandardErrors
     factors: Factors
+    determination: Determination
     alarms: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     report: str = ""
@@ -144,8 +147,7 @@ class Identification:
         names = np.where(
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
-        pinned = self.estimate.details.get("pinned", ())
-        kept = [name.rsplit(".", 1)[0] in pinned for name in self.model.layout.names]
+        kept = self.model.layout.owned_by(self.estimate.details.get("pinned", ()))
         return tuple(np.where(kept, "prior", names).tolist())
 
     @property
@@ -200,7 +202,7 @@ class Identification:
         return judge(
             self.metrics(),
             {e.recording.name: e.metrics["estimate"] for e in kept},
-            undetermined=self.estimate.undetermined,
+            undetermined=self.determination.undetermined,
             is_consistent=self.is_consistent,
             joints=self.model.joints,
             alarms=self.alarms,
@@ -274,10 +276,16 @@ def conclude(
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Prior(prior, spread, share, rough.sigma, stretches)
-    estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
+    known = model.layout.owned_by(choice.constraints.get("pinned", ()))
+    rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
+    determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
+    try:
+        estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
+    except RankDeficientError as error:
+        raise determination.refusal(error) from error
     wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
     if choice.name in _GRADIENT and not choice.physical:
-        estimate = _with_spread(estimate, wls)
+        estimate = with_wls_errors(estimate, wls)
     else:
         sigma = np.ones_like(rough.sigma) if choice.name == "ols" else rough.sigma
         estimate, errors = measured_errors(
@@ -315,6 +323,7 @@ def conclude(
         validation=kept,
         errors=errors,
         factors=factors,
+        determination=determination,
     )
 
 
@@ -362,28 +371,9 @@ def _run(
     if not choice.physical:
         return estimate, None
     if choice.name in _GRADIENT:
-        estimate = _with_spread(estimate, wls)
+        estimate = with_wls_errors(estimate, wls)
     fit = consistent_fit(choice, model, mapping, prior)
     return fit.project(estimate), fit
-
-
-def _with_spread(estimate: Estimate, wls: Estimate) -> Estimate:
-    """Return a gradient method's estimate with the covariance that the factors know.
-
-    It ends beside the minimum of least squares: its mean square error is the covariance of that
-    minimum plus the square of the distance to it, which is measured.
-    """
-    distance = estimate.theta - wls.theta
-    covariance = wls.covariance + np.outer(distance, distance)
-    reason = "standard errors are those of wls plus the distance to it"
-    return replace(
-        estimate,
-        covariance=covariance,
-        rank=wls.rank,
-        condition=wls.condition,
-        undetermined=wls.undetermined,
-        message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
-    )
 
 
 def _standard(

@@ -1,17 +1,22 @@
 """Are the motions of several logs fit for their roles: rich to fit, new to validate with."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.base_parameters import BaseMapping
 from robotid.data import Trajectory
+from robotid.determination import base_spread, determine
 from robotid.estimators import WLS
 from robotid.exceptions import RobotIdError
 from robotid.factors import compress, merge
-from robotid.probe import Probe
-from robotid.regressor import build_problem
+from robotid.model import RobotModel
+from robotid.prior import spread_of
+from robotid.recordings import base_problem, independent_share
+from robotid.signals import SignalSettings
+from robotid.validation import row_mask
 from robotid.verdict import Finding
 
 __all__ = ["check_excitation", "check_repeated_motion"]
@@ -20,6 +25,10 @@ _AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] positions compared: the same now and
 _NEAR = 0.02  # of the range of each joint
 _SHARE = 0.3  # of the validation motion that has been seen before
 _INSTANTS = 300
+_ROWS = 5000  # of a log, that tell what its motion determines
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion could be better
+_RICHER = "a richer motion, of all joints together, back and forth and as fast as they may,"
+_LOST = "the motion is rich, but this hardly loads a joint and is lost in the noise"
 
 
 def check_repeated_motion(
@@ -56,47 +65,90 @@ def check_repeated_motion(
     yield Finding("repeated_motion", "warning", name, message, {"share": share})
 
 
-def check_excitation(mapping: BaseMapping, probes: Sequence[Probe], name: str) -> Iterator[Finding]:
-    """Yield which base parameters the fitted motions leave open.
+def check_excitation(
+    model: RobotModel,
+    mapping: BaseMapping,
+    motions: Sequence[Trajectory],
+    signals: SignalSettings,
+    name: str,
+) -> Iterator[Finding]:
+    """Yield which base parameters the fitted motions determine.
+
+    By :func:`robotid.determination.determine`, as an identification does; of long logs a share of
+    the rows stands for all.
 
     Args:
-        mapping: The structural base parameters.
-        probes: The fitted motions.
+        model: The robot.
+        mapping: Its structural base parameters.
+        motions: Smooth motions that are fitted.
+        signals: How the job smooths, and which rows it leaves out.
         name: What the logs are called.
 
     Yields:
-        One "excitation": a warning if some are left open, else a note.
+        One "excitation": a warning if the motion leaves some open, a note if they are lost in the
+        noise of a rich one or all are determined.
     """
-    problems = [build_problem(p.model, _at_rows(p)) for p in probes]
+    prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
+    thinned = [_every(step, motion) for motion in motions]
     try:
-        factors = merge([compress(mapping.reduce(problem)) for problem in problems])
-        prior = mapping.to_base(probes[0].model.standard_parameters())
-        found = WLS(prior=prior).fit(factors)
-    except RobotIdError:
+        factors = merge(
+            [
+                compress(base_problem(model, mapping, m, row_mask(model, m, signals.min_velocity)))
+                for m in thinned
+            ]
+        )
+        found = WLS(prior=mapping.to_base(prior)).fit(factors)
+    except RobotIdError as error:
+        message = f"{name}: which parameters the motion determines cannot be told: {error}"
+        yield Finding("excitation", "warning", name, message)
         return
-    evidence = {"rank": float(found.rank), "base": float(len(mapping.K))}
+    share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
+    squares = np.sum([motion.squares for motion in thinned], axis=0)
+    spread = spread_of(model, squares, sum(len(motion.t) for motion in thinned))
+    rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
+    known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
+    evidence = {
+        "rank": float(known.rank),
+        "base": float(len(mapping.K)),
+        "weakest": float(known.shrinkage[-1]),
+    }
     if np.isfinite(found.condition):
         evidence["condition"] = float(found.condition)
-    left = list(found.undetermined)
     message = (
-        f"{name}: the motion excites {found.rank} of {len(mapping.K)} base parameters (condition "
-        f"number {found.condition:.3g})"
+        f"{name}: the motion determines {known.rank} of {len(mapping.K)} base parameters "
+        f"(condition number {found.condition:.3g})"
     )
-    message += (
-        f"; it leaves open {left}: record a richer motion, of all joints together and as fast as "
-        "they may"
-        if left
-        else "; nothing needs doing"
-    )
-    yield Finding("excitation", "warning" if left else "note", name, message, evidence)
+    is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
+    if known.groups:
+        advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
+        message += f": {known.in_words()}; {advice}"
+    elif is_poor:
+        left = 100 * known.shrinkage[-1]
+        message += f"; the least known sum keeps {left:.2g} % of its plausible spread: {_RICHER}"
+        message += " would tell more"
+    else:
+        message += "; nothing needs doing"
+    severity = "warning" if known.groups and is_poor else "note"
+    yield Finding("excitation", severity, name, message, evidence)
 
 
-def _at_rows(probe: Probe) -> Trajectory:
-    m, rows = probe.motion, probe.rows
+def _every(step: int, motion: Trajectory) -> Trajectory:
+    """Return every so many rows of a motion."""
+    if step == 1:
+        return motion
+    rows = slice(None, None, step)
+    direction = None if motion.direction is None else motion.direction[rows]
     return Trajectory(
-        t=m.t[rows], q=probe.q, v=probe.v, a=probe.a, tau=probe.tau, joints=m.joints, rate=None,
-        segment=m.segment[rows],
-    )  # fmt: skip
+        t=motion.t[rows],
+        q=motion.q[rows],
+        v=motion.v[rows],
+        a=motion.a[rows],
+        tau=motion.tau[rows],
+        joints=motion.joints,
+        rate=None,
+        segment=motion.segment[rows],
+        direction=direction,
+    )
 
 
 def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:

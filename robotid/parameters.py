@@ -123,6 +123,17 @@ class ParameterLayout:
         """Unit of each of the p parameters."""
         return tuple(self._unit(*name.rsplit(".", 1)) for name in self.names)
 
+    def owned_by(self, owners: Sequence[str]) -> Array:
+        """Return which parameters belong to some bodies or joints.
+
+        Args:
+            owners: Their names.
+
+        Returns:
+            Flags, shape (p,), bool.
+        """
+        return np.isin([name.rsplit(".", 1)[0] for name in self.names], list(owners))
+
     def scales(self, length: float) -> Array:
         """Return the magnitude 1 kg length^k of each parameter, which makes columns comparable.
 

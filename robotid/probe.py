@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array
+from robotid.columns import friction_speeds
 from robotid.data import Log, Trajectory
 from robotid.model import RobotModel
 from robotid.regressor import joint_torque_regressor
@@ -123,7 +124,7 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
     free = np.array([joint.turns_freely for joint in model.limits])
     log = unwrap(replace(log, v=None, a=None), free)
     own = replace(settings, velocity="differentiated", acceleration="differentiated")
-    return process(log, resolve(log, own))
+    return process(log, resolve(log, own), friction_speeds(model.layout))
 
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:

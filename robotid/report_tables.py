@@ -151,13 +151,36 @@ def open_section(found: Identification) -> str:
     wls, layout = found.wls, found.model.layout
     kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
-        f"<p>The data determine {wls.rank} of {len(found.base)} base parameters; condition number "
-        f"{wls.condition:.3g} (columns scaled to unit norm).</p>\n"
-        + _listed("Base parameters about which the data say nothing", found.estimate.undetermined)
+        f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
+        f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
+        + _not_told_apart(found)
         + _listed("Parameters that no motion can show", found.mapping.unidentifiable)
         + _combinations(found)
         + _listed("Standard parameters that remain as the URDF has them, or nearly", kept)
     )
+
+
+def _not_told_apart(found: Identification) -> str:
+    """Return which base parameters the data do not tell apart, and what of them they determine."""
+    groups = found.determination.merged
+    title = "Base parameters that the data do not determine by themselves"
+    if not groups:
+        return _listed(title, ())
+    parts = [
+        f"<h3>{title}</h3>\n<p>A direction counts as determined if the data shrink its plausible "
+        "spread by a tenth or more. Factors are in SI units; terms of less than 5 % of the largest "
+        "one, each times its spread, are left out. result.json has all.</p>\n"
+    ]
+    for group in groups:
+        names = ", ".join(code(name).html for name in group.names)
+        sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
+        parts.append(
+            f'<p>Of</p>\n<p class="code">{names}</p>\n<p>only this is determined:</p>\n'
+            f'<p class="code">{sums}</p>\n'
+            if sums
+            else f'<p>Nothing is determined of</p>\n<p class="code">{names}</p>\n'
+        )
+    return "".join(parts)
 
 
 def _combinations(found: Identification) -> str:

@@ -66,9 +66,10 @@ def build_result(
             "standard": model.layout.n_inertial,
             "base_inertial": len(structural_mapping(model, inertial_only=True).K),
             "base": len(identification.base),
-            "rank": identification.wls.rank,
+            "rank": identification.determination.rank,
             "condition": _finite(identification.wls.condition),
-            "undetermined": list(identification.estimate.undetermined),
+            "undetermined": list(identification.determination.undetermined),
+            "not_told_apart": identification.determination.to_list(),
         },
         "base_parameters": _base_parameters(identification),
         "uncertainty": {

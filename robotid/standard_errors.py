@@ -12,7 +12,7 @@ from robotid.exceptions import NotConvergedError
 from robotid.factors import Factors
 from robotid.uncertainty import FEWEST, Scatter, quantile, scatter
 
-__all__ = ["Redraws", "StandardErrors", "measured_errors"]
+__all__ = ["Redraws", "StandardErrors", "measured_errors", "with_wls_errors"]
 
 _LEAST_SOLVED = 0.8  # share of the redrawn fits below which they tell nothing
 
@@ -128,6 +128,32 @@ def measured_errors(
     if redraws is not None and binds:
         return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
     return estimate, errors
+
+
+def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
+    """Return a gradient method's estimate with the covariance that the factors know.
+
+    It ends beside the minimum of least squares: its mean square error is the covariance of that
+    minimum plus the square of the distance to it, which is measured.
+
+    Args:
+        estimate: Base parameters, shape (b,).
+        wls: Weighted least squares of the same rows.
+
+    Returns:
+        The estimate, with what weighted least squares says of the data.
+    """
+    distance = estimate.theta - wls.theta
+    covariance = wls.covariance + np.outer(distance, distance)
+    reason = "standard errors are those of wls plus the distance to it"
+    return replace(
+        estimate,
+        covariance=covariance,
+        rank=wls.rank,
+        condition=wls.condition,
+        undetermined=wls.undetermined,
+        message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
+    )
 
 
 def _bounded(

@@ -110,7 +110,7 @@ def judge(
     Args:
         identification: Metrics over the fitted recordings.
         validation: Metrics of each kept recording, by its name.
-        undetermined: Base parameters about which the data say nothing.
+        undetermined: Base parameters that the data do not determine by themselves.
         is_consistent: Whether the parameters are physically possible.
         joints: The model's joints; one without a row in any recording is not evaluated.
         alarms: Faults of the recordings that make any result of them wrong.
@@ -168,7 +168,8 @@ def _judge(
         doubts.append(f"the joints {missing} do not move in any validation log: not evaluated")
     if undetermined:
         doubts.append(
-            f"the data say nothing about {len(undetermined)} base parameters: {list(undetermined)}"
+            f"the data do not determine {len(undetermined)} base parameters by themselves: "
+            f"{list(undetermined)}"
         )
     if not is_consistent:
         doubts.append(

@@ -166,7 +166,8 @@ def _with_alarms(
     """Return the identification with its alarms, and what is worth a word so far."""
     findings = [*_locked_findings(job, model), *_log_findings(logs)]
     findings += impossible_inertials(model)
-    findings += [finding for finding in diagnosis if finding.severity != "note"]
+    # what the motion excites the fit tells from all rows: finding "undetermined"
+    findings += [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
     is_robust = job.estimator.robust != "none"
     messages = tuple(f.message for f in alarms if not (is_robust and is_outvoted(f)))
     return replace(identification, alarms=messages), findings
@@ -285,11 +286,12 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
 
 def _fit_findings(identification: Identification) -> list[Finding]:
     findings = []
-    undetermined = identification.estimate.undetermined
-    if undetermined:
+    known = identification.determination
+    if known.groups:
         message = (
-            f"the data say nothing about the base parameters {list(undetermined)}; they keep the "
-            "URDF's values. Record a richer trajectory to determine them"
+            f"the data determine {known.rank} of {len(known.names)} base parameters: "
+            f"{known.in_words()}. What they leave open keeps the URDF's values; record a richer "
+            "trajectory to determine it"
         )
         findings.append(Finding("undetermined", "warning", "base_parameters", message))
     if not identification.is_consistent:

@@ -18,7 +18,7 @@ FLOORS = {
     0: "exceptions _typing __init__",
     1: "parameters data problem program proximity kinematics metrics xml_splice examples "
     "innovations online_settings job_keys lanes lapack log_source console signal_settings "
-    "progress work_flags versions report_page replay_page surprises reversals",
+    "progress work_flags versions report_page replay_page surprises reversals determination",
     2: "factors units model smoothing live_signals base_parameters verdict planar_2r procedure "
     "time_stamps compiled columns array_tables csv_files parquet_files bags summaries meshes "
     "ellipsoids",
@@ -28,10 +28,9 @@ FLOORS = {
     "constraint_settings task checkpoint prediction inertial_audit",
     5: "bands link_audit validation sidecar estimator_settings simulation dynamics log_files "
     "probe mass_matrix reduction",
-    6: "recordings closed_loop conversion explanations load_checks motion_checks cluster residuals "
-    "torque_delay",
+    6: "recordings closed_loop conversion explanations load_checks cluster residuals torque_delay",
     7: "robust urdf job visualization report_plots paper_simulation paper_trajectories "
-    "model_checks long_logs work_plan",
+    "model_checks motion_checks long_logs work_plan",
     8: "identification diagnosis_plots",
     9: "information online result inspection paper_errata consistency_findings long_recordings "
     "long_jobs report_consistency paper_replay",

@@ -59,6 +59,7 @@ def test_result_json_has_the_promised_shape(identified, logs):
         "rank": 58,
         "condition": pytest.approx(result["structure"]["condition"]),
         "undetermined": [],
+        "not_told_apart": [],
     }
     assert len(result["base_parameters"]) == 58
     assert set(result["base_parameters"][0]) == {

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
+from robotid.determination import base_spread, determine
 from robotid.estimators.cones import Subspace
 from robotid.estimators.constraints import (
     Constraints,
@@ -31,7 +32,6 @@ from robotid.problem import Problem
 
 __all__ = ["Consistent"]
 
-_PRIOR_LED = 0.9  # a base parameter whose spread shrinks by less than this is undetermined
 _ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
 
 
@@ -288,10 +288,9 @@ class Consistent(Estimator):
         return spread
 
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the base parameters about which the data say next to nothing.
+        """Return the base parameters that the data do not determine by themselves.
 
-        They are those whose spread the data shrink by less than a tenth, whatever the metric of
-        the prior.
+        See :func:`robotid.determination.determine`; whatever metric and weight the prior has.
 
         Args:
             rows: Information, shape (k, b + 1), as of :meth:`rows`.
@@ -300,14 +299,9 @@ class Consistent(Estimator):
         Returns:
             Their names.
         """
-        KS = self.K * self.prior_std / np.sqrt(self.prior_weight)  # K times the prior's root
-        before = (KS**2).sum(axis=1)
-        _, s, Vt = np.linalg.svd(rows[:, :-1] @ KS, full_matrices=False)
-        after = before - (KS @ Vt.T) ** 2 @ (s**2 / (1.0 + s**2))
-        owners = np.array([name.rsplit(".", 1)[0] for name in self.layout.names])
-        is_free = ~np.isin(owners, self.constraints.pinned)
-        is_open = (after > _PRIOR_LED**2 * before) & self.K[:, is_free].any(axis=1)
-        return tuple(np.array(base_names)[is_open].tolist())
+        known = self.layout.owned_by(self.constraints.pinned)
+        before = base_spread(self.K, self.prior_std, known)
+        return determine(base_names, rows[:, :-1], before).undetermined
 
     @property
     def _held(self) -> Array:

@@ -1,0 +1,260 @@
+"""Which base parameters data determine: by themselves, in sums with others only, or not at all.
+
+One criterion for everything that speaks of it: a direction in the space of base parameters is
+determined if the data shrink its spread against what is plausible before them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from robotid._typing import Array
+from robotid.exceptions import RankDeficientError
+
+__all__ = ["Combination", "Determination", "Group", "base_spread", "determine"]
+
+_PRIOR_LED = 0.9  # a direction whose spread shrinks by less than this is weak
+_LED_IN_PART = 0.3  # a parameter that keeps this share of its spread in weak directions is one's
+_COUPLED = 0.5  # ... or that moves with an open one by this share of their spreads
+_JOINED = 0.05  # smaller coefficients, in units of the spreads, are left out of words
+_TERM = 1e-3  # ... and smaller ones still are no term of a sum
+_TIE = 0.95  # of coefficients nearly as large as the largest the first leads
+_TERMS = 4  # of a sum, as far as words go
+_DIGITS = 3  # of a coefficient in words
+_NAMED = 5  # parameters, and half as many sums, that words name of one group
+_GROUPS = 2  # groups of which a sentence names the sums
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum of base parameters that the data determine, though not each term of it.
+
+    Attributes:
+        names: Base parameters in it, in their order.
+        coefficients: Factor of each, SI units; that of the leading one is 1.
+        shares: The same in units of the spreads [-]; that of the leading one is the largest.
+    """
+
+    names: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    shares: tuple[float, ...]
+
+    def __str__(self) -> str:
+        shares = np.abs(self.shares)
+        leading = self.coefficients.index(1.0)
+        order = [i for i in np.argsort(-shares, kind="stable") if i != leading]
+        terms = [i for i in order if shares[i] > _JOINED * shares[leading]]
+        said = self.names[leading]
+        for i in terms[: _TERMS - 1]:
+            sign = "-" if self.coefficients[i] < 0 else "+"
+            size = f"{abs(self.coefficients[i]):.{_DIGITS}g}"
+            said += f" {sign} {self.names[i]}" if size == "1" else f" {sign} {size} {self.names[i]}"
+        return said + (" + ..." if len(terms) >= _TERMS else "")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Base parameters that the data do not tell apart.
+
+    Attributes:
+        names: The base parameters.
+        combinations: What of them is determined; fewer than there are names.
+    """
+
+    names: tuple[str, ...]
+    combinations: tuple[Combination, ...]
+
+    def __str__(self) -> str:
+        if not self.combinations:
+            return f"of {_and(self.names)} nothing is determined"
+        count = len(self.combinations)
+        if len(self.names) > _NAMED or count > _NAMED // 2:
+            return (
+                f"of the {len(self.names)} parameters {self.names[0]} ... {self.names[-1]} only "
+                f"{count} sum{'s' * (count > 1)} "
+                f"{'is' if count == 1 else 'are'} determined, as {self.combinations[0]}"
+            )
+        sums = _and([str(combination) for combination in self.combinations])
+        return f"of {_and(self.names)} only {sums} {'is' if count == 1 else 'are'} determined"
+
+
+@dataclass(frozen=True, eq=False)
+class Determination:
+    """What data say about the base parameters.
+
+    Attributes:
+        names: Names of the b base parameters.
+        spread: Plausible spread of each before the data, shape (b,), SI units; 0 for known ones.
+        shrinkage: Spread after over spread before of b orthogonal directions in units of the
+            spread, ascending, shape (b,) [-]; known ones count 0.
+        weak: The weak directions, in units of the spread, orthonormal, shape (b, b - rank).
+        groups: Base parameters that the data do not tell apart.
+    """
+
+    names: tuple[str, ...]
+    spread: Array
+    shrinkage: Array
+    weak: Array
+    groups: tuple[Group, ...]
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that the data determine."""
+        return len(self.names) - int(self.weak.shape[1])
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the base parameters that are not determined by themselves, in their order."""
+        listed = {name for group in self.groups for name in group.names}
+        return tuple(name for name in self.names if name in listed)
+
+    @property
+    def merged(self) -> tuple[Group, ...]:
+        """The groups, all of which nothing is determined in one, the last."""
+        sums = tuple(group for group in self.groups if group.combinations)
+        alone = [name for group in self.groups if not group.combinations for name in group.names]
+        return (*sums, Group(tuple(alone), ())) if alone else sums
+
+    def in_words(self) -> str:
+        """Return what is determined of the rest, as "of a and b only a + b is determined".
+
+        Returns:
+            One line, of the first groups; empty if everything is determined.
+        """
+        sums = [str(group) for group in self.merged if group.combinations]
+        said = sums[:_GROUPS]
+        if len(sums) > _GROUPS:
+            more = len(sums) - _GROUPS
+            said.append(f"{more} more such group{'s' * (more > 1)}")
+        return "; ".join(said + [str(group) for group in self.merged if not group.combinations])
+
+    def refusal(self, error: RankDeficientError) -> RankDeficientError:
+        """Return the refusal of data that leave directions open, in words of this criterion.
+
+        Args:
+            error: What least squares said, by its own numerical rank.
+
+        Returns:
+            The refusal; as it was if only rounding leaves them open.
+        """
+        if not self.groups:
+            return error
+        names = self.undetermined
+        return RankDeficientError(self.rank, names, len(self.names), self.in_words())
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Return the groups as plain values, as result.json has them.
+
+        Returns:
+            Per group {"parameters": [names], "determined": [{"text", "terms": {name: coefficient}}]
+            }, coefficients in SI units.
+        """
+        return [
+            {
+                "parameters": list(group.names),
+                "determined": [
+                    {"text": str(c), "terms": dict(zip(c.names, c.coefficients, strict=True))}
+                    for c in group.combinations
+                ],
+            }
+            for group in self.groups
+        ]
+
+
+def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
+    """Return how far each base parameter may plausibly lie from its prior value.
+
+    Args:
+        K: Map to the base parameters, shape (b, p).
+        spread: Spread of each standard parameter, shape (p,), SI units.
+        known: Whether each standard parameter is known, shape (p,); none if empty.
+
+    Returns:
+        Spreads, shape (b,), SI units; 0 where all terms are known.
+    """
+    free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
+    size: Array = np.linalg.norm(K * free, axis=1)
+    return size
+
+
+def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination:
+    """Return which directions the data determine, and in words what they leave.
+
+    In units of the spread, the rows A have singular values s_i; along their right singular
+    vectors data shrink the spread to 1 / sqrt(1 + s_i^2). Those that hardly shrink, V_w, span
+    what the data leave open. Solved for as many base parameters f, x_p = V_p V_f^-1 x_f along
+    them, so that each x_p - V_p V_f^-1 x_f is determined.
+
+    Args:
+        names: Names of the base parameters.
+        rows: Information A, with A^T A the inverse of the covariance of the base parameters by
+            the data alone at their noise level, shape (k, b), in inverse SI units.
+        spread: Plausible spread of each before the data, shape (b,), SI units; 0 if known.
+
+    Returns:
+        The determination.
+    """
+    free = np.flatnonzero(spread > 0)
+    weak, shrinkage = np.zeros((len(spread), 0)), np.zeros(len(spread))
+    if len(free):
+        _, s, Vt = np.linalg.svd(rows[:, free] * spread[free])
+        s = np.append(s, np.zeros(len(free) - len(s)))
+        after = 1.0 / np.sqrt(1.0 + s**2)
+        open_ones = after > _PRIOR_LED
+        weak = np.zeros((len(spread), int(open_ones.sum())))
+        weak[free] = Vt[open_ones].T
+        shrinkage[len(spread) - len(free) :] = after
+    groups = _groups(tuple(names), weak, spread)
+    return Determination(tuple(names), spread, shrinkage, weak, groups)
+
+
+def _groups(names: tuple[str, ...], weak: Array, spread: Array) -> tuple[Group, ...]:
+    """Return the base parameters that move together along the weak directions."""
+    count = weak.shape[1]
+    if not count:
+        return ()
+    order = scipy.linalg.qr(weak.T, mode="r", pivoting=True)[1]
+    chosen, others = order[:count], np.sort(order[count:])
+    moved = np.linalg.solve(weak[chosen].T, weak[others].T).T  # V_p V_f^-1
+    kept = np.linalg.norm(weak[others], axis=1)
+    is_open = (kept > _LED_IN_PART) | (np.abs(moved) > _COUPLED).any(axis=1)
+    others, moved = others[is_open], moved[is_open]
+    label = np.append(np.arange(count), np.zeros(len(others), dtype=int))
+    for k, row in enumerate(moved):
+        joined = np.abs(row) > _JOINED
+        joined[np.argmax(np.abs(row))] = True
+        met = np.unique(label[:count][joined])
+        label[np.isin(label, met)] = met[0]
+        label[count + k] = met[0]
+    places = np.append(chosen, others)
+    groups = []
+    for one in np.unique(label[np.argsort(places)]):
+        members = np.sort(places[label == one])
+        sums = [
+            _combination(names, spread, [int(p), *chosen], [1.0, *-row])
+            for p, row, own in zip(others, moved, label[count:], strict=True)
+            if own == one
+        ]
+        groups.append(Group(tuple(names[i] for i in members), tuple(sums)))
+    return tuple(sorted(groups, key=lambda group: names.index(group.names[0])))
+
+
+def _combination(
+    names: tuple[str, ...], spread: Array, places: Sequence[int], scaled: Sequence[float]
+) -> Combination:
+    """Return a sum given in units of the spread as one in SI units."""
+    terms = sorted((p, c) for p, c in zip(places, scaled, strict=True) if abs(c) > _TERM)
+    shares = np.array([c for _, c in terms])
+    leading = int(np.argmax(np.abs(shares) >= _TIE * np.abs(shares).max()))
+    shares /= shares[leading]
+    physical = shares * spread[terms[leading][0]] / spread[[p for p, _ in terms]]
+    physical[leading] = 1.0
+    chosen = tuple(names[p] for p, _ in terms)
+    return Combination(chosen, tuple(physical.tolist()), tuple(shares.tolist()))
+
+
+def _and(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
