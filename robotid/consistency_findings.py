@@ -21,10 +21,12 @@ def consistency_findings(identification: Identification) -> list[Finding]:
     findings = []
     check, details = identification.mass_matrix, identification.estimate.details
     if not check.is_positive:
+        is_consistent = identification.estimator.name in ("consistent", "log_cholesky")
+        advice = "raise [estimator] margin" if is_consistent else "use the 'consistent' estimator"
         message = (
             f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
             f"of {check.poses} random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g}): "
-            "a simulation with these parameters is unstable; use the 'consistent' estimator"
+            f"a simulation with these parameters is unstable; {advice}"
         )
         findings.append(Finding("mass_matrix", "warning", "standard_parameters", message))
     second = details.get("check")

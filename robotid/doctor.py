@@ -19,6 +19,7 @@ from robotid.channel_checks import (
     check_velocity_order,
 )
 from robotid.data import Log, Trajectory
+from robotid.doubts import DOUBTFUL
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification import structural_mapping
 from robotid.job import Job, LogEntry
@@ -107,7 +108,7 @@ def alarming(findings: Sequence[Finding], ignore: Sequence[str]) -> tuple[Findin
 
     Args:
         findings: What the doctor found.
-        ignore: Codes of errors that the user knows better.
+        ignore: Codes of errors, or of what makes a result doubtful, that the user knows better.
 
     Returns:
         The errors that are not ignored.
@@ -115,13 +116,12 @@ def alarming(findings: Sequence[Finding], ignore: Sequence[str]) -> tuple[Findin
     Raises:
         SettingsError: If a code to ignore is unknown.
     """
+    known = sorted({*CODES, *DOUBTFUL})
     for code in ignore:
-        if code not in CODES:
-            near = difflib.get_close_matches(code, CODES, n=1)
+        if code not in known:
+            near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
-            raise SettingsError(
-                f"doctor: ignore names {code!r}, wanted some of {list(CODES)}{hint}"
-            )
+            raise SettingsError(f"doctor: ignore names {code!r}, wanted some of {known}{hint}")
     return tuple(f for f in findings if f.severity == "error" and f.code not in ignore)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from robotid.verdict import Doubt, Finding
 
-__all__ = ["doubts_of", "is_outvoted"]
+__all__ = ["DOUBTFUL", "doubts_of", "is_outvoted"]
 
 _WRONG = 2.0  # a fit that misses this many times what WLS misses ...
 _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
@@ -31,6 +31,8 @@ _WORDS = {
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
     "lack a load",
 }
+#: Codes of the warnings that make a result doubtful.
+DOUBTFUL = (*_WORDS, "repeated_motion")
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
 
 

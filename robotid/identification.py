@@ -207,6 +207,7 @@ class Identification:
             joints=self.model.joints,
             alarms=self.alarms,
             doubts=self.doubts,
+            refitted=[evaluation.recording.name for evaluation in self.refitted],
         )
 
 

@@ -1,7 +1,7 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from robotid.metrics import JointMetrics, Metrics
@@ -104,6 +104,7 @@ def judge(
     joints: Sequence[str] = (),
     alarms: Sequence[str] = (),
     doubts: Sequence[Doubt] = (),
+    refitted: Sequence[str] = (),
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -115,81 +116,86 @@ def judge(
         joints: The model's joints; one without a row in any recording is not evaluated.
         alarms: Faults of the recordings that make any result of them wrong.
         doubts: Why the result may be wrong however well it predicts.
+        refitted: Kept recordings, by name, that are left out since they hold fitted rows.
 
     Returns:
         The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
         of a joint with a doubt.
     """
-    found = _judge(identification, validation, undetermined, is_consistent, joints, alarms, doubts)
-    return replace(found, alarms=tuple(alarms), doubts=tuple(doubts))
-
-
-def _judge(
-    identification: Metrics,
-    validation: Mapping[str, Metrics],
-    undetermined: Sequence[str],
-    is_consistent: bool,
-    all_joints: Sequence[str],
-    alarms: Sequence[str],
-    suspicions: Sequence[Doubt],
-) -> Verdict:
     moved = [joint for m in (identification, *validation.values()) for joint in m.per_joint]
-    names = dict.fromkeys([*all_joints, *moved])
-    poor: list[str] = []
-    doubts: list[str] = []
-    joints: dict[str, JointVerdict] = {}
+    names = dict.fromkeys([*joints, *moved])
+    found = {joint: _found_on(joint, identification, validation) for joint in names}
+    poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
+    reasons = [*alarms, *poor]
     if not validation:
-        doubts.append("the prediction of a new motion was not evaluated: no validation log given")
-    for joint in names:
-        worse, doubt, errors = [], [], []
-        for log, metrics in validation.items():
-            measured = metrics.per_joint.get(joint)
-            if measured is not None:
-                found = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
-                worse += found[0]
-                doubt += found[1]
-                errors.append(_error(measured))
-        poor += worse
-        doubts += doubt
-        doubt += [f"{joint}: {d.message} ({d.code})" for d in suspicions if d.joint == joint]
-        joints[joint] = _joint_verdict(
-            sorted(worse, key=_rank), doubt, errors, is_still=joint not in moved
+        why = (
+            f"{list(refitted)} hold rows that were fitted"
+            if refitted
+            else "no validation log given"
         )
-    doubts += _in_words(suspicions)
-    poor = [*alarms, *sorted(poor, key=_rank)]
-    kept = {joint for m in validation.values() for joint in m.per_joint}
-    still = [joint for joint in names if joint not in moved]
-    missing = [joint for joint in names if joint in moved and joint not in kept]
-    if still and identification.per_joint:
-        doubts.append(f"the joints {still} move in no recording: not evaluated")
-    elif still and validation:
-        missing = still
-    if missing and validation:
-        doubts.append(f"the joints {missing} do not move in any validation log: not evaluated")
+        reasons.append(f"the prediction of a new motion was not evaluated: {why}")
+    reasons += [reason for _, doubt, _ in found.values() for reason in doubt]
+    reasons += _in_words(doubts)
+    reasons += _unseen(names, identification, validation)
     if undetermined:
-        doubts.append(
+        reasons.append(
             f"the data do not determine {len(undetermined)} base parameters by themselves: "
             f"{list(undetermined)}"
         )
     if not is_consistent:
-        doubts.append(
+        reasons.append(
             "the standard parameters are not physically consistent, so no URDF was written; the "
             "base parameters predict torque all the same"
         )
-    if poor:
-        return Verdict("poor", (*poor, *doubts), joints)
-    if doubts:
-        return Verdict("usable", tuple(doubts), joints)
-    worst = max(_error(m) for metrics in validation.values() for m in metrics.per_joint.values())
-    return Verdict(
-        "good",
-        (
+    per_joint = {
+        joint: _joint_verdict(
+            sorted(worse, key=_rank),
+            [*doubt, *(f"{joint}: {d.message} ({d.code})" for d in doubts if d.joint == joint)],
+            errors,
+            is_still=joint not in moved,
+        )
+        for joint, (worse, doubt, errors) in found.items()
+    }
+    status = "poor" if poor or alarms else "usable" if reasons else "good"
+    if not reasons:
+        worst = max(error for _, _, errors in found.values() for error in errors)
+        reasons = [
             f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, "
             "better than by a constant and than by the URDF, and every parameter is physically "
-            "consistent",
-        ),
-        joints,
-    )
+            "consistent"
+        ]
+    return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
+
+
+def _found_on(
+    joint: str, identification: Metrics, validation: Mapping[str, Metrics]
+) -> tuple[list[str], list[str], list[float]]:
+    """Return what makes a joint poor, what makes it doubtful, and its errors [%], log by log."""
+    poor, doubts, errors = [], [], []
+    for log, metrics in validation.items():
+        measured = metrics.per_joint.get(joint)
+        if measured is not None:
+            found = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
+            poor += found[0]
+            doubts += found[1]
+            errors.append(_error(measured))
+    return poor, doubts, errors
+
+
+def _unseen(
+    names: Iterable[str], identification: Metrics, validation: Mapping[str, Metrics]
+) -> list[str]:
+    """Return which joints move in no recording, and which in no kept one."""
+    kept = {joint for m in validation.values() for joint in m.per_joint}
+    fitted = identification.per_joint
+    still = [joint for joint in names if joint not in kept and joint not in fitted]
+    missing = [joint for joint in names if joint not in kept and joint in fitted]
+    if still and not fitted:  # measured again without the fitted recordings
+        still, missing = [], still
+    reasons = [f"the joints {still} move in no recording: not evaluated"] if still else []
+    if missing and validation:
+        reasons.append(f"the joints {missing} do not move in any validation log: not evaluated")
+    return reasons
 
 
 def _joint_verdict(
@@ -222,6 +228,8 @@ def _judge_joint(
     """Return what makes the result poor, and what makes it doubtful, on one joint."""
     error = _error(measured)
     urdf = measured.baselines.get("urdf")
+    if measured.relative_error_pct is None:
+        return [f"{joint}: the torque on {log} is 0 throughout: nothing was predicted"], []
     if not measured.better_than_constant:
         return [f"{joint}: worse than a constant torque on {log} ({error:.1f} %)"], []
     if urdf is not None and error > urdf:

@@ -43,6 +43,7 @@ __all__ = ["run_job", "validate_result"]
 _log = logging.getLogger(__name__)
 
 _NAMED = 5  # outliers that a finding names
+_WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is worth a word
 
 
@@ -284,6 +285,15 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
     return [Finding("outliers", "warning", outliers[0].joint, message, evidence)]
 
 
+def _asked(identification: Identification) -> str:
+    """Return in words what the user asks of the parameters, empty if nothing."""
+    settings = identification.estimator
+    asked = {key: value for key, value in settings.constraints.items() if value}
+    if settings.margin > _WIDE:
+        asked["margin"] = settings.margin
+    return f"what [estimator] asks for ({asked}), " if asked else ""
+
+
 def _fit_findings(identification: Identification) -> list[Finding]:
     findings = []
     known = identification.determination
@@ -310,12 +320,13 @@ def _fit_findings(identification: Identification) -> list[Finding]:
         where = evaluation.recording.log.path
         findings.append(Finding("validation_was_fitted", "warning", where, message))
     ours, wls = identification.metrics(), identification.metrics("wls")
+    asked = _asked(identification)
     for joint, measured in ours.per_joint.items():
         if measured.rmse > _DIFFERS * wls.per_joint[joint].rmse:
             message = (
                 f"{joint}: the residual is {measured.rmse:.3g} {measured.unit} against "
                 f"{wls.per_joint[joint].rmse:.3g} of unconstrained WLS: physics and data disagree "
-                "there; check the torque scale (gains), the drive model and the payload"
+                f"there; check {asked}the torque scale (gains), the drive model and the payload"
             )
             evidence = {
                 "error_pct": measured.relative_error_pct or 0.0,

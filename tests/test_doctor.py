@@ -215,8 +215,8 @@ def test_doctor_prints_findings_as_json_and_as_text(wrong_sign, tmp_path, capsys
     job.write_text(f'urdf = "{URDF}"\n[[identification]]\nlog = "{wrong_sign}"\n')
     assert main(["doctor", str(job)]) == 1
     assert "torque_sign" in capsys.readouterr().out
-    assert main(["doctor", str(job), "--ignore", "torque_sign"]) == 0
-    assert main(["doctor", str(job), "--ignore", "torque_sgn"]) == 2
+    assert main(["doctor", URDF, wrong_sign, "--ignore", "torque_sign"]) == 0
+    assert main(["doctor", URDF, wrong_sign, "--ignore", "torque_sgn"]) == 2
     assert main(["doctor", URDF, str(tmp_path / "none.csv")]) == 1
 
 

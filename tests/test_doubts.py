@@ -74,7 +74,7 @@ def test_a_robust_loss_excuses_jumps_of_the_torque_and_what_they_cause():
 def run(ur5, tmp_path):
     """Run a job on two logs of the same arm, the fitted one as a test spoils it."""
 
-    def runner(spoil=None, **settings):
+    def runner(spoil=None, ignore=(), **settings):
         names = ("run.csv", "kept.csv")
         for name, rng in zip(names, np.random.default_rng(0).spawn(2), strict=True):
             log = exact_log(ur5, truth(ur5), rng, samples=800, rate=100.0, noise=0.1 * NOISE)
@@ -86,29 +86,36 @@ def run(ur5, tmp_path):
             "identification": [{"log": "run.csv"}],
             "validation": [{"log": "kept.csv"}],
             "estimator": {"prior_weight": 1.0, "draws": 0, **settings},
+            "doctor": {"ignore": list(ignore)},
         }
         out = tmp_path / "out"
         found, result = run_job(job_from_settings(table, "job.toml", tmp_path), out)
         again = validate_result(out / "result.json", [tmp_path / "kept.csv"])
-        return found, result["verdict"], again["verdict"]
+        return found, result, again["verdict"]
 
     return runner
 
 
 def test_a_stated_bound_that_binds_makes_it_usable(run):
     far = {"com": {"forearm_link": [[1, 1, 1], [1.2, 1.2, 1.2]]}}
-    _, verdict, again = run(constraints=far)
-    assert verdict["status"] == again["status"] == "usable"
-    assert "centre_of_mass forearm_link: the data push against a stated bound" in str(verdict)
+    _, result, again = run(constraints=far)
+    assert result["verdict"]["status"] == again["status"] == "usable"
+    bound = "centre_of_mass forearm_link: the data push against a stated bound"
+    assert bound in str(result["verdict"])
 
 
 def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run):
-    _, verdict, again = run(constraints={"total_mass": 5.0})
-    assert verdict["status"] == again["status"] == "usable"
-    lift = verdict["per_joint"]["shoulder_lift_joint"]
+    _, result, again = run(constraints={"total_mass": 5.0})
+    assert result["verdict"]["status"] == again["status"] == "usable"
+    lift = result["verdict"]["per_joint"]["shoulder_lift_joint"]
     assert lift["status"] == "usable"
+    costs = [f["message"] for f in result["warnings"] if f["code"] == "constraint_costs"]
+    assert costs
+    assert all("what [estimator] asks for ({'total_mass': 5.0})" in text for text in costs)
     assert "physics and data disagree" in lift["reasons"][-1]
     assert again["per_joint"]["shoulder_lift_joint"]["status"] == "usable"
+    found, *_ = run(constraints={"total_mass": 5.0}, ignore=["constraint_costs"])
+    assert "constraint_costs" not in {doubt.code for doubt in found.doubts}
 
 
 def test_spikes_in_torques_do_not_condemn_a_robust_fit(run):
@@ -118,10 +125,11 @@ def test_spikes_in_torques_do_not_condemn_a_robust_fit(run):
             tau[[200, 400, 600], 2] += 1000.0
         return type(log)(**{**vars(log), "tau": tau})
 
-    plain, verdict, _ = run(spoil)
-    assert "jumps by up to" in verdict["reasons"][0]
+    plain, result, _ = run(spoil)
+    assert "jumps by up to" in result["verdict"]["reasons"][0]
     assert plain.alarms
-    robust, verdict, again = run(spoil, robust="tukey")
+    robust, result, again = run(spoil, robust="tukey")
+    verdict = result["verdict"]
     assert verdict["status"] == again["status"] == "good", verdict["reasons"]
     assert verdict["doubts"] == []
     assert not robust.alarms

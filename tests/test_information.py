@@ -22,7 +22,7 @@ def dense(found):
     model, rows = found.model, []
     for e in found.identification:
         t, sigma = e.recording.trajectory, found.wls.sigma
-        W = joint_torque_regressor(model, t.q, t.v, t.a)[:, found.mapping.independent]
+        W = joint_torque_regressor(model, t.q, t.v, t.a, t.direction)[:, found.mapping.independent]
         weighted = W.reshape(len(t.t), model.n_rows, -1) / sigma[:, None]
         rows.append(weighted[e.recording.mask.astype(bool)])
     return np.concatenate(rows)

@@ -126,3 +126,18 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     assert found.to_dict()["doubts"] == [
         {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
     ]
+
+
+def test_kept_recordings_that_were_fitted_are_named():
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0), {}, undetermined=(), is_consistent=True, refitted=["x.csv"]
+    )
+    assert found.status == "usable"
+    (reason,) = found.reasons
+    assert reason.endswith("was not evaluated: ['x.csv'] hold rows that were fitted")
+
+
+def test_a_torque_of_zero_is_no_prediction():
+    found = verdict({"a": joint(None, constant=False)})
+    assert found.status == "poor"
+    assert found.reasons == ("a: the torque on val.csv is 0 throughout: nothing was predicted",)
