@@ -175,8 +175,17 @@ def _torque_scales(model: LoadModel) -> Array:
     common = np.repeat(_SCALES[:, None], n, axis=1)
     chi = model.misfits(np.vstack([np.ones(n), common]))
     best = int(np.argmin(chi[1:]))
-    far = abs(np.log(_SCALES[best])) > np.log(_OTHER_SCALE)
-    scale = common[best] if far and chi[0] - chi[1 + best] > _GAIN else np.ones(n)
+    starts = [np.ones(n)]
+    if abs(np.log(_SCALES[best])) > np.log(_OTHER_SCALE) and chi[0] - chi[1 + best] > _GAIN:
+        starts.append(common[best])
+    found = np.array([_descended(model, start) for start in starts])
+    scale = found[int(np.argmin(model.misfits(found)))]
+    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
+
+
+def _descended(model: LoadModel, scale: Array) -> Array:
+    """Return the factors that are reached from some by changing one after the other."""
+    n = len(scale)
     for _ in range(n):
         trials = np.repeat(scale[None], n * len(_SCALES), axis=0)
         trials[np.arange(len(trials)), np.repeat(np.arange(n), len(_SCALES))] = np.tile(_SCALES, n)
@@ -184,7 +193,7 @@ def _torque_scales(model: LoadModel) -> Array:
         if chi[0] - chi[1:].min() < _GAIN:
             break
         scale = trials[int(np.argmin(chi[1:]))]
-    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
+    return scale
 
 
 def _needed(model: LoadModel, scale: Array, other: Array) -> Array:

@@ -17,6 +17,7 @@ _MARGIN = (
     0.15  # [s] rows this near to the end of a stretch are left out: the filter is not settled there
 )
 _STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
+_SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,8 @@ class Probe:
             Columns a, v, sign v, 1, -1 and those of coupled drives, shape (N, 5 + k).
         """
         v, one = self.v[:, j], np.ones(len(self.v))
-        friction = np.tanh(v / _STILL)
+        still = min(_STILL, _SLOW * float(np.abs(v).max())) or _STILL
+        friction = np.tanh(v / still)
         own = np.column_stack([self.a[:, j], v, friction, one, -one])
         return np.hstack([own, self.drives[:, j]])
 
