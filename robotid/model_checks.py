@@ -39,8 +39,8 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     """
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
-    if best.kind in _OF_POSITIONS and loaded.misfit < best.misfit:
-        best = stated  # a load explains it better than another position
+    if best.kind != "torque_sign" and loaded.misfit < best.misfit:
+        best = stated  # a load explains it better
     found = list(_FINDINGS[best.kind](probe, stated, best, stated.misfit - best.misfit, name))
     for finding in found:
         # what a load on the last link would explain as well is no error for certain
@@ -147,9 +147,6 @@ _FINDINGS: dict[str, _Maker] = {
     "position_offset": _position,
     "gravity": _gravity,
 }
-
-
-_OF_POSITIONS = ("position_order", "position_sign", "position_offset")
 
 
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:

@@ -9,7 +9,7 @@ from synthetic import exact_log, truth
 
 from robotid.estimator_settings import EstimatorSettings
 from robotid.estimators import Consistent
-from robotid.estimators.weighting import choose_weight, held_out_error, log_evidence
+from robotid.estimators.weighting import choose_weight, held_out_errors, log_evidence
 from robotid.exceptions import DataError, SettingsError
 from robotid.factors import compress, compress_stretches, gather, merge
 from robotid.identification import identify, structural_mapping
@@ -79,7 +79,7 @@ def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
     assert np.mean(found) == pytest.approx(2.0, abs=0.2)
 
 
-def test_the_held_out_error_is_that_of_a_loop_by_hand(case):
+def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
     fit, problem = case
     stretches = cut(problem, 3)
     total, count = 0.0, 0
@@ -91,7 +91,7 @@ def test_the_held_out_error_is_that_of_a_loop_by_hand(case):
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
         total, count = total + (residual**2).sum(), count + residual.size
-    error = held_out_error(fit, stretches, NOISE, 2.0)
+    error = np.sqrt(held_out_errors(fit, stretches, NOISE, 2.0).sum())
     # it is computed to the solver's tolerance only
     assert error == pytest.approx(np.sqrt(total / count), rel=2e-4)
 
@@ -104,10 +104,27 @@ def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
         prior = found.estimate.details["prior"]
         assert prior["chosen_by"] == how
         weights, scores = np.array(prior["curve"]).T
-        assert prior["weight"] == weights[np.argmin(scores)]
+        assert prior["weight"] in weights
+        assert prior["weight"] >= weights[np.argmin(scores)]
         assert (np.diff(weights) > 0).all()
         assert len(weights) >= 5
         assert weights.max() == 1.0
+
+
+@pytest.mark.parametrize(("gain", "weight"), [(0.01, 1.0), (0.5, 0.01)])
+def test_a_lighter_weight_must_be_better_beyond_chance(case, monkeypatch, gain, weight):
+    fit, problem = case
+    chance = np.array([0.1, -0.1, 0.05, -0.1, 0.1, -0.05])  # in favour of some stretches only
+
+    def errors(fit, stretches, sigma, w):
+        distance = abs(np.log10(w) + 2.0)  # smallest at 0.01
+        return 1.0 + distance * (gain + chance)
+
+    monkeypatch.setattr("robotid.estimators.weighting.held_out_errors", errors)
+    choice = choose_weight(fit, cut(problem, 6), "cv")
+    assert choice.weight == pytest.approx(weight)
+    weights, scores = zip(*choice.curve, strict=True)
+    assert weights[int(np.argmin(scores))] == pytest.approx(0.01)
 
 
 def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
