@@ -8,6 +8,7 @@ for what must be found, of any severity, as shares of the seeds.
 """
 
 import argparse
+import itertools
 import os
 import platform
 import sys
@@ -33,6 +34,8 @@ from robotid.signals import SignalSettings
 from robotid.simulation import another_robot
 from robotid.tables import write_columns
 
+DURATIONS = (8.0, 20.0)  # [s] of clean logs
+
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
@@ -55,13 +58,14 @@ def main():
 def clean(seeds):
     print(
         "\nclean simulated logs: findings above a note\n"
-        "\n| robot | logs | findings |\n|---|---|---|"
+        "\n| robot | seconds | logs | findings |\n|---|---|---|---|"
     )
-    for name in ROBOTS:
+    for name, duration in itertools.product(ROBOTS, DURATIONS):
         model, found = robot(name), Counter()
         for seed in seeds:
-            found.update(loud(diagnose(model, [clean_log(model, seed)], [], SignalSettings())))
-        print(f"| {name} | {len(seeds)} | {dict(found) or 'none'} |")
+            log = clean_log(model, seed, duration=duration)
+            found.update(loud(diagnose(model, [log], [], SignalSettings())))
+        print(f"| {name} | {duration:g} | {len(seeds)} | {dict(found) or 'none'} |")
 
 
 def spoilt(seeds):

@@ -1,6 +1,7 @@
 """Validation error per joint on recordings of other laboratories: WLS and the consistent fit.
 
-Prints one row per recording, in % of the measured torque, over rows that were not fitted, beside
+Runs the job of each recording as ``robotid identify`` does, doctor and report included, and prints
+one row of it, in % of the measured torque, over rows that were not fitted, beside
 the figures that plain numpy reached with weighted least squares on the same splits.
 
     ROBOTID_DATA=folder python benchmarks/bench_validation.py [--quick]
@@ -10,6 +11,7 @@ import argparse
 import os
 import platform
 import sys
+import tempfile
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -17,8 +19,8 @@ from pathlib import Path
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
-from robotid.identification import identify
 from robotid.job import read_job
+from robotid.workflow import run_job
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 PLAIN_NUMPY = {
@@ -41,13 +43,8 @@ def main():
     print("|---|---|---|---|---|---|")
     for name in names:
         start = time.perf_counter()
-        job = read_job(JOBS / f"{name}.toml")
-        model = job.model()
-        logs, kept = (
-            [job.read(entry, model) for entry in entries]
-            for entries in (job.identification, job.validation)
-        )
-        found = identify(model, logs, validation=kept, signals=job.signals, estimator=job.estimator)
+        with tempfile.TemporaryDirectory() as folder:
+            found, _ = run_job(read_job(JOBS / f"{name}.toml"), folder)
         seconds = time.perf_counter() - start
         wls, consistent = (row(found.validation[0].metrics[key]) for key in ("wls", "estimate"))
         verdict = found.verdict.status

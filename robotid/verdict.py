@@ -120,7 +120,7 @@ def judge(
 
     Returns:
         The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
-        of a joint with a doubt.
+        of a joint with a doubt, and that of all joints with one about all.
     """
     moved = [joint for m in (identification, *validation.values()) for joint in m.per_joint]
     names = dict.fromkeys([*joints, *moved])
@@ -150,7 +150,7 @@ def judge(
     per_joint = {
         joint: _joint_verdict(
             sorted(worse, key=_rank),
-            [*doubt, *(f"{joint}: {d.message} ({d.code})" for d in doubts if d.joint == joint)],
+            [*doubt, *_in_words([d for d in doubts if d.joint in ("", joint)])],
             errors,
             is_still=joint not in moved,
         )

@@ -4,12 +4,13 @@ import re
 
 import pytest
 from conftest import ROOT
+from corruptions import CASES
 from synthetic import exact_log, truth
 
 from robotid.examples import example_urdf
 from robotid.log_files import write_log
 
-DOCS = ROOT / "docs"
+DOCS, README = ROOT / "docs", ROOT / "README.md"
 
 
 def run(name):
@@ -62,3 +63,12 @@ def test_online_tracker(capsys):
     assert change.onset <= change.flagged < 10.5
     mass, error = map(float, re.search(r"load: (\S+) \+- (\S+) kg", printed).groups())
     assert abs(mass - 2.0) < 4 * error < 1.0
+
+
+def test_doctor_lists_every_corruption_and_none_other():
+    page = (DOCS / "doctor.md").read_text()
+    rows = re.findall(r"^\| (.+?) \| (.+?) \| (\d)/8 \| .+ \|$", page, re.MULTILINE)
+    assert {name: codes for name, codes, _ in rows} == {
+        name: ", ".join(case.codes) for name, case in CASES.items()
+    }
+    assert f"{sum(int(found) for *_, found in rows)} of {8 * len(CASES)}" in README.read_text()

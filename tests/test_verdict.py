@@ -122,7 +122,7 @@ def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
     found = judge(Metrics(fit, 1.0), logs, undetermined=(), is_consistent=True, doubts=whole)
     assert found.status == "usable"
     assert found.reasons == ("run.csv: masses do not fit (urdf_mismatch)",)
-    assert {v.status for v in found.joints.values()} == {"good"}
+    assert {v.status for v in found.joints.values()} == {"usable"}
     assert found.to_dict()["doubts"] == [
         {"code": "urdf_mismatch", "joint": "", "message": "run.csv: masses do not fit"}
     ]
