@@ -13,6 +13,7 @@ _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
 _WORDS = {
     "bound_binds": "the data push against a stated bound, so one of them is wrong",
     "clipped": "the torque is clipped at a limit",
+    "constant_torque": "the torque never changes: the channel is dead",
     "constraint_costs": "{error_pct:.1f} % of the torque is missed where it was fitted, "
     "{wls_error_pct:.1f} % without constraints: physics and data disagree",
     "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "

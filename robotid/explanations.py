@@ -21,6 +21,7 @@ _POOR = 0.08  # a share above this lets other readings of the positions be tried
 _CLEARLY = 2.0  # gain in misfit, a factor 7, over what needs no other position
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero position may be off
 _EARTH = 9.81  # [m/s^2]
+_CONSTANT = 1e-9  # of its size: a torque that varies less does not, but for rounding
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,7 @@ def unexplained(probe: Probe, gravity: Array | None = None) -> Array:
     """
     n = len(probe.model.joints)
     loads = _link_loads(probe, gravity)
-    centred = probe.tau - probe.tau.mean(axis=0)
-    size = np.einsum("kn,kn->n", centred, centred)
+    size = _variation(probe)
     share = np.zeros((n, n, 2))
     for k in range(n):
         R, T = _compressed(np.hstack([loads[:, k], probe.drive(k)]), probe.tau)
@@ -199,13 +199,20 @@ def _own_share(probe: Probe, gravity: Array | None = None, any_load: bool = Fals
     if any_load:
         last = probe.regressor(gravity)[:, :, -10:-6]
         loads = np.concatenate([loads, last, -last[:, :, 1:]], axis=2)
-    centred = probe.tau - probe.tau.mean(axis=0)
-    size = np.einsum("kn,kn->n", centred, centred)
+    size = _variation(probe)
     share = np.zeros(len(size))
     for j in np.flatnonzero(size > 0).tolist():
         R, T = _compressed(np.hstack([loads[:, j], probe.drive(j)]), probe.tau[:, [j]])
         share[j] = min(_nonnegative_misfit(R, T[:, 0]) / size[j], 1.0)
     return share
+
+
+def _variation(probe: Probe) -> Array:
+    """Return the sum of squares of each torque about its mean, 0 of a constant one, shape (n,)."""
+    centred = probe.tau - probe.tau.mean(axis=0)
+    is_constant = np.ptp(probe.tau, axis=0) <= _CONSTANT * np.abs(probe.tau).max(axis=0)
+    size: Array = np.where(is_constant, 0.0, np.einsum("kn,kn->n", centred, centred))
+    return size
 
 
 def _link_loads(probe: Probe, gravity: Array | None) -> Array:

@@ -155,6 +155,8 @@ CASES = {
     "velocity 30 ms late": Case(("velocity_delay",), late("dq_", 0.03)),
     "torque clipped": Case(("clipped",), column("tau_elbow_joint",
         lambda x, _t: np.minimum(x, np.quantile(x, 0.9)))),
+    "dead torque channel": Case(("constant_torque",), column("tau_wrist_2_joint",
+        lambda x, _t: np.full_like(x, 3.0))),
     "static joint": Case(("static_joint",), both(
         column("q_wrist_3_joint", frozen), scaled("dq_wrist_3", 0))),
     "stale rows": Case(("stale_rows",), stale),
