@@ -3,7 +3,8 @@
 Every fit sees one stretch of motion only, and chooses the weight of its prior from that alone;
 figures are the error per joint in % of the torque of another stretch. Simulated: a UR10 whose
 masses are unlike its URDF's. Recorded, if ROBOTID_DATA names the folder: other laboratories' logs,
-and the first tenth of each ("short"), where the excitation is poor.
+and the first tenth of each ("short"), where the excitation is poor. "auto" is the default: by
+held-out stretches where the log is long enough, else 1.
 
     ROBOTID_DATA=folder python benchmarks/bench_priors.py [--quick]
 """
@@ -20,21 +21,17 @@ import numpy as np
 from setting import machine, robot
 
 from robotid.data import Log
-from robotid.estimator_settings import EstimatorSettings, Prior, make_estimator
-from robotid.estimators import WLS
+from robotid.estimator_settings import EstimatorSettings
 from robotid.excitation import random_fourier
-from robotid.factors import compress_stretches, merge
-from robotid.identification import structural_mapping
+from robotid.identification import identify
 from robotid.job import read_job
-from robotid.prior import prior_spread
-from robotid.regressor import build_problem, joint_torque_regressor
+from robotid.regressor import joint_torque_regressor
 from robotid.signals import SignalSettings
 from robotid.simulation import another_robot
-from robotid.validation import evaluate, pool, prepare
+from robotid.validation import pool
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 DATA = os.environ.get("ROBOTID_DATA")
-STRETCHES = 6
 FITS = {
     "euclidean, 1": {"prior": "euclidean", "prior_weight": 1.0},
     "riemannian, 1": {"prior": "riemannian", "prior_weight": 1.0},
@@ -42,9 +39,9 @@ FITS = {
     "euclidean, evidence": {"prior": "euclidean", "prior_weight": "evidence"},
     "riemannian, evidence": {"prior": "riemannian", "prior_weight": "evidence"},
     "entropic, evidence": {"prior": "entropic", "prior_weight": "evidence"},
-    "euclidean, cv": {"prior": "euclidean", "prior_weight": "cv"},
-    "riemannian, cv": {"prior": "riemannian", "prior_weight": "cv"},
-    "entropic, cv": {"prior": "entropic", "prior_weight": "cv"},
+    "euclidean, auto": {"prior": "euclidean", "prior_weight": "auto"},
+    "riemannian, auto": {"prior": "riemannian", "prior_weight": "auto"},
+    "entropic, auto": {"prior": "entropic", "prior_weight": "auto"},
 }
 QUICK = [name for name in FITS if not name.startswith("entropic, ")]
 
@@ -68,7 +65,9 @@ def main():
             if name != "wls" and (DATA is None or "simulated" not in title):
                 (shorts if "short" in title else ratios)[name].append((ratio, seconds))
     print("\n### Error over that of WLS, geometric mean over joints and recordings\n")
-    print("| fit | stretches | short ones | worst stretch | worst short one | s per fit |")
+    print(
+        "| fit | stretches | short ones | worst stretch | worst short one | s per identification |"
+    )
     print("|---|---|---|---|---|---|")
     for name in names:
         cells = [summary(ratios[name], mean), summary(shorts[name], mean)]
@@ -159,32 +158,22 @@ def simulated(title, duration):
 
 def compare(model, signals, train, test, names):
     """Return weight, error per joint on the test logs and seconds of each fit."""
-    recordings = [prepare(model, log, signals) for log in train]
-    mapping, pi = structural_mapping(model), model.standard_parameters()
-    stretches = []
-    for r in recordings:
-        problem = mapping.reduce(build_problem(model, r.trajectory, r.mask.astype(float)))
-        length = -(-len(r.trajectory.t) * len(recordings) // STRETCHES)
-        stretches += compress_stretches(problem, length)
-    factors = merge(stretches)
-    spread = prior_spread(model, [r.trajectory for r in recordings])
-    resolved = recordings[0].signals
-    share = min(1.0, 2 * resolved.cutoff / resolved.rate) if resolved.cutoff else 1.0
-    wls = WLS(prior=mapping.to_base(pi), independent_share=share).fit(factors)
-    prior = Prior(pi, spread, share, wls.sigma, tuple(stretches))
-    candidates = {"wls": mapping.to_standard(wls.theta, pi, spread)}
-    found = {"wls": (None, 0.0)}
-    for name in names:
-        start = time.perf_counter()
-        estimator = make_estimator(EstimatorSettings(**FITS[name]), model, mapping, prior)
-        candidates[name] = estimator.fit(factors).theta
-        found[name] = (estimator.prior_weight, time.perf_counter() - start)
-    kept = [evaluate(model, prepare(model, log, signals), candidates, pi) for log in test]
     errors = {}
-    for name, (weight, seconds) in found.items():
-        measured = pool(model, kept, name).per_joint.values()
-        errors[name] = (weight, np.array([m.relative_error_pct for m in measured]), seconds)
+    for name in names:
+        settings = EstimatorSettings(**FITS[name], draws=0)
+        start = time.perf_counter()
+        found = identify(model, train, validation=test, signals=signals, estimator=settings)
+        seconds = time.perf_counter() - start
+        if not errors:
+            errors["wls"] = (None, error_per_joint(found, "wls"), 0.0)
+        weight = found.estimate.details["prior"]["weight"]
+        errors[name] = (weight, error_per_joint(found, "estimate"), seconds)
     return errors
+
+
+def error_per_joint(found, name):
+    measured = pool(found.model, found.validation, name).per_joint.values()
+    return np.array([m.relative_error_pct for m in measured])
 
 
 def mean(values):
