@@ -17,6 +17,7 @@ __all__ = [
     "check_spikes",
     "check_velocity_delay",
     "check_velocity_order",
+    "check_velocity_scale",
 ]
 
 _COARSE = 100  # a channel of fewer steps than this over its range says little
@@ -33,6 +34,8 @@ _NOISY = 0.3  # noise over signal from which a torque tells little
 _LATE = 0.02  # [s] robotid does not use a measured velocity that is later than this
 _LAG = 0.002  # [s] a shorter lag is not worth a word
 _ALIKE = 0.8  # correlation of a velocity with the derivative of its position
+_SCALE = 1.1  # a velocity that is this many times d(q)/dt, or its inverse, is in another unit
+_DEAD = 1e-3  # a velocity that moves by less than this share of d(q)/dt does not move
 
 
 def check_quantisation(log: Log) -> Iterator[Finding]:
@@ -202,11 +205,7 @@ def check_velocity_order(log: Log) -> Iterator[Finding]:
     """
     if log.v is None:
         return
-    step = np.diff(log.t)[:, None]
-    usual = (step < 5 * np.median(step))[:, 0]
-    every = max(1, len(step) // 20000)
-    slope, v = (np.diff(log.q, axis=0) / step)[usual], (0.5 * (log.v[1:] + log.v[:-1]))[usual]
-    alike = _correlation(slope[::every], v[::every])  # (n, n): position j, velocity k
+    alike = _correlation(*_slopes(log, log.v))  # (n, n): position j, velocity k
     for j, joint in enumerate(log.joints):
         k = int(np.argmax(alike[j]))
         if k == j or alike[j, k] < _ALIKE or alike[j, j] > 0.5 * alike[j, k]:
@@ -218,6 +217,52 @@ def check_velocity_order(log: Log) -> Iterator[Finding]:
         )
         evidence = {"correlation": float(alike[j, k]), "own_correlation": float(alike[j, j])}
         yield Finding("velocity_order", "error", f"{_name(log)}: {joint}", message, evidence)
+
+
+def check_velocity_scale(log: Log, velocity: str) -> Iterator[Finding]:
+    """Yield measured velocities that are a multiple of d(q)/dt, or none.
+
+    The factor lies between the regression of one on the other and the inverse of the regression
+    of the other on the one, whatever the noise of both.
+
+    Args:
+        log: The log.
+        velocity: Setting of where velocities come from; if "differentiated" these are not used.
+
+    Yields:
+        "velocity_scale" per joint: an error where they are used, else a note.
+    """
+    if log.v is None:
+        return
+    slope, v = _slopes(log, log.v)
+    alike = np.diag(_correlation(slope, v))
+    slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
+    for j, joint in enumerate(log.joints):
+        a, b, ab = slope[:, j] @ slope[:, j], v[:, j] @ v[:, j], slope[:, j] @ v[:, j]
+        moves = np.ptp(log.q[:, j]) > _LEAST["q"] and np.sqrt(a / len(v)) > _LEAST["dq"]
+        is_dead = bool(moves and b < _DEAD**2 * a)
+        is_alike = bool(moves and not is_dead and alike[j] > _ALIKE)
+        if not is_dead and not (is_alike and (ab / a > _SCALE or b / ab < 1 / _SCALE)):
+            continue
+        factor = 0.0 if is_dead else float(np.sqrt(b / a))
+        what = "hardly changes while the position moves" if is_dead else "is in another unit"
+        message = (
+            f"{_name(log)}: dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured "
+            f"velocity {what}, and every friction and inertia with it; correct the column, or set "
+            "[signals] velocity = 'differentiated'"
+        )
+        severity = "note" if velocity == "differentiated" else "error"
+        where = f"{_name(log)}: {joint}"
+        yield Finding("velocity_scale", severity, where, message, {"factor": factor})
+
+
+def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
+    """Return d(q)/dt and the measured velocity, shape (m, n) each, without gaps."""
+    step = np.diff(log.t)[:, None]
+    usual = (step < 5 * np.median(step))[:, 0]
+    every = max(1, len(step) // 20000)
+    slope, v = np.diff(log.q, axis=0) / step, 0.5 * (velocity[1:] + velocity[:-1])
+    return slope[usual][::every], v[usual][::every]
 
 
 def _channels(log: Log) -> Iterator[tuple[str, Array]]:

@@ -307,7 +307,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> None:
-    from robotid.workflow import validate_result
+    from robotid.revalidation import validate_result
 
     found = validate_result(options.result, options.logs)
     if options.json:

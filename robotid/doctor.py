@@ -17,6 +17,7 @@ from robotid.channel_checks import (
     check_spikes,
     check_velocity_delay,
     check_velocity_order,
+    check_velocity_scale,
 )
 from robotid.data import Log, Trajectory
 from robotid.doubts import DOUBTFUL
@@ -44,7 +45,7 @@ __all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
     "gravity", "joint_order", "position_offset", "position_order", "position_sign", "spikes",
-    "torque_order", "torque_sign", "velocity_order",
+    "torque_order", "torque_sign", "velocity_order", "velocity_scale",
 )  # fmt: skip
 _RANK = {"error": 0, "warning": 1, "note": 2}
 
@@ -189,6 +190,7 @@ def _examine_log(
     for check in (check_spikes, check_noise, check_velocity_order):
         findings += check(log)
     findings += check_velocity_delay(log, signals.velocity_delay)
+    findings += check_velocity_scale(log, signals.velocity)
     if model.free_flyer:
         message = f"{name}: torques of a robot with a floating base are not judged"
         findings.append(Finding("floating_base", "note", name, message))

@@ -1,4 +1,4 @@
-"""A job from its files to the folder of results; and validation of a result on other logs."""
+"""A job from its files to the folder of results."""
 
 import logging
 import os
@@ -19,26 +19,17 @@ from robotid.doubts import doubts_of, is_outvoted
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.identification import Identification, conclude, identify, structural_mapping
 from robotid.inertial_audit import impossible_inertials
-from robotid.job import Job, LogEntry, job_from_settings
+from robotid.job import Job
 from robotid.long_jobs import is_long, survey_logs
-from robotid.long_recordings import LongRecordings, evaluate_long
-from robotid.metrics import Metrics
+from robotid.long_recordings import LongRecordings
 from robotid.model import RobotModel
 from robotid.report import write_report
-from robotid.result import (
-    build_result,
-    read_result,
-    recording_metrics,
-    stated_parameters,
-    write_json,
-)
-from robotid.sidecar import load_identified
+from robotid.result import build_result, write_json
 from robotid.urdf import write_urdf
-from robotid.validation import evaluate, prepare
-from robotid.verdict import Doubt, Finding, judge
+from robotid.verdict import Doubt, Finding
 from robotid.work_plan import WorkPlan
 
-__all__ = ["run_job", "validate_result"]
+__all__ = ["run_job"]
 
 _log = logging.getLogger(__name__)
 
@@ -182,62 +173,6 @@ def _doubts(
     told = [finding for finding in findings if finding.code not in job.ignore]
     is_robust = job.estimator.robust != "none"
     return doubts_of(told, identification.model.joints, kept, is_robust=is_robust)
-
-
-def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
-    """Measure the prediction of a written result on other logs.
-
-    Where the result has a URDF, that file and its sidecar predict; they are what a user ships.
-
-    Args:
-        path: A result.json.
-        logs: Logs of the same robot.
-
-    Returns:
-        {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json.
-
-    Raises:
-        DataError: If the result or a log cannot be used.
-        ModelError: If the URDF is missing or was changed.
-        SettingsError: If the settings in the result are not usable.
-    """
-    result = read_result(path)
-    folder = Path(path).parent
-    settings = {key: value for key, value in result["settings"].items() if value != {}}
-    job = job_from_settings(settings, Path(path).name, Path())
-    source = job.model()
-    outputs = result["outputs"]
-    if "urdf" in outputs:
-        model, pi = load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
-    else:
-        model, pi = source, stated_parameters(result, source)
-    prior = source.standard_parameters()
-    entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
-    if is_long(job, entries):
-        surveyed = survey_logs(job, entries, model, structural_mapping(model))
-        evaluations = [evaluate_long(log, parameters, prior) for log in surveyed]
-    else:
-        recordings = [prepare(model, job.read(entry, model), job.signals) for entry in entries]
-        evaluations = [evaluate(model, r, parameters, prior) for r in recordings]
-    verdict = judge(
-        Metrics({}, 0.0),
-        {e.recording.name: e.metrics["estimate"] for e in evaluations},
-        undetermined=result["structure"]["undetermined"],
-        is_consistent=result["consistency"]["is_consistent"],
-        joints=source.joints,
-        alarms=result["verdict"].get("alarms", ()),
-        doubts=[
-            Doubt(**doubt)
-            for doubt in result["verdict"].get("doubts", ())
-            if doubt["code"] != "repeated_motion"
-        ],
-    )
-    return {
-        "result": str(path),
-        "predicted_with": outputs.get("urdf", "base parameters of result.json"),
-        "validation": [recording_metrics(e, "estimate") for e in evaluations],
-        "verdict": verdict.to_dict(),
-    }
 
 
 def _locked_findings(job: Job, model: RobotModel) -> list[Finding]:

@@ -37,7 +37,7 @@ FLOORS = {
     10: "comparison report_diagnosis doctor report_tables paper_plots paper_page tracking "
     "checkpoint_inputs replay_job",
     11: "live comparison_page report paper",
-    12: "workflow",
+    12: "workflow revalidation",
     13: "demo flags",
     14: "cli",
     15: "__main__",

@@ -6,8 +6,9 @@ from robotid.doubts import doubts_of, is_outvoted
 from robotid.examples import example_urdf
 from robotid.job import job_from_settings
 from robotid.log_files import write_log
+from robotid.revalidation import validate_result
 from robotid.verdict import Doubt, Finding
-from robotid.workflow import run_job, validate_result
+from robotid.workflow import run_job
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 JOINTS = ("a", "b", "c")

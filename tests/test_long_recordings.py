@@ -17,8 +17,9 @@ from robotid.job import Job, LogEntry, job_from_settings, read_job
 from robotid.log_files import read_log, write_log
 from robotid.long_jobs import is_long, survey_logs
 from robotid.long_recordings import evaluate_long
+from robotid.revalidation import validate_result
 from robotid.signals import SignalSettings
-from robotid.workflow import run_job, validate_result
+from robotid.workflow import run_job
 
 HELD = 1024  # rows in memory, so that pieces have 256
 
