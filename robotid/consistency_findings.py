@@ -7,6 +7,8 @@ __all__ = ["consistency_findings"]
 
 _SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
 _SAME_OPTIMUM = 1e-3  # the same of the objectives of log-Cholesky and cone programme
+_COSTS = 1.05  # residual over that of WLS from which bounds cost torque
+_LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
 
 
 def consistency_findings(identification: Identification) -> list[Finding]:
@@ -45,12 +47,16 @@ def consistency_findings(identification: Identification) -> list[Finding]:
         findings.append(Finding("solvers_differ", "warning", "estimator", message))
     bounds = [name for name in details.get("active", ()) if name.startswith(_USER_BOUNDS)]
     if bounds:
+        against = _speaks_against(identification)
         message = (
-            f"the data push against the bounds {bounds}: check these bounds, the torque scale "
-            "(gains) and the payload"
+            f"the bounds {bounds} bind: {against}; check these bounds, the torque scale (gains) "
+            "and the payload"
+            if against
+            else f"the bounds {bounds} bind: the URDF's values lie beyond them, and the torque is "
+            "explained as well as without"
         )
-        stated = _stated(identification)
-        severity = "warning" if stated.intersection(bounds) else "note"
+        is_stated = bool(_stated(identification).intersection(bounds))
+        severity = "warning" if against and is_stated else "note"
         findings.append(Finding("bound_binds", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:
@@ -63,6 +69,23 @@ def consistency_findings(identification: Identification) -> list[Finding]:
 
 
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
+
+
+def _speaks_against(identification: Identification) -> str:
+    """Return what data or masses say against bounds that bind, in words; empty if nothing."""
+    ours, wls = identification.metrics().per_joint, identification.metrics("wls").per_joint
+    costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
+    if costs:
+        return f"the data push against them at {costs}"
+    layout = identification.model.layout
+    masses = identification.standard[: layout.n_inertial : 10]
+    urdf = identification.model.standard_parameters()[: layout.n_inertial : 10]
+    light = [
+        f"{mass:.2g} of its {before:.3g} kg to {link}"
+        for link, mass, before in zip(layout.bodies, masses, urdf, strict=True)
+        if mass < _LIGHT * before
+    ]
+    return f"they leave {', '.join(light)}" if light else ""
 
 
 def _stated(identification: Identification) -> set[str]:

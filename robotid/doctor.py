@@ -24,6 +24,7 @@ from robotid.doubts import DOUBTFUL
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification import structural_mapping
 from robotid.job import Job, LogEntry
+from robotid.locked_joints import check_locked
 from robotid.log_checks import (
     check_clock,
     check_gaps,
@@ -44,8 +45,8 @@ __all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "joint_order", "position_offset", "position_order", "position_sign", "spikes",
-    "torque_order", "torque_sign", "velocity_order", "velocity_scale",
+    "gravity", "joint_order", "locked_position", "position_offset", "position_order",
+    "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order", "velocity_scale",
 )  # fmt: skip
 _RANK = {"error": 0, "warning": 1, "note": 2}
 
@@ -157,6 +158,7 @@ def _read(
     for entry in entries:
         try:
             logs.append(job.read(entry, model))
+            findings += check_locked(job, model, [entry])
         except DataError as error:
             findings.append(Finding(error.code, "error", entry.path.name, str(error)))
     return logs

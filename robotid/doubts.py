@@ -11,7 +11,7 @@ _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
 #: Warnings that make a result doubtful, in words that a verdict can hold. A word in braces is a
 #: figure of the evidence.
 _WORDS = {
-    "bound_binds": "the data push against a stated bound, so one of them is wrong",
+    "bound_binds": "the data, or the masses that it leaves, speak against a stated bound",
     "clipped": "the torque is clipped at a limit",
     "constant_torque": "the torque never changes: the channel is dead",
     "constraint_costs": "{error_pct:.1f} % of the torque is missed where it was fitted, "

@@ -148,6 +148,9 @@ class Identification:
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
         kept = self.model.layout.owned_by(self.estimate.details.get("pinned", ()))
+        masses = self.estimator.constraints.get("mass", {}).items()
+        known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
+        kept = kept | np.isin(self.model.layout.names, known)
         return tuple(np.where(kept, "prior", names).tolist())
 
     @property

@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
+_WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
 
 
 def build_result(
@@ -126,7 +127,7 @@ def read_result(path: str | Path) -> dict[str, Any]:
         raise DataError(f"there is no result {str(source)!r}")
     try:
         result = json.loads(source.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
+    except ValueError as error:  # no JSON, or no UTF-8
         raise DataError(f"{source.name} is not JSON: {error}") from error
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
@@ -134,6 +135,9 @@ def read_result(path: str | Path) -> dict[str, Any]:
             f"{source.name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
             "written by 'robotid identify'"
         )
+    missing = [key for key in _WANTED if key not in result]
+    if missing:
+        raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
     return dict(result)
 
 

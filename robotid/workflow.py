@@ -16,10 +16,11 @@ from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
 from robotid.doubts import doubts_of, is_outvoted
-from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
+from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.identification import Identification, conclude, identify, structural_mapping
 from robotid.inertial_audit import impossible_inertials
 from robotid.job import Job
+from robotid.locked_joints import check_locked
 from robotid.long_jobs import is_long, survey_logs
 from robotid.long_recordings import LongRecordings
 from robotid.model import RobotModel
@@ -62,6 +63,10 @@ def run_job(
         WorkerError: If a worker ends before its work.
     """
     model, target = job.model(), Path(folder)
+    if target.exists() and not target.is_dir():
+        raise SettingsError(
+            f"{str(target)!r} is a file, wanted a folder for the results; name another"
+        )
     chosen = plan or WorkPlan(job.workers or 1)
     checkpoint: Checkpoint | None = None
     if is_long(job, (*job.identification, *job.validation)):
@@ -80,8 +85,8 @@ def run_job(
     partial = Path(tempfile.mkdtemp(prefix=".robotid-", dir=target))
     try:
         outputs = {"report": "report.html"}
+        name = f"{Path(model.tree.path).stem}.identified.urdf"
         if identification.is_consistent:
-            name = f"{Path(model.tree.path).stem}.identified.urdf"
             sidecar = write_urdf(
                 model, identification.standard, partial / name, dynamics=job.dynamics
             )
@@ -91,6 +96,8 @@ def run_job(
         write_json(result, partial / "result.json")
         for made in sorted(partial.iterdir()):
             os.replace(made, target / made.name)
+        if "urdf" not in outputs:
+            _remove_urdf(target / name)
         identification = replace(identification, report=str(target / outputs["report"]))
     finally:
         shutil.rmtree(partial)
@@ -99,11 +106,20 @@ def run_job(
     return identification, result
 
 
+def _remove_urdf(urdf: Path) -> None:
+    """Remove the URDF and sidecar that an earlier run left, for they are not of this result."""
+    for stale in (urdf, urdf.with_suffix(".drive.json")):
+        if stale.exists():
+            _log.warning("%s is of an earlier run and was removed: this one wrote none", stale)
+            stale.unlink()
+
+
 def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding]]:
     """Identify from logs in memory."""
     logs = [job.read(entry, model) for entry in job.identification]
     kept = [job.read(entry, model) for entry in job.validation]
-    diagnosis = diagnose(model, logs, kept, job.signals)
+    held = check_locked(job, model, [*job.identification, *job.validation])
+    diagnosis = (*held, *diagnose(model, logs, kept, job.signals))
     alarms = alarming(diagnosis, job.ignore)
     with _explained(diagnosis):
         identification = identify(

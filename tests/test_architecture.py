@@ -31,7 +31,7 @@ FLOORS = {
     6: "recordings closed_loop conversion explanations load_checks cluster residuals torque_delay",
     7: "robust urdf job visualization report_plots paper_simulation paper_trajectories "
     "model_checks motion_checks long_logs work_plan",
-    8: "identification diagnosis_plots",
+    8: "locked_joints identification diagnosis_plots",
     9: "information online result inspection paper_errata consistency_findings long_recordings "
     "long_jobs report_consistency paper_replay",
     10: "comparison report_diagnosis doctor report_tables paper_plots paper_page tracking "

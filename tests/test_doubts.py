@@ -101,8 +101,24 @@ def test_a_stated_bound_that_binds_makes_it_usable(run):
     far = {"com": {"forearm_link": [[1, 1, 1], [1.2, 1.2, 1.2]]}}
     _, result, again = run(constraints=far)
     assert result["verdict"]["status"] == again["status"] == "usable"
-    bound = "centre_of_mass forearm_link: the data push against a stated bound"
+    bound = "centre_of_mass forearm_link: the data, or the masses that it leaves, speak against"
     assert bound in str(result["verdict"])
+    (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
+    assert "the data push against them at ['shoulder_pan_joint'," in finding["message"]
+
+
+def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(run):
+    found, result, _ = run(constraints={"total_mass": [10.0, 17.0]})
+    (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
+    assert found.doubts == ()
+    assert "the torque is explained as well as without" in finding["message"]
+    assert found.verdict.status == "good"
+
+
+def test_a_mass_that_is_stated_does_not_come_from_the_data(run):
+    _, result, _ = run(constraints={"mass": {"forearm_link": 2.0}})
+    (mass,) = [p for p in result["standard_parameters"] if p["name"] == "forearm_link.m"]
+    assert (mass["value"], mass["source"]) == (pytest.approx(2.0), "prior")
 
 
 def test_a_wrong_total_mass_makes_the_joints_usable_that_it_costs(run):

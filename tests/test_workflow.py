@@ -9,7 +9,8 @@ import pytest
 from synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.exceptions import DataError
+from robotid.estimator_settings import EstimatorSettings
+from robotid.exceptions import DataError, SettingsError
 from robotid.job import Job, LogEntry
 from robotid.log_files import write_log
 from robotid.workflow import run_job
@@ -29,6 +30,42 @@ def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(ur5, rng, tm
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("robotid: 0 torque rows")
     assert lines[1].startswith("  doctor: warning: ")
+
+
+def test_an_earlier_urdf_does_not_stay_beside_a_result_that_has_none(ur5, rng, tmp_path, caplog):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=1.0)
+    write_log(log, tmp_path / "run.csv")
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "run.csv"),))
+    out = tmp_path / "out"
+    _, result = run_job(replace(job, estimator=EstimatorSettings(draws=0)), out)
+    written = [out / result["outputs"][key] for key in ("urdf", "sidecar")]
+    assert all(path.exists() for path in written)
+    noisy = replace(log, tau=log.tau + 30.0 * rng.standard_normal(log.tau.shape))
+    write_log(noisy, tmp_path / "run.csv")
+    _, result = run_job(replace(job, estimator=EstimatorSettings(name="wls")), out)
+    assert set(result["outputs"]) == {"report"}
+    assert not any(path.exists() for path in written)
+    assert "is of an earlier run and was removed" in caplog.text
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(ur5, tmp_path):
+    (tmp_path / "out").write_text("")
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "none.csv"),))
+    with pytest.raises(SettingsError, match="out' is a file, wanted a folder for the results"):
+        run_job(job, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b'{"schema_version":1,"verdict":{}}', "has no ['settings', 'inputs', "),
+        (b"\xff\xfe", "is not JSON"),
+    ],
+)
+def test_a_result_that_is_none_is_refused(tmp_path, capsys, content, said):
+    (tmp_path / "result.json").write_bytes(content)
+    assert main(["validate", str(tmp_path / "result.json"), "run.csv"]) == 1
+    assert f"robotid: result.json {said}" in capsys.readouterr().err
 
 
 def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refused(
