@@ -45,8 +45,9 @@ __all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "joint_order", "locked_position", "position_offset", "position_order",
-    "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order", "velocity_scale",
+    "gravity", "joint_axis", "joint_order", "locked_position", "position_offset",
+    "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
+    "velocity_scale",
 )  # fmt: skip
 _RANK = {"error": 0, "warning": 1, "note": 2}
 

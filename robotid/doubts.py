@@ -19,6 +19,7 @@ _WORDS = {
     "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "
     "in another unit, masses and inertias are wrong in the same proportion",
     "gravity": "the direction of gravity may be stated wrongly",
+    "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
     "position_offset": "the zero of the position may be off",

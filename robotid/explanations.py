@@ -6,7 +6,7 @@ by any factor; signs, columns, gravity and positions may not.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -30,7 +30,7 @@ class Explanation:
 
     Attributes:
         kind: "stated", "payload", "torque_sign", "torque_order", "gravity", "joint_order",
-            "position_order", "position_sign" or "position_offset".
+            "joint_axis", "position_order", "position_sign" or "position_offset".
         share: Unexplained share of each torque's variance, shape (n,).
         joints: Indices of the joints concerned.
         values: "torque_order": which joint each torque column belongs to; "gravity": the vector
@@ -119,8 +119,10 @@ def _gravity(probe: Probe) -> Explanation:
         return Explanation("gravity", share, tuple(range(n)), tuple(g.tolist()))
 
     axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
-    best = min(map(explained, [probe.gravity, *axes]), key=lambda e: e.misfit)
+    best = min(map(explained, [probe.gravity, *axes, np.zeros(3)]), key=lambda e: e.misfit)
     start = np.array(best.values)
+    if not start.any():
+        return best
     # two directions across the start, on which the tangent of the tilt is measured
     _, _, frame = np.linalg.svd(start.reshape(1, 3))
     across = frame[1:]
@@ -137,7 +139,7 @@ def _gravity(probe: Probe) -> Explanation:
             "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60,
         },
     )  # fmt: skip
-    return explained(tilted(found.x)) if start.any() else best
+    return explained(tilted(found.x))
 
 
 def _positions(probe: Probe) -> Iterator[Explanation]:
@@ -155,6 +157,10 @@ def _positions(probe: Probe) -> Iterator[Explanation]:
     for j in turning:
         share = _own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
         yield Explanation("position_sign", share, (j,))
+    for j in range(n):
+        turned = small.with_motion(_moved(small, j, -1.0, 0.0))
+        sign = np.where(np.arange(n) == j, -1.0, 1.0)
+        yield Explanation("joint_axis", _own_share(replace(turned, tau=sign * small.tau)), (j,))
     offsets = [_offset(small, j, offset) for j in turning for offset in _OFFSETS]
     if offsets:
         yield _refined(small, min(offsets, key=lambda e: e.misfit))

@@ -33,9 +33,9 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         name: What the log is called.
 
     Yields:
-        Errors "torque_sign", "torque_order", "joint_order", "position_order", "position_sign",
-        "position_offset" or "gravity", or else what :func:`check_loads` yields; and
-        "unexplained_torque".
+        Errors "torque_sign", "torque_order", "joint_order", "joint_axis", "position_order",
+        "position_sign", "position_offset" or "gravity", or else what :func:`check_loads` yields;
+        and "unexplained_torque".
     """
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
@@ -100,16 +100,22 @@ def _position(
     if not _is_certain(best, gain):
         return
     joint = probe.model.joints[best.joints[0]]
-    if best.kind == "position_sign":
+    if best.kind == "joint_axis":
+        what = (
+            f"position and torque of {joint} have the opposite sign: its axis is reversed; turn "
+            f"the joint's axis in the URDF, or negate q_{joint}, dq_{joint} and tau_{joint}"
+        )
+    elif best.kind == "position_sign":
         what = f"the position of {joint} has the opposite sign; negate q_{joint} (and dq_{joint})"
     else:
         what = (
             f"the zero of {joint} is off by about {best.values[0]:.2g} rad; correct q_{joint} or "
             "the joint's origin in the URDF"
         )
+    worst = int(np.argmax(stated.share - best.share))
     message = (
-        f"{name}: {what}: so read, the unexplained share of the worst torque falls from "
-        f"{100 * stated.share.max():.2g} to {100 * best.share.max():.2g} %"
+        f"{name}: {what}: so read, the unexplained share of {probe.model.joints[worst]}'s torque "
+        f"falls from {100 * stated.share[worst]:.3g} to {100 * best.share[worst]:.3g} %"
     )
     where = f"{name}: {joint}"
     yield Finding(best.kind, "error", where, message, _shares(stated, best, gain))
@@ -120,6 +126,15 @@ def _gravity(
 ) -> Iterator[Finding]:
     g, believed = np.array(best.values), probe.gravity
     size = float(np.linalg.norm(believed))
+    if not g.any():
+        if size > 0 and _is_certain(best, gain):
+            message = (
+                f"{name}: the torques hold no gravity: without it they are explained best; they "
+                "may be those of a gravity-compensated channel: log the torque of the motor, or "
+                "state gravity = [0, 0, 0] for what is left"
+            )
+            yield Finding("gravity", "error", name, message, {"gain": gain})
+        return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     turned = angle > _TURNED and _is_certain(best, gain)
@@ -143,6 +158,7 @@ _FINDINGS: dict[str, _Maker] = {
     "torque_order": _exchanged,
     "joint_order": _exchanged,
     "position_order": _exchanged,
+    "joint_axis": _position,
     "position_sign": _position,
     "position_offset": _position,
     "gravity": _gravity,

@@ -143,6 +143,8 @@ CASES = {
     "one velocity negated": Case(("velocity_sign",), scaled("dq_elbow", -1)),
     "one axis negated": Case(("position_sign",), both(
         scaled("q_elbow", -1), scaled("dq_elbow", -1))),
+    "one joint reversed whole": Case(("joint_axis",), both(
+        scaled("q_elbow", -1), scaled("dq_elbow", -1), scaled("tau_elbow", -1))),
     "degrees": Case(("angle_unit",), both(scaled("q_", 57.29578), scaled("dq_", 57.29578))),
     "velocity in degrees": Case(("angle_unit",), scaled("dq_", 57.29578)),
     "one velocity halved": Case(("velocity_scale",), scaled("dq_elbow", 0.5)),
