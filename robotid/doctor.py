@@ -20,7 +20,7 @@ from robotid.channel_checks import (
     check_velocity_scale,
 )
 from robotid.data import Log, Trajectory
-from robotid.doubts import DOUBTFUL
+from robotid.doubts import DOUBTFUL, is_outvoted
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification import structural_mapping
 from robotid.job import Job, LogEntry
@@ -106,12 +106,15 @@ def diagnose(
     return _sorted(findings)
 
 
-def alarming(findings: Sequence[Finding], ignore: Sequence[str]) -> tuple[Finding, ...]:
+def alarming(
+    findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
+) -> tuple[Finding, ...]:
     """Return the findings that make an identification wrong, but for those the user knows better.
 
     Args:
         findings: What the doctor found.
         ignore: Codes of errors, or of what makes a result doubtful, that the user knows better.
+        is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
 
     Returns:
         The errors that are not ignored.
@@ -125,7 +128,8 @@ def alarming(findings: Sequence[Finding], ignore: Sequence[str]) -> tuple[Findin
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
             raise SettingsError(f"doctor: ignore names {code!r}, wanted some of {known}{hint}")
-    return tuple(f for f in findings if f.severity == "error" and f.code not in ignore)
+    errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
+    return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
 
 
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:

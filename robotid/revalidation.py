@@ -6,7 +6,7 @@ from typing import Any
 
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
-from robotid.doubts import doubts_of, is_outvoted
+from robotid.doubts import doubts_of
 from robotid.identification import structural_mapping
 from robotid.job import Job, LogEntry, job_from_settings
 from robotid.long_jobs import is_long, survey_logs
@@ -116,6 +116,7 @@ def _verdict(
         for finding in diagnose(model, fitted, looks, job.signals)
         if finding.where.split(": ")[0] in names and finding.code not in job.ignore
     ]
+    alarms = alarming(found, job.ignore, is_robust=job.estimator.robust != "none")
     stated = result["verdict"]
     return judge(
         Metrics({}, 0.0),
@@ -123,7 +124,7 @@ def _verdict(
         undetermined=result["structure"]["undetermined"],
         is_consistent=result["consistency"]["is_consistent"],
         joints=model.joints,
-        alarms=list(dict.fromkeys([*stated.get("alarms", ()), *_alarms(job, found)])),
+        alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
         refitted=[
             e.recording.name
@@ -131,12 +132,6 @@ def _verdict(
             if is_refitted
         ],
     )
-
-
-def _alarms(job: Job, found: Sequence[Finding]) -> list[str]:
-    is_robust = job.estimator.robust != "none"
-    alarms = alarming(found, job.ignore)
-    return [finding.message for finding in alarms if not (is_robust and is_outvoted(finding))]
 
 
 def _doubts(

@@ -15,7 +15,7 @@ from robotid.checkpoint_inputs import checkpoint_inputs
 from robotid.consistency_findings import consistency_findings
 from robotid.data import Log
 from robotid.doctor import alarming, diagnose
-from robotid.doubts import doubts_of, is_outvoted
+from robotid.doubts import doubts_of
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.identification import Identification, conclude, identify, structural_mapping
 from robotid.inertial_audit import impossible_inertials
@@ -120,7 +120,7 @@ def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding
     kept = [job.read(entry, model) for entry in job.validation]
     held = check_locked(job, model, [*job.identification, *job.validation])
     diagnosis = (*held, *diagnose(model, logs, kept, job.signals))
-    alarms = alarming(diagnosis, job.ignore)
+    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.robust != "none")
     with _explained(diagnosis):
         identification = identify(
             model, logs, validation=kept, signals=job.signals, estimator=job.estimator
@@ -141,7 +141,7 @@ def _identify_long(
         [look for log in some for look in log.looks] for some in (logs, kept)
     )
     diagnosis = diagnose(model, fitted_looks, kept_looks, job.signals)
-    alarms = alarming(diagnosis, job.ignore)
+    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.robust != "none")
     pieces = [piece for log in logs for piece in log.pieces]
     checkpoint = Checkpoint.open(folder, checkpoint_inputs(job), pieces, resume=plan.resume)
     with plan, _explained(diagnosis):
@@ -176,8 +176,7 @@ def _with_alarms(
     findings += impossible_inertials(model)
     # what the motion excites the fit tells from all rows: finding "undetermined"
     findings += [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
-    is_robust = job.estimator.robust != "none"
-    messages = tuple(f.message for f in alarms if not (is_robust and is_outvoted(f)))
+    messages = tuple(finding.message for finding in alarms)
     return replace(identification, alarms=messages), findings
 
 
