@@ -24,15 +24,15 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from corruptions import CASES, ROBOTS, clean_log, robot, table_of
+from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
 
-from robotid.doctor import diagnose, examine
-from robotid.examples import example_urdf
-from robotid.job import Job, LogEntry, read_job
-from robotid.parameters import INERTIAL_TERMS
-from robotid.signals import SignalSettings
-from robotid.simulation import another_robot
-from robotid.tables import write_columns
+from robotid.commands.job import Job, LogEntry, read_job
+from robotid.doctor.diagnosis import diagnose, examine
+from robotid.logs.formats import write_columns
+from robotid.logs.signals import SignalSettings
+from robotid.robot.examples import example_urdf
+from robotid.robot.parameters import INERTIAL_TERMS
+from robotid.simulation.closed_loop import another_robot
 
 DURATIONS = (8.0, 20.0)  # [s] of clean logs
 

@@ -21,8 +21,8 @@ import numpy as np
 from bench_figaroh import compare
 from setting import ROBOTS, full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
-from robotid.compiled import is_installed
-from robotid.identification import structural_mapping
+from robotid.identification.pipeline import structural_mapping
+from robotid.regressor.compiled import is_installed
 
 README = Path(__file__).parents[1] / "README.md"
 README_SIZES = (10_000, 100_000, 1_000_000)

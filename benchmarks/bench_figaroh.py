@@ -80,7 +80,7 @@ def compare(python, samples):
     """Return wall-clock and processor time [s], memory [MiB] and version of each way."""
     from setting import motion, robot
 
-    from robotid.compiled import is_installed
+    from robotid.regressor.compiled import is_installed
 
     model = robot("panda")
     trajectory = motion(model, samples, np.random.default_rng(0))
@@ -171,9 +171,9 @@ def robotid(compiled):
     from setting import identify, robot
 
     from robotid import __version__
-    from robotid.data import Trajectory
-    from robotid.identification import structural_mapping
-    from robotid.regressor import joint_torque_regressor
+    from robotid.identification.pipeline import structural_mapping
+    from robotid.logs.data import Trajectory
+    from robotid.regressor.torque import joint_torque_regressor
 
     model = robot("panda")
 

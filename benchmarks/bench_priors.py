@@ -20,15 +20,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 import numpy as np
 from setting import machine, robot
 
-from robotid.data import Log
-from robotid.estimator_settings import EstimatorSettings
-from robotid.excitation import random_fourier
-from robotid.identification import identify
-from robotid.job import read_job
-from robotid.regressor import joint_torque_regressor
-from robotid.signals import SignalSettings
-from robotid.simulation import another_robot
-from robotid.validation import pool
+from robotid.commands.job import read_job
+from robotid.identification.evaluation import pool
+from robotid.identification.pipeline import identify
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.data import Log
+from robotid.logs.signals import SignalSettings
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.simulation.closed_loop import another_robot
+from robotid.simulation.motions import random_fourier
 
 JOBS = Path(__file__).parents[1] / "tests" / "jobs"
 DATA = os.environ.get("ROBOTID_DATA")

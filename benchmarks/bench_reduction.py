@@ -14,9 +14,9 @@ import numpy as np
 import scipy.linalg
 from setting import ROBOTS, machine, motion, robot, rows_of, side_by_side
 
-from robotid.identification import structural_mapping
-from robotid.lapack import Triangle
-from robotid.regressor import build_problem
+from robotid.identification.pipeline import structural_mapping
+from robotid.regressor.lapack import Triangle
+from robotid.regressor.torque import build_problem
 
 
 def main():

@@ -13,8 +13,8 @@ import argparse
 import numpy as np
 from setting import ROBOTS, bare_loop, exhaust, machine, motion, robot, rows_of, side_by_side
 
-from robotid.compiled import is_installed
-from robotid.regressor import build_problem
+from robotid.regressor.compiled import is_installed
+from robotid.regressor.torque import build_problem
 
 
 def main():

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from browsing import FLAGS, NAMES
+from helpers.browsing import FLAGS, NAMES
 
-from robotid.examples import example_urdf
-from robotid.model import RobotModel
-from robotid.visualization import Torques, replay
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.viewer.replays import Torques, replay
 
 FRAMES = "[replay.clock.frames, replay.clock.at / 1000]"
 

@@ -18,7 +18,7 @@ import time
 
 from setting import machine
 
-from robotid.compiled import is_installed
+from robotid.regressor.compiled import is_installed
 
 PROGRAMS = {
     "bare Python": ["-c", ""],
@@ -31,11 +31,11 @@ PROGRAMS = {
 FIRST_USE = """
 import time
 import numpy as np
-from robotid.data import Trajectory
-from robotid.examples import example_urdf
-from robotid.factors import compress
-from robotid.model import RobotModel
-from robotid.regressor import build_problem
+from robotid.logs.data import Trajectory
+from robotid.robot.examples import example_urdf
+from robotid.regressor.factors import compress
+from robotid.robot.model import RobotModel
+from robotid.regressor.torque import build_problem
 model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"))
 x = np.ones((64, 6))
 log = Trajectory(t=np.arange(64.0), q=x, v=x, a=x, tau=x, joints=model.joints, rate=1.0,

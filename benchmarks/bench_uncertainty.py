@@ -21,14 +21,14 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from robotid.data import Log
-from robotid.excitation import random_fourier
-from robotid.identification import identify, structural_mapping
-from robotid.parameters import inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.regressor import joint_torque_regressor
-from robotid.signals import SignalSettings
-from robotid.simulation import another_robot
-from robotid.uncertainty import quantile
+from robotid.logs.data import Log
+from robotid.simulation.motions import random_fourier
+from robotid.identification.pipeline import identify, structural_mapping
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.logs.signals import SignalSettings
+from robotid.simulation.closed_loop import another_robot
+from robotid.identification.uncertainty import quantile
 
 CHAINS = {"filtered": SignalSettings(), "raw": SignalSettings(cutoff=None)}
 NOISES = ("white", "unequal", "coloured")

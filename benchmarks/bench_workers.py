@@ -19,12 +19,12 @@ from pathlib import Path
 import bench_memory
 from setting import ROBOTS, machine
 
-from robotid.examples import example_urdf
-from robotid.identification import structural_mapping
-from robotid.job import Job, LogEntry
-from robotid.long_jobs import survey_logs
-from robotid.pieces import join
-from robotid.work_plan import WorkPlan
+from robotid.commands.job import Job, LogEntry
+from robotid.commands.logs import survey_logs
+from robotid.identification.pipeline import structural_mapping
+from robotid.robot.examples import example_urdf
+from robotid.workers.pieces import join
+from robotid.workers.plan import WorkPlan
 
 WRITE = Path(bench_memory.__file__)
 

@@ -13,14 +13,14 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 import pinocchio as pin
 
-from robotid.data import Trajectory
 from robotid.estimators import WLS
-from robotid.examples import example_urdf
-from robotid.excitation import random_fourier
-from robotid.factors import compress
-from robotid.identification import structural_mapping
-from robotid.model import RobotModel
-from robotid.regressor import build_problem
+from robotid.identification.pipeline import structural_mapping
+from robotid.logs.data import Trajectory
+from robotid.regressor.factors import compress
+from robotid.regressor.torque import build_problem
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.motions import random_fourier
 
 PLANAR = Path(__file__).parents[1] / "urdf" / "planar_2r.urdf"
 ROBOTS = {

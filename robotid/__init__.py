@@ -4,22 +4,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robotid.base_parameters import BaseMapping
-    from robotid.data import Log, Trajectory
+    from robotid.commands.job import read_job
+    from robotid.commands.replay import replay_identified
     from robotid.estimators import OLS, WLS, Consistent, Estimate, Estimator
     from robotid.exceptions import DataError, ModelError, RobotIdError
-    from robotid.identification import EstimatorSettings, Identification, identify
-    from robotid.job import read_job
-    from robotid.log_files import read_log, write_log
-    from robotid.log_source import LogSource
-    from robotid.model import RobotModel
-    from robotid.parameters import Coupling
-    from robotid.replay_job import replay_identified
-    from robotid.report import write_report
-    from robotid.signals import SignalSettings
-    from robotid.units import LogUnits
-    from robotid.urdf import write_urdf
-    from robotid.visualization import replay
+    from robotid.export.urdf import write_urdf
+    from robotid.identification.pipeline import EstimatorSettings, Identification, identify
+    from robotid.logs.data import Log, Trajectory
+    from robotid.logs.read import read_log, write_log
+    from robotid.logs.signals import SignalSettings
+    from robotid.logs.table import LogSource
+    from robotid.logs.units import LogUnits
+    from robotid.regressor.base_parameters import BaseMapping
+    from robotid.report.document import write_report
+    from robotid.robot.model import RobotModel
+    from robotid.robot.parameters import Coupling
+    from robotid.viewer.replays import replay
 
 __version__ = "0.1.0"
 
@@ -54,22 +54,22 @@ __all__ = [
 ]
 
 _HOMES = {
-    "base_parameters": ["BaseMapping"],
-    "data": ["Log", "Trajectory"],
+    "regressor.base_parameters": ["BaseMapping"],
+    "logs.data": ["Log", "Trajectory"],
     "estimators": ["OLS", "WLS", "Consistent", "Estimate", "Estimator"],
     "exceptions": ["DataError", "ModelError", "RobotIdError"],
-    "identification": ["EstimatorSettings", "Identification", "identify"],
-    "job": ["read_job"],
-    "log_files": ["read_log", "write_log"],
-    "log_source": ["LogSource"],
-    "model": ["RobotModel"],
-    "parameters": ["Coupling"],
-    "replay_job": ["replay_identified"],
-    "report": ["write_report"],
-    "signals": ["SignalSettings"],
-    "units": ["LogUnits"],
-    "urdf": ["write_urdf"],
-    "visualization": ["replay"],
+    "identification.pipeline": ["EstimatorSettings", "Identification", "identify"],
+    "commands.job": ["read_job"],
+    "logs.read": ["read_log", "write_log"],
+    "logs.table": ["LogSource"],
+    "robot.model": ["RobotModel"],
+    "robot.parameters": ["Coupling"],
+    "commands.replay": ["replay_identified"],
+    "report.document": ["write_report"],
+    "logs.signals": ["SignalSettings"],
+    "logs.units": ["LogUnits"],
+    "export.urdf": ["write_urdf"],
+    "viewer.replays": ["replay"],
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from robotid import __version__
-from robotid.console import (
+from robotid.commands.console import (
     print_comparison,
     print_error,
     print_files,
@@ -17,8 +17,7 @@ from robotid.console import (
     print_verdict,
     shown_log,
 )
-from robotid.exceptions import RobotIdError, SettingsError
-from robotid.flags import (
+from robotid.commands.flags import (
     add_job_flags,
     add_log_flags,
     add_source_flags,
@@ -26,11 +25,12 @@ from robotid.flags import (
     refuse_log_flags,
     source_settings,
 )
-from robotid.progress import terminal_progress
-from robotid.work_flags import add_progress_flags, add_verbose_flag, add_work_flags
+from robotid.commands.progress import terminal_progress
+from robotid.commands.work_flags import add_progress_flags, add_verbose_flag, add_work_flags
+from robotid.exceptions import RobotIdError, SettingsError
 
 if TYPE_CHECKING:
-    from robotid.job import Job
+    from robotid.commands.job import Job
 
 __all__ = ["main"]
 
@@ -166,7 +166,7 @@ def _add_serve_flags(parser: argparse.ArgumentParser, help_: str) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from robotid.demo import run_demo
+    from robotid.commands.demo import run_demo
 
     print("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
     identification, result, truth = run_demo(options.out)
@@ -178,8 +178,8 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _paper(options: argparse.Namespace) -> None:
-    from robotid.paper import run_paper
-    from robotid.paper_simulation import PaperSettings
+    from robotid.paper.run import run_paper
+    from robotid.paper.study import PaperSettings
 
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
     with terminal_progress(quiet=options.json, force=options.progress) as progress:
@@ -194,8 +194,8 @@ def _paper(options: argparse.Namespace) -> None:
 
 
 def _inspect(options: argparse.Namespace) -> None:
+    from robotid.doctor.urdf import inspect_urdf
     from robotid.exceptions import ModelError
-    from robotid.inspection import inspect_urdf
 
     inspection = inspect_urdf(options.urdf, free_flyer=options.free_flyer)
     content = inspection.to_dict()
@@ -208,8 +208,8 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    from robotid.work_plan import WorkPlan
-    from robotid.workflow import run_job
+    from robotid.commands.identify import run_job
+    from robotid.workers.plan import WorkPlan
 
     job = job_from_flags(options)
     workers = job.workers if options.workers is None else options.workers
@@ -224,7 +224,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _track(options: argparse.Namespace) -> None:
-    from robotid.tracking import run_track
+    from robotid.online.tracking import run_track
 
     job = job_from_flags(options)
     if options.serve is not None:
@@ -255,7 +255,7 @@ def _print_track(found: dict[str, Any], options: argparse.Namespace) -> None:
 
 
 def _replay(options: argparse.Namespace) -> None:
-    from robotid.replay_job import read_findings, replay_files, stated_job
+    from robotid.commands.replay import read_findings, replay_files, stated_job
 
     findings = read_findings(options.results)
     if findings.settings is None:
@@ -272,7 +272,7 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
-    from robotid.live import serve_track
+    from robotid.viewer.server import serve_track
 
     def announce(url: str) -> None:
         print(f"live: {url}  (Ctrl-C ends it)", file=sys.stderr, flush=True)
@@ -290,7 +290,7 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from robotid.doctor import alarming, examine, findings_to_dict
+    from robotid.doctor.diagnosis import alarming, examine, findings_to_dict
 
     job = job_from_flags(options)
     findings = examine(job)
@@ -307,7 +307,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> None:
-    from robotid.revalidation import validate_result
+    from robotid.commands.validate import validate_result
 
     found = validate_result(options.result, options.logs)
     if options.json:
@@ -321,8 +321,8 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from robotid.comparison import compare_results
-    from robotid.comparison_page import write_comparison
+    from robotid.report.comparison import compare_results
+    from robotid.report.comparison_page import write_comparison
 
     if options.out:
         content = write_comparison(options.results, options.out)
@@ -339,8 +339,8 @@ def _compare(options: argparse.Namespace) -> None:
 def _convert(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
-    from robotid.conversion import convert
-    from robotid.log_source import LogSource
+    from robotid.commands.convert import convert
+    from robotid.logs.table import LogSource
 
     joints = options.joints.split(",") if options.joints else None
     source = LogSource(**source_settings(options))

@@ -3,13 +3,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browsing import launch
+from helpers.browsing import launch
+from helpers.paths import IN_CI, ROOT
 
-from robotid.examples import example_urdf
-from robotid.model import RobotModel
-
-ROOT = Path(__file__).resolve().parents[1]
-IN_CI = os.environ.get("CI") == "true"
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 
 @pytest.fixture

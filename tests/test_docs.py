@@ -3,12 +3,12 @@
 import re
 
 import pytest
-from conftest import ROOT
-from corruptions import CASES
-from synthetic import exact_log, truth
+from helpers.corruptions import CASES
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
 
-from robotid.examples import example_urdf
-from robotid.log_files import write_log
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
 
 DOCS, README = ROOT / "docs", ROOT / "README.md"
 

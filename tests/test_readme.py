@@ -5,12 +5,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from synthetic import exact_log, truth
+from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.examples import example_urdf
-from robotid.job import job_from_settings
-from robotid.log_files import write_log
+from robotid.commands.job import job_from_settings
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()

@@ -9,9 +9,9 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.factors import Factors, compress
-from robotid.problem import Problem
-from robotid.summaries import estimate_html, estimate_line, estimate_text
+from robotid.identification.summary import estimate_html, estimate_line, estimate_text
+from robotid.regressor.factors import Factors, compress
+from robotid.regressor.problem import Problem
 
 __all__ = ["Estimate", "Estimator", "as_factors", "require_rows"]
 

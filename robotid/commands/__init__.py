@@ -1,0 +1,3 @@
+"""One module per command: files in, files out."""
+
+__all__: list[str] = []

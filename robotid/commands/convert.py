@@ -1,0 +1,110 @@
+"""Conversion of log files: any format that is read to any that is written, numbers unchanged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from robotid.exceptions import DataError
+from robotid.logs.data import repeated, suggestion
+from robotid.logs.formats import open_table, write_columns
+from robotid.logs.table import LogSource, prefixes
+
+__all__ = ["Conversion", "convert"]
+
+_WHOLE = LogSource()
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What a conversion wrote.
+
+    Attributes:
+        path: The file written.
+        samples: Number of its rows.
+        columns: Its columns, of standard names.
+        joints: The joints they are of.
+        ignored: Columns of the file read that are no joint's quantity.
+    """
+
+    path: str
+    samples: int
+    columns: tuple[str, ...]
+    joints: tuple[str, ...]
+    ignored: tuple[str, ...]
+
+
+def convert(
+    path: str | Path,
+    target: str | Path,
+    *,
+    joints: Sequence[str] | None = None,
+    source: LogSource = _WHOLE,
+) -> Conversion:
+    """Write a log in another format, with standard column names; the robot need not be known.
+
+    Numbers and their units stay as they are; what they mean is judged when the log is read.
+
+    Args:
+        path: The log to read.
+        target: The file to write, .csv, .parquet, .npz, .h5, .hdf5 or .mat; replaced if it exists.
+        joints: Names of the joints to write; all that are found if None.
+        source: Which topic or group, names of joints in the file, meaning of effort.
+
+    Returns:
+        What was written.
+
+    Raises:
+        DataError: If the file cannot be read, has no time, or does not hold a joint.
+        MissingDependencyError: If a package that reads or writes a format is not installed.
+    """
+    file = Path(path)
+    opened = open_table(file, source)
+    found, by_joint = _standard_names(file.name, opened.names, source)
+    for joint in joints or ():
+        if joint not in by_joint:
+            raise DataError(
+                f"{file.name} has no joint {joint!r}; joints found: {list(by_joint)}"
+                f"{suggestion(joint, by_joint)}"
+            )
+    kept = tuple(by_joint) if joints is None else tuple(joints)
+    chosen = ["time", *(name for joint in kept for name in by_joint[joint])]
+    columns = [name for name in found if name in chosen]
+    table = opened.read([found[name] for name in columns])
+    write_columns({name: table[found[name]] for name in columns}, Path(target))
+    return Conversion(
+        path=str(target),
+        samples=len(table[found["time"]]),
+        columns=tuple(columns),
+        joints=kept,
+        ignored=tuple(name for name in opened.names if name not in found.values()),
+    )
+
+
+def _standard_names(
+    where: str, names: Sequence[str], source: LogSource
+) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Return the columns by standard name, ordered by quantity, and the standard names by joint."""
+    joint_of = {name: joint for joint, name in source.joints.items()}
+    pairs = [("time", name) for name in names if name in ("time", "t")]
+    by_joint: dict[str, list[str]] = {}
+    for kind, starts in prefixes(source.effort).items():
+        for name in names:
+            start = next((s for s in starts if name.startswith(s) and name != s), None)
+            if start is None:
+                continue
+            named = name[len(start) :]
+            joint = joint_of.get(named, named)
+            pairs.append((f"{kind}_{joint}", name))
+            by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
+    if twice := repeated([standard for standard, _ in pairs]):
+        both = [name for standard, name in pairs if standard == twice[0]]
+        raise DataError(f"{where} has {both}, several names of {twice[0]!r}; remove all but one")
+    found = dict(pairs)
+    if "time" not in found:
+        raise DataError(f"{where} has no column 'time'; columns found: {list(names)}. Rename it")
+    if not by_joint:
+        raise DataError(
+            f"{where} has no column of a joint, as 'q_<joint>'; columns found: {list(names)}. "
+            "Rename them"
+        )
+    return found, by_joint

@@ -1,0 +1,255 @@
+"""A replay from files: the log, what results predict of it, what a tracker saw, a ghost."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.exceptions import DataError, SettingsError
+from robotid.export.result import read_result, stated_parameters
+from robotid.identification.evaluation import predict, prepare
+from robotid.identification.pipeline import Identification
+from robotid.logs.data import Log
+from robotid.logs.formats import open_table
+from robotid.logs.table import LogSource, prefixes
+from robotid.robot.model import RobotModel
+from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
+from robotid.viewer.unexplained import find_surprises
+
+__all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What identifications and a tracker found, as read from their files.
+
+    Attributes:
+        results: Contents of result.json, by label.
+        track: Content of a track.json; None if there is none.
+        folder: Folder of the track.json, which its history is in.
+    """
+
+    results: Mapping[str, Mapping[str, Any]]
+    track: Mapping[str, Any] | None = None
+    folder: Path | None = None
+
+    @property
+    def settings(self) -> Mapping[str, Any] | None:
+        """The job that the first of them ran, None without any."""
+        for content in (*self.results.values(), self.track):
+            if content is not None:
+                return dict(content["settings"])
+        return None
+
+
+def read_findings(paths: Sequence[str | Path]) -> Findings:
+    """Read results to show.
+
+    Args:
+        paths: Each a result.json, a track.json, or a folder with one or both.
+
+    Returns:
+        What they hold; a result is called by its folder.
+
+    Raises:
+        DataError: If a file cannot be used, or there are two tracks.
+    """
+    results: dict[str, Mapping[str, Any]] = {}
+    tracks: list[tuple[Path, Mapping[str, Any]]] = []
+    for path in map(Path, paths):
+        files = [path]
+        if path.is_dir():
+            files = [path / name for name in ("result.json", "track.json")]
+            files = [file for file in files if file.is_file()]
+            if not files:
+                raise DataError(f"there is no result.json or track.json in {str(path)!r}")
+        for file in files:
+            track = _track(file)
+            if track is not None:
+                tracks.append((file.parent, track))
+                continue
+            name = file.resolve().parent.name if len(paths) > 1 else "identified"
+            label = name if name not in results else f"{name} {len(results) + 1}"
+            results[label] = read_result(file)
+    if len(tracks) > 1:
+        raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
+    folder, content = tracks[0] if tracks else (None, None)
+    return Findings(results, content, folder)
+
+
+def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
+    """Return the job whose results are shown, with a URDF and a log of its own.
+
+    Args:
+        findings: At least one result or track.
+        urdf: The URDF to show.
+        log: The log to play.
+
+    Returns:
+        The job: it says which joints move and how logs are read.
+
+    Raises:
+        SettingsError: If the settings in the file cannot be used, or there is none.
+    """
+    settings = findings.settings
+    if settings is None:
+        raise SettingsError("there is no result whose settings could be used")
+    table = {key: value for key, value in settings.items() if value != {}}
+    job = job_from_settings(table, "settings of the result", Path())
+    return replace(job, urdf=Path(urdf), identification=(LogEntry(Path(log)),), validation=())
+
+
+def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
+    """Return the replay of a log.
+
+    Args:
+        job: The robot, its one log, and how logs are read.
+        findings: What to show beside it.
+        ghost: A second log, of a designed or a simulated motion, to show as a ghost.
+
+    Returns:
+        The page.
+
+    Raises:
+        DataError: If a log or a result cannot be used.
+        ModelError: If the URDF cannot be used, or a result is of another robot.
+        SettingsError: If a setting does not fit.
+    """
+    model = job.model()
+    (entry,) = job.identification
+    motion = job.read(entry, model)
+    vectors = {label: stated_parameters(r, model) for label, r in findings.results.items()}
+    second = None
+    if ghost is not None:
+        second = (Path(ghost).name, *_ghost(job, model, Path(ghost)))
+    prior = model.standard_parameters()
+    torques = _torques(job, model, motion, vectors)
+    return replay(
+        model,
+        motion.t,
+        motion.q,
+        torques=torques,
+        masses={"URDF": prior, **vectors} if vectors else None,
+        ghost=second,
+        bands=None if findings.track is None else _bands(findings),
+        marks=[*_payloads(findings.track), *_contacts(torques, model)],
+        notes=[f"Motion: {entry.path.name}."],
+    )
+
+
+def replay_identified(identification: Identification) -> Replay:
+    """Return the replay of an identification: its last recording, kept apart if there is one.
+
+    Args:
+        identification: What was found.
+
+    Returns:
+        The page: measured and predicted torque, masses before and after.
+    """
+    shown = (*identification.identification, *identification.validation)[-1]
+    motion = shown.recording.trajectory
+    predicted = _sure(shown.torques["estimate"], shown.recording.mask)
+    return replay(
+        identification.model,
+        motion.t,
+        motion.q,
+        torques=Torques(motion.t, motion.tau, {"identified": predicted}),
+        masses={"URDF": identification.prior, "identified": identification.standard},
+        notes=[f"Motion: {shown.recording.name}."],
+    )
+
+
+def _ghost(job: Job, model: RobotModel, path: Path) -> tuple[Array, Array]:
+    """Return times and positions of a second motion, which need not have torques."""
+    table = open_table(path, job.source)
+    starts = prefixes()
+    torques = (*starts["tau"], *starts["current"])
+    if any(name.startswith(torques) for name in table.names):
+        log = job.read(LogEntry(path), model)
+        return log.t, log.q
+    found = []
+    for wanted in [("time", "t"), *([s + joint for s in starts["q"]] for joint in model.joints)]:
+        name = next((name for name in wanted if name in table.names), None)
+        if name is None:
+            raise DataError(f"{path.name} has no column {wanted[0]!r}; columns: {table.names}")
+        found.append(name)
+    columns = table.read(found)
+    return columns[found[0]], np.column_stack([columns[name] for name in found[1:]])
+
+
+def _track(path: Path) -> Mapping[str, Any] | None:
+    """Return the content of a track.json; None if the file is another one, or none."""
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return None
+    is_track = isinstance(content, dict) and {"history", "changes"} <= set(content)
+    return content if is_track else None
+
+
+def _torques(job: Job, model: RobotModel, log: Log, vectors: Mapping[str, Array]) -> Torques:
+    if not vectors:
+        return Torques(log.t, log.tau)
+    recording = prepare(model, log, job.signals)
+    motion = recording.trajectory
+    predicted = predict(model, list(vectors.values()), motion)
+    shown = [_sure(torque, recording.mask) for torque in predicted]
+    return Torques(motion.t, motion.tau, dict(zip(vectors, shown, strict=True)))
+
+
+def _sure(torque: Array, mask: Array) -> Array:
+    """Return a prediction without the rows of joints that stand still: friction has no sign."""
+    return np.where(mask, torque, np.nan)
+
+
+def _bands(findings: Findings) -> Bands:
+    track, folder = findings.track, findings.folder
+    if track is None or folder is None:
+        raise DataError("there is no track to show")
+    table = open_table(folder / track["history"], LogSource())
+    entries = track["base_parameters"]
+    names = [entry["name"] for entry in entries]
+    wanted = ("time", *names, *(f"{name}.std_error" for name in names))
+    missing = [name for name in wanted if name not in table.names]
+    if missing:
+        raise DataError(f"{track['history']} has no column {missing[0]!r}; track the log again")
+    errors = [f"{name}.std_error" for name in names]
+    columns = table.read(["time", *names, *errors])
+    return Bands(
+        t=columns["time"],
+        names=names,
+        units=[entry["unit"] for entry in entries],
+        theta=np.column_stack([columns[name] for name in names]),
+        std_error=np.column_stack([columns[name] for name in errors]),
+    )
+
+
+def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
+    marks = []
+    for change in [] if track is None else track["changes"]:
+        load = change["payload"]
+        label = f"payload {load['mass']:.2f} ± {load['std_error']:.2f} kg on {load['body']}"
+        marks.append(Mark(change["onset"], label, "payload"))
+    return marks
+
+
+def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
+    """Return marks where the first result does not explain the torque."""
+    if not torques.predicted:
+        return []
+    predicted = next(iter(torques.predicted.values()))
+    units = dict(zip(model.joints, model.row_units, strict=True))
+    marks = []
+    for found in find_surprises(torques.t, torques.measured, predicted, model.joints):
+        size = f"{found.residual:.2g} {units[found.joint]} on average"
+        label = f"unexplained torque, most at {found.joint} ({size}, for "
+        label += f"{found.end - found.start:.1f} s): contact or load?"
+        marks.append(Mark(found.start, label, "contact"))
+    return marks

@@ -1,0 +1,161 @@
+"""Validation of a written result on other logs, and whether it shows a prediction."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.commands.logs import is_long, survey_logs
+from robotid.doctor.diagnosis import alarming, diagnose
+from robotid.export.result import file_sha256, read_result, recording_metrics, stated_parameters
+from robotid.export.sidecar import load_identified
+from robotid.identification.doubts import doubts_of
+from robotid.identification.evaluation import Evaluation, evaluate, prepare, shares_rows
+from robotid.identification.long_recordings import evaluate_long
+from robotid.identification.metrics import Metrics
+from robotid.identification.pipeline import structural_mapping
+from robotid.identification.verdict import Doubt, Finding, Verdict, judge
+from robotid.logs.data import Log
+from robotid.robot.model import RobotModel
+
+__all__ = ["validate_result"]
+
+
+def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, Any]:
+    """Measure the prediction of a written result on other logs.
+
+    Where the result has a URDF, that file and its sidecar predict; they are what a user ships. The
+    doctor examines the logs, and those that hold fitted rows show no prediction.
+
+    Args:
+        path: A result.json.
+        logs: Logs of the same robot.
+
+    Returns:
+        {"result", "predicted_with", "validation": [...], "verdict": {...}}, as in result.json.
+
+    Raises:
+        DataError: If the result or a log cannot be used.
+        ModelError: If the URDF is missing or was changed.
+        SettingsError: If the settings in the result are not usable.
+    """
+    result = read_result(path)
+    folder = Path(path).parent
+    settings = {key: value for key, value in result["settings"].items() if value != {}}
+    job = job_from_settings(settings, Path(path).name, Path())
+    source = job.model()
+    outputs = result["outputs"]
+    if "urdf" in outputs:
+        model, pi = load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
+    else:
+        model, pi = source, stated_parameters(result, source)
+    prior = source.standard_parameters()
+    entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
+    if is_long(job, entries):
+        surveyed = survey_logs(job, entries, model, structural_mapping(model))
+        evaluations = [evaluate_long(log, parameters, prior) for log in surveyed]
+        kept = [log.looks for log in surveyed]
+    else:
+        read = [job.read(entry, model) for entry in entries]
+        recordings = [prepare(model, log, job.signals) for log in read]
+        evaluations = [evaluate(model, r, parameters, prior) for r in recordings]
+        kept = [(log,) for log in read]
+    fitted, missing = _fitted_logs(job, source, result)
+    verdict = _verdict(job, source, result, evaluations, kept, fitted, missing)
+    return {
+        "result": str(path),
+        "predicted_with": outputs.get("urdf", "base parameters of result.json"),
+        "validation": [recording_metrics(e, "estimate") for e in evaluations],
+        "verdict": verdict.to_dict(),
+    }
+
+
+def _fitted_logs(
+    job: Job, model: RobotModel, result: Mapping[str, Any]
+) -> tuple[list[Log], list[str]]:
+    """Return the logs that were fitted, windows of long ones, and names of those that are gone."""
+    hashes = _hashes(result)
+    is_there = [e.path.exists() and file_sha256(e.path) in hashes for e in job.identification]
+    missing = [
+        e.path.name for e, there in zip(job.identification, is_there, strict=True) if not there
+    ]
+    entries = [e for e, there in zip(job.identification, is_there, strict=True) if there]
+    if is_long(job, entries):
+        surveyed = survey_logs(job, entries, model, structural_mapping(model))
+        return [look for log in surveyed for look in log.looks], missing
+    return [job.read(entry, model) for entry in entries], missing
+
+
+def _hashes(result: Mapping[str, Any]) -> set[str]:
+    """Return the SHA-256 of the files that were fitted."""
+    return {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+
+
+def _verdict(
+    job: Job,
+    model: RobotModel,
+    result: Mapping[str, Any],
+    evaluations: Sequence[Evaluation],
+    kept: Sequence[Sequence[Log]],
+    fitted: Sequence[Log],
+    missing: Sequence[str],
+) -> Verdict:
+    """Return the verdict on logs that may be fitted ones, faulty, or of a motion seen before."""
+    hashes = _hashes(result)
+    again = [
+        file_sha256(logs[0].path) in hashes or any(_share(a, b) for a in logs for b in fitted)
+        for logs in kept
+    ]
+    new = [e for e, is_refitted in zip(evaluations, again, strict=True) if not is_refitted]
+    looks = [
+        log for logs, refitted in zip(kept, again, strict=True) if not refitted for log in logs
+    ]
+    names = list(dict.fromkeys(Path(log.path).name for log in looks))
+    found = [
+        finding
+        for finding in diagnose(model, fitted, looks, job.signals)
+        if finding.where.split(": ")[0] in names and finding.code not in job.ignore
+    ]
+    alarms = alarming(found, job.ignore, is_robust=job.estimator.robust != "none")
+    stated = result["verdict"]
+    return judge(
+        Metrics({}, 0.0),
+        {e.recording.name: e.metrics["estimate"] for e in new},
+        undetermined=result["structure"]["undetermined"],
+        is_consistent=result["consistency"]["is_consistent"],
+        joints=model.joints,
+        alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
+        doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
+        refitted=[
+            e.recording.name
+            for e, is_refitted in zip(evaluations, again, strict=True)
+            if is_refitted
+        ],
+    )
+
+
+def _doubts(
+    job: Job,
+    model: RobotModel,
+    stated: Mapping[str, Any],
+    found: Sequence[Finding],
+    names: Sequence[str],
+    missing: Sequence[str],
+) -> list[Doubt]:
+    """Return the doubts of the result, but for its own validation, and those of the new logs."""
+    own = [Doubt(**doubt) for doubt in stated.get("doubts", ())]
+    is_robust = job.estimator.robust != "none"
+    doubts = [doubt for doubt in own if doubt.code != "repeated_motion"]
+    doubts += doubts_of(found, model.joints, names, is_robust=is_robust)
+    if missing:
+        message = (
+            f"the fitted logs {list(missing)} are not where they were, or were changed: whether "
+            "these recordings hold fitted rows was not looked at"
+        )
+        doubts.append(Doubt("fitted_logs_missing", "", message))
+    return doubts
+
+
+def _share(one: Log, other: Log) -> bool:
+    """Return whether one of two logs holds rows of the other, as a cut or thinned copy does."""
+    return shares_rows(one, other) or shares_rows(other, one)

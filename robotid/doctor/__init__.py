@@ -1,0 +1,3 @@
+"""What is wrong with logs, or with a URDF."""
+
+__all__: list[str] = []

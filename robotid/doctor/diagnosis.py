@@ -1,0 +1,229 @@
+"""The doctor: what is wrong with logs, or with the URDF for them, before anything is identified.
+
+Findings never change data. An error is what would give a wrong answer; it stops an identification
+unless its code is ignored.
+"""
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from robotid.commands.job import Job, LogEntry
+from robotid.commands.logs import is_long, survey_logs
+from robotid.doctor.channels import (
+    check_clipping,
+    check_noise,
+    check_quantisation,
+    check_spikes,
+    check_velocity_delay,
+    check_velocity_order,
+    check_velocity_scale,
+)
+from robotid.doctor.clock import (
+    check_clock,
+    check_gaps,
+    check_stale_rows,
+    check_standstill,
+    check_static,
+)
+from robotid.doctor.locked_joints import check_locked
+from robotid.doctor.motions import check_excitation, check_repeated_motion
+from robotid.doctor.sample import Probe, smooth_motion, take_probe
+from robotid.doctor.torque_delay import check_torque_delay
+from robotid.doctor.torques import check_torques
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification.doubts import DOUBTFUL, is_outvoted
+from robotid.identification.pipeline import structural_mapping
+from robotid.identification.verdict import Finding
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.signals import SignalSettings
+from robotid.robot.model import RobotModel
+
+__all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
+
+#: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
+CODES = (
+    "gravity", "joint_axis", "joint_order", "locked_position", "position_offset",
+    "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
+    "velocity_scale",
+)  # fmt: skip
+_RANK = {"error": 0, "warning": 1, "note": 2}
+
+
+def examine(job: Job) -> tuple[Finding, ...]:
+    """Examine the logs of a job.
+
+    Args:
+        job: The job. A log that cannot be read gives a finding, not an error.
+
+    Returns:
+        The findings, errors first.
+
+    Raises:
+        ModelError: If the URDF cannot be used.
+        SettingsError: If a setting does not fit, or a code to ignore is unknown.
+    """
+    alarming([], job.ignore)
+    model = job.model()
+    findings: list[Finding] = []
+    read = _look if is_long(job, (*job.identification, *job.validation)) else _read
+    fitted, kept = (
+        read(job, model, entries, findings) for entries in (job.identification, job.validation)
+    )
+    return _sorted([*findings, *diagnose(model, fitted, kept, job.signals)])
+
+
+def diagnose(
+    model: RobotModel, fitted: Sequence[Log], kept: Sequence[Log], signals: SignalSettings
+) -> tuple[Finding, ...]:
+    """Examine logs that were read.
+
+    Args:
+        model: The robot.
+        fitted: Logs to fit, of the model's joints in its order.
+        kept: Logs kept apart to validate with.
+        signals: How the logs become trajectories.
+
+    Returns:
+        The findings, errors first.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
+    findings: list[Finding] = []
+    motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
+    first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
+    for log, (motion, _) in zip(kept, motions[len(fitted) :], strict=True):
+        if motion is not None:
+            findings += check_repeated_motion(first, motion, _name(log))
+    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+    if probes:
+        names = ", ".join(_name(log) for log in fitted)
+        moving = [probe.motion for probe in probes]
+        findings += check_excitation(model, structural_mapping(model), moving, signals, names)
+    return _sorted(findings)
+
+
+def alarming(
+    findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
+) -> tuple[Finding, ...]:
+    """Return the findings that make an identification wrong, but for those the user knows better.
+
+    Args:
+        findings: What the doctor found.
+        ignore: Codes of errors, or of what makes a result doubtful, that the user knows better.
+        is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
+
+    Returns:
+        The errors that are not ignored.
+
+    Raises:
+        SettingsError: If a code to ignore is unknown.
+    """
+    known = sorted({*CODES, *DOUBTFUL})
+    for code in ignore:
+        if code not in known:
+            near = difflib.get_close_matches(code, known, n=1)
+            hint = f". Did you mean {near[0]!r}?" if near else ""
+            raise SettingsError(f"doctor: ignore names {code!r}, wanted some of {known}{hint}")
+    errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
+    return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
+
+
+def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return findings as plain values, as ``robotid doctor --json`` prints them.
+
+    Args:
+        findings: The findings.
+
+    Returns:
+        {"findings": [{"code", "severity", "where", "message", "evidence"}]}.
+    """
+    return {
+        "findings": [
+            {
+                "code": finding.code,
+                "severity": finding.severity,
+                "where": finding.where,
+                "message": finding.message,
+                "evidence": {key: float(value) for key, value in finding.evidence.items()},
+            }
+            for finding in findings
+        ]
+    }
+
+
+def _read(
+    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
+) -> list[Log]:
+    """Return the logs that can be read; why the others cannot goes to the findings."""
+    logs = []
+    for entry in entries:
+        try:
+            logs.append(job.read(entry, model))
+            findings += check_locked(job, model, [entry])
+        except DataError as error:
+            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
+    return logs
+
+
+def _look(
+    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
+) -> list[Log]:
+    """Return windows of logs that are too long to be in memory."""
+    mapping, looks = structural_mapping(model), []
+    for entry in entries:
+        try:
+            (log,) = survey_logs(job, [entry], model, mapping)
+        except DataError as error:
+            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
+            continue
+        notes, name = log.head.notes, entry.path.name
+        findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
+        looks += [replace(look, notes=()) for look in log.looks]
+    return looks
+
+
+def _examine_log(
+    model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
+) -> tuple[Trajectory | None, Probe | None]:
+    """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
+    name = _name(log)
+    findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in log.notes]
+    for check in (check_clock, check_gaps, check_stale_rows, check_quantisation, check_clipping):
+        findings += check(log)
+    for check in (check_spikes, check_noise, check_velocity_order):
+        findings += check(log)
+    findings += check_velocity_delay(log, signals.velocity_delay)
+    findings += check_velocity_scale(log, signals.velocity)
+    if model.free_flyer:
+        message = f"{name}: torques of a robot with a floating base are not judged"
+        findings.append(Finding("floating_base", "note", name, message))
+        return None, None
+    try:
+        motion = smooth_motion(model, log, signals)
+    except DataError as error:
+        findings.append(Finding(error.code, "error", name, str(error)))
+        return None, None
+    findings += check_standstill(log, motion.t, motion.v)
+    findings += check_static(log, motion.q, motion.v, model.layout.prismatic)
+    probe = take_probe(model, motion)
+    if probe is None:
+        message = f"{name}: too little moves to judge torques by; record motion of every joint"
+        findings.append(Finding("no_motion", "warning", name, message))
+        return motion, None
+    torques = list(check_torques(probe, name))
+    findings += torques
+    if not any(finding.severity == "error" for finding in torques):
+        findings += check_torque_delay(model, motion, signals, name)
+    return motion, probe
+
+
+def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    return tuple(sorted(findings, key=lambda finding: _RANK[finding.severity]))
+
+
+def _name(log: Log) -> str:
+    return Path(log.path).name or "log"

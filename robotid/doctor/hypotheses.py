@@ -1,0 +1,244 @@
+"""How well physics explains each torque, as stated and if something were otherwise.
+
+A joint's torque must be a sum, with factors >= 0, of what each link it carries would load it with
+by the URDF, of the inertia and the frictions of its drive, and of a constant. Masses may be wrong
+by any factor; signs, columns, gravity and positions may not.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.doctor.sample import Probe
+
+__all__ = ["Explanation", "explanations", "unexplained"]
+
+_FLOOR = 1e-3  # an unexplained share below this is as good as none
+_POOR = 0.08  # a share above this lets other readings of the positions be tried
+_CLEARLY = 2.0  # gain in misfit, a factor 7, over what needs no other position
+_OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero position may be off
+_EARTH = 9.81  # [m/s^2]
+_CONSTANT = 1e-9  # of its size: a torque that varies less does not, but for rounding
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What would have to be otherwise, and how well the torques are explained then.
+
+    Attributes:
+        kind: "stated", "payload", "torque_sign", "torque_order", "gravity", "joint_order",
+            "joint_axis", "position_order", "position_sign" or "position_offset".
+        share: Unexplained share of each torque's variance, shape (n,).
+        joints: Indices of the joints concerned.
+        values: "torque_order": which joint each torque column belongs to; "gravity": the vector
+            [m/s^2]; "position_offset": the offset [rad].
+    """
+
+    kind: str
+    share: Array
+    joints: tuple[int, ...] = ()
+    values: tuple[float, ...] = ()
+
+    @property
+    def misfit(self) -> float:
+        """The sum of the logarithms of the unexplained shares: lower is better."""
+        return float(np.sum(np.log(self.share + _FLOOR)))
+
+
+def unexplained(probe: Probe, gravity: Array | None = None) -> Array:
+    """Return which share of each torque column no physics of each joint explains.
+
+    Args:
+        probe: The motion.
+        gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+
+    Returns:
+        Shares of variance, shape (n, n, 2): torque column i, physics of joint k, with the column's
+        sign as it is and reversed. 0 for a constant column.
+    """
+    n = len(probe.model.joints)
+    loads = _link_loads(probe, gravity)
+    size = _variation(probe)
+    share = np.zeros((n, n, 2))
+    for k in range(n):
+        R, T = _compressed(np.hstack([loads[:, k], probe.drive(k)]), probe.tau)
+        for i in np.flatnonzero(size > 0):
+            for s, sign in enumerate((1.0, -1.0)):
+                share[i, k, s] = _nonnegative_misfit(R, sign * T[:, i]) / size[i]
+    return np.minimum(share, 1.0)
+
+
+def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanation]]:
+    """Return how the torques are explained as stated, and by each reading that is tried.
+
+    Args:
+        probe: The motion.
+
+    Returns:
+        The reading as stated; the same with any load on the last link; and others.
+    """
+    share = unexplained(probe)
+    own = np.diagonal(share).T  # (n, 2)
+    stated = Explanation("stated", own[:, 0])
+    others = [_signs(own), _order(share), _gravity(probe)]
+    loaded = Explanation("payload", np.minimum(_own_share(probe, any_load=True), stated.share))
+    if stated.share.max() > _POOR:
+        # more readings are tried, and with fewer rows: one of them must be clearly better
+        bound = min(e.misfit for e in [stated, *others]) - _CLEARLY
+        others += [e for e in _positions(probe) if e.misfit < bound]
+    return stated, loaded, others
+
+
+def _signs(own: Array) -> Explanation:
+    turned = np.flatnonzero(own[:, 1] < own[:, 0])
+    return Explanation("torque_sign", own.min(axis=1), tuple(turned.tolist()))
+
+
+def _order(share: Array) -> Explanation:
+    """Return the best assignment of torque columns to joints."""
+    from scipy.optimize import linear_sum_assignment
+
+    columns, joints = linear_sum_assignment(np.log(share[:, :, 0] + _FLOOR))
+    moved = tuple(np.flatnonzero(columns != joints).tolist())
+    found = share[columns, joints, 0]
+    return Explanation("torque_order", found, moved, tuple(joints.astype(float).tolist()))
+
+
+def _gravity(probe: Probe) -> Explanation:
+    """Return the direction of gravity that explains the torques best."""
+    from scipy.optimize import minimize
+
+    size = float(np.linalg.norm(probe.gravity)) or _EARTH
+    n = len(probe.model.joints)
+
+    def explained(g: Array) -> Explanation:
+        share = _own_share(probe, g)
+        return Explanation("gravity", share, tuple(range(n)), tuple(g.tolist()))
+
+    axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
+    best = min(map(explained, [probe.gravity, *axes, np.zeros(3)]), key=lambda e: e.misfit)
+    start = np.array(best.values)
+    if not start.any():
+        return best
+    # two directions across the start, on which the tangent of the tilt is measured
+    _, _, frame = np.linalg.svd(start.reshape(1, 3))
+    across = frame[1:]
+
+    def tilted(x: Array) -> Array:
+        g = start + size * x @ across
+        turned: Array = size * g / np.linalg.norm(g)
+        return turned
+
+    found = minimize(
+        lambda x: explained(tilted(x)).misfit, np.zeros(2), method="Nelder-Mead",
+        options={
+            "initial_simplex": [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]],
+            "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60,
+        },
+    )  # fmt: skip
+    return explained(tilted(found.x))
+
+
+def _positions(probe: Probe) -> Iterator[Explanation]:
+    """Yield readings in which a position column means something else."""
+    every = max(1, len(probe.rows) // 200)
+    small = probe.at(probe.rows[::every])
+    n = len(probe.model.joints)
+    for pair in combinations(range(n), 2):
+        order = list(range(n))
+        order[pair[0]], order[pair[1]] = pair[1], pair[0]
+        share = unexplained(small.with_motion(_reordered(small, order)))
+        yield Explanation("position_order", np.diagonal(share[:, :, 0]), pair)
+        yield Explanation("joint_order", share[np.arange(n), order, 0], pair)
+    turning = [j for j in range(n) if probe.model.joints[j] not in probe.model.layout.prismatic]
+    for j in turning:
+        share = _own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
+        yield Explanation("position_sign", share, (j,))
+    for j in range(n):
+        turned = small.with_motion(_moved(small, j, -1.0, 0.0))
+        sign = np.where(np.arange(n) == j, -1.0, 1.0)
+        yield Explanation("joint_axis", _own_share(replace(turned, tau=sign * small.tau)), (j,))
+    offsets = [_offset(small, j, offset) for j in turning for offset in _OFFSETS]
+    if offsets:
+        yield _refined(small, min(offsets, key=lambda e: e.misfit))
+
+
+def _offset(probe: Probe, j: int, offset: float) -> Explanation:
+    share = _own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
+    return Explanation("position_offset", share, (j,), (offset,))
+
+
+def _refined(probe: Probe, rough: Explanation) -> Explanation:
+    """Return the offset near a rough one that explains the torques best."""
+    from scipy.optimize import minimize_scalar
+
+    j, centre = rough.joints[0], rough.values[0]
+    found = minimize_scalar(
+        lambda offset: _offset(probe, j, float(offset)).misfit,
+        bounds=(centre - 0.4, centre + 0.4), method="bounded",
+        options={"xatol": 5e-3, "maxiter": 15},
+    )  # fmt: skip
+    return min(rough, _offset(probe, j, float(found.x)), key=lambda e: e.misfit)
+
+
+def _reordered(probe: Probe, order: Sequence[int]) -> tuple[Array, Array, Array]:
+    return probe.q[:, order], probe.v[:, order], probe.a[:, order]
+
+
+def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Array, Array]:
+    q, v, a = probe.q.copy(), probe.v.copy(), probe.a.copy()
+    q[:, j] = sign * q[:, j] + offset
+    v[:, j] *= sign
+    a[:, j] *= sign
+    return q, v, a
+
+
+def _own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
+    """Return the share that each joint's own physics leaves of its torque, shape (n,).
+
+    With any load, the last link may also have any mass more, and any centre of it.
+    """
+    loads = _link_loads(probe, gravity)
+    if any_load:
+        last = probe.regressor(gravity)[:, :, -10:-6]
+        loads = np.concatenate([loads, last, -last[:, :, 1:]], axis=2)
+    size = _variation(probe)
+    share = np.zeros(len(size))
+    for j in np.flatnonzero(size > 0).tolist():
+        R, T = _compressed(np.hstack([loads[:, j], probe.drive(j)]), probe.tau[:, [j]])
+        share[j] = min(_nonnegative_misfit(R, T[:, 0]) / size[j], 1.0)
+    return share
+
+
+def _variation(probe: Probe) -> Array:
+    """Return the sum of squares of each torque about its mean, 0 of a constant one, shape (n,)."""
+    centred = probe.tau - probe.tau.mean(axis=0)
+    is_constant = np.ptp(probe.tau, axis=0) <= _CONSTANT * np.abs(probe.tau).max(axis=0)
+    size: Array = np.where(is_constant, 0.0, np.einsum("kn,kn->n", centred, centred))
+    return size
+
+
+def _link_loads(probe: Probe, gravity: Array | None) -> Array:
+    """Return the torque that each link loads each joint with by the URDF, shape (N, n, bodies)."""
+    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial].reshape(-1, 10)
+    Y = probe.regressor(gravity)
+    loads: Array = np.einsum("knbi,bi->knb", Y.reshape(*Y.shape[:2], -1, 10), pi)
+    return loads
+
+
+def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:
+    """Return the triangular factor of the columns, of length 1 each, and the torques beside it."""
+    size = np.linalg.norm(X, axis=0)
+    used = size > 1e-9 * size.max(initial=1e-300)
+    R = np.asarray(np.linalg.qr(np.hstack([X[:, used] / size[used], tau]), mode="r"))
+    count = int(used.sum())
+    return R[:, :count], R[:, count:]
+
+
+def _nonnegative_misfit(R: Array, tau: Array) -> float:
+    from scipy.optimize import nnls
+
+    return float(nnls(R, tau)[1] ** 2)

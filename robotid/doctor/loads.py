@@ -1,0 +1,265 @@
+"""Does the torque fit the URDF's masses: scale of each torque, payload, mismatch.
+
+One linear model of all joints with priors: each link as the URDF has it times 1 +- 0.3, a payload
+of any size in the last link, drives of any size, and torques known to 5 %.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.doctor.sample import Probe
+from robotid.identification.verdict import Finding
+
+__all__ = ["LoadModel", "check_loads", "load_model"]
+
+_SPREAD = 0.3  # of a link's mass about the URDF's
+_PRECISION = 0.05  # of a torque, model errors included
+_INDEPENDENT = 20.0  # instants of a log that are independent of each other
+_PER_SECOND = 3.0  # ... of a short one
+_MASS, _MOMENT = 20.0, 10.0  # [kg], [kg m] of a payload, wide
+_CONSTANT = 1e-6  # of the largest torque: one that varies less says nothing
+_EXPLAINED = 0.25  # a torque of which physics leaves more says nothing of its scale
+_WORSE = 0.25  # in variances of its precision, that a torque may fit worse than by itself
+_ALIKE = 1.6  # factors that differ by less are one: they are sought in steps of 1.26
+_GAIN = 20.0  # drop of the misfit that makes another torque scale believable
+_OTHER_SCALE = 3.0  # a torque scale farther from 1 than this is no error of masses
+_SCALES = np.logspace(-3, 3, 61)
+_HEAVY = 0.08  # payload over the arm's mass that is surely more than the links' errors
+_MISMATCH = 7.5  # sum of squares of the links' errors, in standard deviations, that is too much
+
+
+@dataclass(frozen=True, eq=False)
+class LoadModel:
+    """The torques of each joint, whitened, as far as their drive cannot explain them.
+
+    Attributes:
+        R: Triangular factor of the c unknowns and the torque of each joint, shape (n, c+1, c+1);
+            0 of joints that have no say.
+        mean: Prior mean of the unknowns: links over the URDF's, and m, mcx, mcy, mcz of a payload.
+        spread: Prior standard deviation, shape (c,).
+        expected: Misfit of torques that are explained as well as by each joint's own.
+        independent: Number of independent torques they stand for.
+    """
+
+    R: Array
+    mean: Array
+    spread: Array
+    expected: float
+    independent: float
+
+    def misfits(self, scales: Array) -> Array:
+        """Return how badly the torques fit when multiplied by some scales.
+
+        Args:
+            scales: T times a factor of each torque column, shape (T, n).
+
+        Returns:
+            Chi-squares, prior included, shape (T,).
+        """
+        R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
+        chi: Array = R[:, -1, -1] ** 2
+        return chi
+
+    def fit(self, scale: Array) -> tuple[float, Array, Array]:
+        """Fit with the torque columns multiplied by a scale, links of no negative mass.
+
+        Args:
+            scale: Factor of each torque column, shape (n,).
+
+        Returns:
+            The misfit (chi-square, prior included), the unknowns and their standard deviations.
+        """
+        from scipy.optimize import lsq_linear
+
+        rows = self._rows(scale[None])[0]
+        bounds = np.full(len(self.mean), -np.inf)
+        bounds[:-4] = 0.0
+        found = lsq_linear(rows[:, :-1], rows[:, -1], bounds=(bounds, np.inf), method="bvls")
+        inverse = np.linalg.inv(np.linalg.qr(rows[:, :-1], mode="r"))
+        error: Array = self.spread * np.linalg.norm(inverse, axis=1)
+        return 2 * float(found.cost), self.spread * found.x, error
+
+    def _rows(self, scales: Array) -> Array:
+        """Return the rows of torques and prior, of unknowns over their spread, (T, N, c+1)."""
+        c, (T, n) = len(self.mean), scales.shape
+        rows = self.R * np.append(self.spread, 1.0)
+        rows = np.repeat(rows[None], T, axis=0)  # (T, n, c+1, c+1)
+        rows[..., :-1] /= scales[:, :, None, None]
+        prior = np.column_stack([np.eye(c), self.mean / self.spread])
+        prior = np.repeat(prior[None], T, axis=0)
+        return np.concatenate([rows.reshape(T, n * (c + 1), c + 1), prior], axis=1)
+
+
+def load_model(probe: Probe, share: Array) -> LoadModel:
+    """Return the rows of a motion.
+
+    Args:
+        probe: The motion.
+        share: Share of each torque's variance that no physics explains, shape (n,).
+
+    Returns:
+        The load model; a torque that is constant or that physics does not explain has no say.
+    """
+    N, n = probe.tau.shape
+    duration = float(np.ptp(probe.motion.t[probe.rows]))
+    independent = min(_INDEPENDENT, _PER_SECOND * duration)
+    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial].reshape(-1, 10)
+    bodies = len(pi)
+    Y = probe.regressor().reshape(N, n, bodies, 10)
+    links = np.einsum("knbi,bi->knb", Y, pi)
+    X = np.concatenate([links, Y[:, :, -1, :4], probe.tau[:, :, None]], axis=2)
+    level = probe.tau.std(axis=0)
+    told = (level > _CONSTANT * np.abs(probe.tau).max()) & (share < _EXPLAINED)
+    R = np.zeros((n, bodies + 5, bodies + 5))
+    for j in np.flatnonzero(told).tolist():
+        drive = np.delete(probe.drive(j), 4, axis=1)
+        length = np.linalg.norm(drive, axis=0)
+        U, s, _ = np.linalg.svd(drive / np.where(length > 0, length, 1.0), full_matrices=False)
+        Q = U[:, s > 1e-6 * s[0]]
+        left = X[:, j] - Q @ (Q.T @ X[:, j])
+        sigma = np.sqrt(_PRECISION**2 + share[j]) * level[j]
+        R[j] = np.linalg.qr(left * np.sqrt(independent / N) / sigma, mode="r")
+    mean = np.append(np.ones(bodies), np.zeros(4))
+    spread = np.append(np.full(bodies, _SPREAD), [_MASS, *[_MOMENT] * 3])
+    expected = independent * float((share / (_PRECISION**2 + share))[told].sum())
+    return LoadModel(R, mean, spread, expected, independent * float(told.sum()))
+
+
+def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
+    """Yield torques in another scale, a payload, a URDF of another robot.
+
+    Another scale is believed where the links then weigh about what the URDF says and the torques
+    fit; else the URDF is of another robot.
+
+    Args:
+        probe: The motion; signs, order and gravity must be right.
+        share: Share of each torque's variance that no physics explains, shape (n,).
+        name: What the log is called.
+
+    Yields:
+        "current_for_torque" per joint, or once for all joints of one factor, or else
+        "urdf_mismatch", or else "payload".
+    """
+    model = load_model(probe, share)
+    bodies = len(probe.model.layout.bodies)
+    chi, theta, error = model.fit(np.ones(len(share)))
+    if _is_this_robot(model, chi, theta):
+        yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
+        return
+    scale = _torque_scales(model)
+    other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
+    if len(other) and _is_this_robot(model, *model.fit(scale)[:2]):
+        yield from _scaled(probe, scale, _needed(model, scale, other), name)
+    elif len(other) or _error_of_links(theta) > _MISMATCH:
+        yield _mismatch(probe, theta[:bodies], name)
+    else:
+        yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
+
+
+def _is_this_robot(model: LoadModel, chi: float, theta: Array) -> bool:
+    """Return whether torques fit about as well as by themselves, by links that weigh as stated."""
+    is_good = chi - model.expected < _WORSE * model.independent
+    return is_good and _error_of_links(theta) < _MISMATCH
+
+
+def _error_of_links(theta: Array) -> float:
+    return float(np.sum(((theta[:-4] - 1.0) / _SPREAD) ** 2))
+
+
+def _torque_scales(model: LoadModel) -> Array:
+    """Return the factors of the torque columns that the data insist on, 1 elsewhere."""
+    n = len(model.R)
+    common = np.repeat(_SCALES[:, None], n, axis=1)
+    chi = model.misfits(np.vstack([np.ones(n), common]))
+    best = int(np.argmin(chi[1:]))
+    starts = [np.ones(n)]
+    if abs(np.log(_SCALES[best])) > np.log(_OTHER_SCALE) and chi[0] - chi[1 + best] > _GAIN:
+        starts.append(common[best])
+    found = np.array([_descended(model, start) for start in starts])
+    scale = found[int(np.argmin(model.misfits(found)))]
+    return np.where(model.R.any(axis=(1, 2)), scale, 1.0)
+
+
+def _descended(model: LoadModel, scale: Array) -> Array:
+    """Return the factors that are reached from some by changing one after the other."""
+    n = len(scale)
+    for _ in range(n):
+        trials = np.repeat(scale[None], n * len(_SCALES), axis=0)
+        trials[np.arange(len(trials)), np.repeat(np.arange(n), len(_SCALES))] = np.tile(_SCALES, n)
+        chi = model.misfits(np.vstack([scale, trials]))
+        if chi[0] - chi[1:].min() < _GAIN:
+            break
+        scale = trials[int(np.argmin(chi[1:]))]
+    return scale
+
+
+def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
+    """Return the joints without whose scale the torques no longer fit; all if all are scaled."""
+    if len(other) == len(scale):
+        return other
+    kept = scale.copy()
+    for j in other:
+        without = kept.copy()
+        without[j] = 1.0
+        if _is_this_robot(model, *model.fit(without)[:2]):
+            kept = without
+    needed: Array = other[kept[other] != 1.0]
+    return needed
+
+
+def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
+    joints = [probe.model.joints[j] for j in other]
+    factors = scale[other]
+    todo = "with [torque] gains (--gain {0}=...), or correct the gain"
+    if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
+        factor = float(np.exp(np.log(factors).mean()))
+        message = (
+            f"{name}: the torques of {joints} fit the URDF far better times {factor:.3g}: they may "
+            "be currents, or have another unit or gain; give them as current_<joint> "
+            + todo.format("JOINT")
+        )
+        evidence = {"factor": factor, "joints": float(len(other))}
+        where = name if len(other) == len(scale) else f"{name}: {', '.join(joints)}"
+        yield Finding("current_for_torque", "warning", where, message, evidence)
+        return
+    for joint, factor in zip(joints, factors.tolist(), strict=True):
+        message = (
+            f"{name}: the torque of {joint} fits the URDF far better times {factor:.3g}: it may "
+            f"be a current, or have another unit or gain; give it as current_{joint} "
+            + todo.format(joint)
+        )
+        yield Finding(
+            "current_for_torque", "warning", f"{name}: {joint}", message, {"factor": factor}
+        )
+
+
+def _mismatch(probe: Probe, factors: Array, name: str) -> Finding:
+    links = probe.model.layout.bodies
+    shown = ", ".join(f"{link} {factor:.2g}" for link, factor in zip(links, factors, strict=True))
+    message = (
+        f"{name}: to explain the torques, the URDF's links would have to weigh {shown} times what "
+        "it says: the URDF may be of another robot or lack a load, or the torques be currents of "
+        "several gains; check the model and the unit, and use the URDF's values as prior with care"
+    )
+    evidence = dict(zip(links, factors.tolist(), strict=True))
+    return Finding("urdf_mismatch", "warning", name, message, evidence)
+
+
+def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
+    mass = float(load[0])
+    arm = float(probe.model.standard_parameters()[: probe.model.layout.n_inertial : 10].sum())
+    if abs(mass) < 3 * error:
+        return
+    link = probe.model.layout.bodies[-1]
+    verb = "more" if mass > 0 else "less"
+    message = (
+        f"{name}: {link} carries about {abs(mass):.2g} +- {error:.2g} kg {verb} than the URDF "
+        "says; if a tool or payload is mounted, add it to the URDF or expect it in the last link"
+    )
+    evidence = {"mass": mass, "std_error": error, "mcx": float(load[1]), "mcy": float(load[2]),
+                "mcz": float(load[3])}  # fmt: skip
+    severity = "warning" if abs(mass) - 2 * error > _HEAVY * arm else "note"
+    yield Finding("payload", severity, f"{name}: {link}", message, evidence)

@@ -1,0 +1,170 @@
+"""Are the motions of several logs fit for their roles: rich to fit, new to validate with."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import WLS
+from robotid.estimators.determination import base_spread, determine
+from robotid.exceptions import RobotIdError
+from robotid.identification.evaluation import row_mask
+from robotid.identification.prior import spread_of
+from robotid.identification.recordings import base_problem, independent_share
+from robotid.identification.verdict import Finding
+from robotid.logs.data import Trajectory
+from robotid.logs.signals import SignalSettings
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.factors import compress, merge
+from robotid.robot.model import RobotModel
+
+__all__ = ["check_excitation", "check_repeated_motion"]
+
+_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] positions compared: the same now and in a second
+_NEAR = 0.02  # of the range of each joint
+_SHARE = 0.3  # of the validation motion that has been seen before
+_INSTANTS = 300
+_ROWS = 5000  # of a log, that tell what its motion determines
+_ILL_CONDITIONED = 1e3  # condition number of unit columns above which a motion could be better
+_RICHER = "a richer motion, of all joints together, back and forth and as fast as they may,"
+_LOST = "the motion is rich, but this hardly loads a joint and is lost in the noise"
+
+
+def check_repeated_motion(
+    fitted: Sequence[Trajectory], kept: Trajectory, name: str
+) -> Iterator[Finding]:
+    """Yield whether a validation log repeats motion that is fitted, whoever recorded it when.
+
+    Args:
+        fitted: Smooth motions that are fitted.
+        kept: Smooth motion that is kept apart.
+        name: What its log is called.
+
+    Yields:
+        At most one warning "repeated_motion".
+    """
+    from scipy.spatial import cKDTree
+
+    size = np.maximum(np.ptp(kept.q, axis=0), 1e-3)
+    seen = _stretches(kept, size, _INSTANTS)
+    if len(seen) == 0:
+        return
+    share = 0.0
+    for motion in fitted:
+        known = _stretches(motion, size, None)
+        if len(known):
+            distance, _ = cKDTree(known).query(seen, p=np.inf, distance_upper_bound=_NEAR)
+            share = max(share, float(np.mean(np.isfinite(distance))))
+    if share < _SHARE:
+        return
+    message = (
+        f"{name}: {100 * share:.0f} % of this motion is in a fitted log, too: its score shows how "
+        "well the fit repeats itself, not how it predicts; record another motion to validate with"
+    )
+    yield Finding("repeated_motion", "warning", name, message, {"share": share})
+
+
+def check_excitation(
+    model: RobotModel,
+    mapping: BaseMapping,
+    motions: Sequence[Trajectory],
+    signals: SignalSettings,
+    name: str,
+) -> Iterator[Finding]:
+    """Yield which base parameters the fitted motions determine.
+
+    By :func:`robotid.estimators.determination.determine`, as an identification does; of long logs a share of
+    the rows stands for all.
+
+    Args:
+        model: The robot.
+        mapping: Its structural base parameters.
+        motions: Smooth motions that are fitted.
+        signals: How the job smooths, and which rows it leaves out.
+        name: What the logs are called.
+
+    Yields:
+        One "excitation": a warning if the motion leaves some open, a note if they are lost in the
+        noise of a rich one or all are determined.
+    """
+    prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
+    thinned = [_every(step, motion) for motion in motions]
+    try:
+        factors = merge(
+            [
+                compress(base_problem(model, mapping, m, row_mask(model, m, signals.min_velocity)))
+                for m in thinned
+            ]
+        )
+        found = WLS(prior=mapping.to_base(prior)).fit(factors)
+    except RobotIdError as error:
+        message = f"{name}: which parameters the motion determines cannot be told: {error}"
+        yield Finding("excitation", "warning", name, message)
+        return
+    share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
+    squares = np.sum([motion.squares for motion in thinned], axis=0)
+    spread = spread_of(model, squares, sum(len(motion.t) for motion in thinned))
+    rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
+    known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
+    evidence = {
+        "rank": float(known.rank),
+        "base": float(len(mapping.K)),
+        "weakest": float(known.shrinkage[-1]),
+    }
+    if np.isfinite(found.condition):
+        evidence["condition"] = float(found.condition)
+    message = (
+        f"{name}: the motion determines {known.rank} of {len(mapping.K)} base parameters "
+        f"(condition number {found.condition:.3g})"
+    )
+    is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
+    if known.groups:
+        advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
+        message += f": {known.in_words()}; {advice}"
+    elif is_poor:
+        left = 100 * known.shrinkage[-1]
+        message += f"; the least known sum keeps {left:.2g} % of its plausible spread: {_RICHER}"
+        message += " would tell more"
+    else:
+        message += "; nothing needs doing"
+    severity = "warning" if known.groups and is_poor else "note"
+    yield Finding("excitation", severity, name, message, evidence)
+
+
+def _every(step: int, motion: Trajectory) -> Trajectory:
+    """Return every so many rows of a motion."""
+    if step == 1:
+        return motion
+    rows = slice(None, None, step)
+    direction = None if motion.direction is None else motion.direction[rows]
+    return Trajectory(
+        t=motion.t[rows],
+        q=motion.q[rows],
+        v=motion.v[rows],
+        a=motion.a[rows],
+        tau=motion.tau[rows],
+        joints=motion.joints,
+        rate=None,
+        segment=motion.segment[rows],
+        direction=direction,
+    )
+
+
+def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:
+    """Return the positions now and a little later, in units of the size, where something moves."""
+    step = float(np.median(np.diff(motion.t)))
+    ahead = [round(s / step) for s in _AHEAD]
+    last = len(motion.t) - ahead[-1]
+    if last <= 0:
+        return np.empty((0, len(_AHEAD) * len(size)))
+    starts = np.arange(last)
+    whole = motion.segment[starts] == motion.segment[starts + ahead[-1]]
+    moved = np.abs(motion.q[starts + ahead[-1]] - motion.q[starts]) / size
+    starts = starts[whole & (moved.max(axis=1) > 2 * _NEAR)]
+    if count is not None and len(starts) > count:
+        starts = starts[np.linspace(0, len(starts) - 1, count).astype(int)]
+    else:
+        # fast motion must not slip between two instants: it moves less than the bound per step
+        starts = starts[:: max(1, round(0.005 / step))]
+    return np.hstack([motion.q[starts + k] / size for k in ahead])

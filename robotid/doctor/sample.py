@@ -1,0 +1,186 @@
+"""A log's motion at a few hundred instants, with each part of its torque apart: for the doctor."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.signals import SignalSettings, process, resolve, unwrap
+from robotid.regressor.columns import friction_speeds
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.model import RobotModel
+
+__all__ = ["Probe", "smooth_motion", "take_probe"]
+
+_MARGIN = (
+    0.15  # [s] rows this near to the end of a stretch are left out: the filter is not settled there
+)
+_STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
+_SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """What a model says of a motion, linear in what it does not know.
+
+    The inertial torque is ``(Y + sum_i gravity_i G_i) pi``, with Y of a robot without gravity and
+    G_i of one that stands still in a gravity of 1 m/s^2 along axis i.
+
+    Attributes:
+        model: The robot.
+        motion: The smooth motion the instants were taken from.
+        rows: The N instants, as rows of the motion, shape (N,), int.
+        q: Joint positions, shape (N, n) [rad or m].
+        v: Velocities, shape (N, n).
+        a: Accelerations, shape (N, n).
+        tau: Torques, shape (N, n) [N m or N].
+        Y: Regressor without gravity, shape (N, n, p).
+        G: Regressors of gravity alone along x, y and z, shape (3, N, n, p).
+        drives: What each coupled drive adds, shape (N, n, k).
+    """
+
+    model: RobotModel
+    motion: Trajectory
+    rows: Array
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    Y: Array
+    G: Array
+    drives: Array
+
+    @property
+    def gravity(self) -> Array:
+        """Gravity as the model states it, shape (3,) [m/s^2]."""
+        return np.array(self.model.pin_model.gravity.linear)
+
+    def regressor(self, gravity: Array | None = None) -> Array:
+        """Return the inertial regressor in a gravity.
+
+        Args:
+            gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+
+        Returns:
+            Regressor, shape (N, n, p).
+        """
+        g = self.gravity if gravity is None else gravity
+        Y: Array = self.Y + np.tensordot(g, self.G, axes=1)
+        return Y
+
+    def drive(self, j: int) -> Array:
+        """Return what the drive of joint j may add: inertia, frictions, offset of either sign.
+
+        Args:
+            j: Index of the joint.
+
+        Returns:
+            Columns a, v, sign v, 1, -1 and those of coupled drives, shape (N, 5 + k).
+        """
+        v, one = self.v[:, j], np.ones(len(self.v))
+        still = min(_STILL, _SLOW * float(np.abs(v).max())) or _STILL
+        friction = np.tanh(v / still)
+        own = np.column_stack([self.a[:, j], v, friction, one, -one])
+        return np.hstack([own, self.drives[:, j]])
+
+    def at(self, rows: Array) -> "Probe":
+        """Return the probe at other rows of the same motion.
+
+        Args:
+            rows: Rows of the motion, shape (N,), int.
+
+        Returns:
+            The probe, computed anew.
+        """
+        m = self.motion
+        return _probe(self.model, m, rows, (m.q[rows], m.v[rows], m.a[rows]))
+
+    def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
+        """Return the probe with other positions, velocities and accelerations, torques as they are.
+
+        Args:
+            state: q, v and a, each of shape (N, n).
+
+        Returns:
+            The probe, computed anew.
+        """
+        return _probe(self.model, self.motion, self.rows, state)
+
+
+def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:
+    """Return the motion of a log with everything derived from its positions.
+
+    Args:
+        model: The robot.
+        log: The log, of the model's joints in its order.
+        settings: How the job smooths; what it says of velocities is not used.
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        DataError: If the log is too short or an angle jumps.
+        SettingsError: If a setting does not fit the log.
+    """
+    free = np.array([joint.turns_freely for joint in model.limits])
+    log = unwrap(replace(log, v=None, a=None), free)
+    own = replace(settings, velocity="differentiated", acceleration="differentiated")
+    return process(log, resolve(log, own), friction_speeds(model.layout))
+
+
+def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
+    """Return a probe of a motion.
+
+    Args:
+        model: The robot, with a fixed base.
+        motion: The smooth motion.
+        samples: Number of instants, spread evenly over the rows at which something moves.
+
+    Returns:
+        The probe; None if too little moves to judge anything by.
+    """
+    moving = (np.abs(motion.v) > _STILL).any(axis=1) & _inner(motion)
+    rows = np.flatnonzero(moving)
+    if len(rows) < 50:
+        return None
+    chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
+    kept = rows[chosen]
+    return _probe(model, motion, kept, (motion.q[kept], motion.v[kept], motion.a[kept]))
+
+
+def _inner(motion: Trajectory) -> Array:
+    """Return which rows are not near the end of a stretch, shape (N,), bool."""
+    inner = np.ones(len(motion.t), dtype=bool)
+    for number in np.unique(motion.segment):
+        part = motion.segment == number
+        t = motion.t[part]
+        inner[part] = (t >= t[0] + _MARGIN) & (t <= t[-1] - _MARGIN)
+    return inner
+
+
+def _probe(
+    model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
+) -> Probe:
+    q, v, a = state
+    size = model.layout.n_inertial
+    shape = (len(q), model.n_rows, -1)
+    still = np.zeros_like(v)
+    whole = joint_torque_regressor(_in_gravity(model, np.zeros(3)), q, v, a).reshape(shape)
+    G = np.array(
+        [
+            joint_torque_regressor(_in_gravity(model, g), q, still, still).reshape(shape)
+            for g in np.eye(3)
+        ]
+    )
+    own = len(model.joints) * len(model.layout.terms)
+    return Probe(
+        model, motion, rows, q, v, a, motion.tau[rows],
+        whole[:, :, :size], G[:, :, :, :size], whole[:, :, size + own :],
+    )  # fmt: skip
+
+
+def _in_gravity(model: RobotModel, gravity: Array) -> RobotModel:
+    pin_model = model.pin_model.copy()
+    pin_model.gravity.linear = gravity
+    return replace(model, pin_model=pin_model)

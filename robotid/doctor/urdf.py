@@ -1,0 +1,333 @@
+"""Audit of a URDF: its joints, its identifiable parameters, and its faults, before any log."""
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.doctor.urdf_geometry import audit_links
+from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
+from robotid.exceptions import ModelError
+from robotid.export.urdf import read_with_yourdfpy
+from robotid.identification.pipeline import structural_mapping
+from robotid.identification.verdict import Finding
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.torque import random_regressor
+from robotid.robot.bodies import LinkPlace, link_places
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint, Tree
+
+__all__ = ["Inspection", "Structure", "inspect_urdf"]
+
+_MOVABLE = ("revolute", "continuous", "prismatic")
+_ROUNDED = 1e-3  # [rad] nearer to a multiple of pi/2 than this is meant to be one
+_EXACT = 1e-7  # [rad] nearer than this is one
+_NOISE = 1e-10  # pivots below this share of the largest are rounding
+# the attributes that hold numbers, by the element they are in
+_NUMBERS = {
+    ("link", "inertial/mass"): ("value",),
+    ("link", "inertial/origin"): ("xyz", "rpy"),
+    ("link", "inertial/inertia"): ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+    ("joint", "origin"): ("xyz", "rpy"),
+    ("joint", "axis"): ("xyz",),
+    ("joint", "limit"): ("lower", "upper", "velocity", "effort"),
+    ("joint", "mimic"): ("multiplier", "offset"),
+    ("joint", "dynamics"): ("damping", "friction"),
+}
+
+
+@dataclass(frozen=True)
+class Structure:
+    """How many parameters a robot has and how well any motion can show them.
+
+    Attributes:
+        standard: Number of standard inertial parameters, ten per body.
+        base_inertial: Number of base parameters of the inertias alone.
+        base: The same with armature, viscous, Coulomb and offset of every joint.
+        rank: Rank of the regressor at random states; equal to ``base``.
+        condition: Condition number of the base regressor there, columns of length 1.
+        undetermined: Standard inertial parameters that load no joint in any motion.
+    """
+
+    standard: int
+    base_inertial: int
+    base: int
+    rank: int
+    condition: float
+    undetermined: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in a URDF.
+
+    Attributes:
+        robot: Name of the robot, "" if the file has none.
+        joints: Names of its movable joints.
+        structure: Its parameters; None if no model can be built.
+        base_groups: The inertial base parameters in words.
+        findings: What a user must know; ``where`` is "link NAME", "joint NAME" or "file NAME".
+    """
+
+    robot: str
+    joints: tuple[str, ...]
+    structure: Structure | None
+    base_groups: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the inspection as plain values, as ``robotid inspect --json`` prints it.
+
+        Returns:
+            {"robot", "joints", "structure", "base_groups", "findings"}; finite numbers only.
+        """
+        structure = None
+        if self.structure is not None:
+            structure = {**vars(self.structure), "undetermined": list(self.structure.undetermined)}
+        return {
+            "robot": self.robot,
+            "joints": list(self.joints),
+            "structure": structure,
+            "base_groups": list(self.base_groups),
+            "findings": [_plain(finding) for finding in self.findings],
+        }
+
+
+def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
+    """Audit a URDF file.
+
+    Args:
+        path: The URDF file. Meshes are not needed.
+        free_flyer: Whether the base floats.
+
+    Returns:
+        The inspection. A file that no model can be built from gives a finding, not an error.
+    """
+    robot = _parse(Path(path))
+    findings = [*_numbers(robot), *negative_masses(robot)] if robot is not None else []
+    model = None
+    try:
+        model = RobotModel.from_urdf(path, free_flyer=free_flyer)
+    except ModelError as error:
+        findings.append(Finding("unusable", "error", f"file {Path(path).name}", str(error)))
+    if robot is not None and robot.get("name"):
+        findings += _joint_findings(Path(path))
+    if model is None or robot is None:
+        name = robot.get("name", "") if robot is not None else ""
+        return Inspection(name, _movable(robot), None, (), tuple(findings))
+    full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
+    findings += _link_findings(model)
+    findings += audit_links(model)
+    findings += _rounded_angles(model, robot, full)
+    structure = Structure(
+        standard=model.layout.n_inertial,
+        base_inertial=len(inertial.K),
+        base=len(full.K),
+        rank=len(full.K),
+        condition=_condition(model, full),
+        undetermined=inertial.unidentifiable,
+    )
+    return Inspection(model.name, model.joints, structure, inertial.expressions, tuple(findings))
+
+
+def _parse(path: Path) -> ET.Element | None:
+    """Return the ``<robot>``; None if there is none, which building the model reports."""
+    try:
+        robot = ET.parse(path).getroot()
+    except (OSError, ET.ParseError, LookupError, ValueError):  # the last two: its encoding
+        return None
+    return robot if robot.tag == "robot" else None
+
+
+def _movable(robot: ET.Element | None) -> tuple[str, ...]:
+    joints = robot.findall("joint") if robot is not None else []
+    return tuple(j.get("name", "") for j in joints if j.get("type") in _MOVABLE)
+
+
+def _condition(model: RobotModel, mapping: BaseMapping) -> float:
+    columns = len(mapping.names)
+    samples = 2 * columns // model.n_rows + 20
+    W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
+    return float(np.linalg.cond(W / np.linalg.norm(W, axis=0)))
+
+
+def _numbers(robot: ET.Element) -> Iterator[Finding]:
+    """Yield a finding for each attribute that should hold numbers and does not."""
+    for (kind, inside), keys in _NUMBERS.items():
+        for owner in robot.findall(kind):
+            element = owner.find(inside)
+            for key in keys if element is not None else ():
+                text = element.get(key) if element is not None else None
+                if text is None or _is_finite(text):
+                    continue
+                name = owner.get("name", "")
+                message = (
+                    f"{kind} {name!r}: {inside.replace('/', ' ')} {key} is {text!r}, wanted finite "
+                    "numbers with a decimal point and blanks between them; write the true value"
+                )
+                yield Finding("not_a_number", "error", f"{kind} {name}", message)
+
+
+def _is_finite(text: str) -> bool:
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        return False
+    return bool(values) and all(map(math.isfinite, values))
+
+
+def _joint_findings(path: Path) -> Iterator[Finding]:
+    """Yield what yourdfpy finds of limits, damping, friction and mimic."""
+    try:
+        joints = read_with_yourdfpy(path).joints
+    except ModelError as error:
+        message = f"{error}; limits, damping, friction and mimic of its joints were not checked"
+        yield Finding("yourdfpy_refuses", "warning", f"file {path.name}", message)
+        return
+    names = {joint.name for joint in joints if joint.type in _MOVABLE}
+    for joint in joints:
+        if joint.type in ("revolute", "prismatic"):
+            yield from _no_limits(joint)
+        if joint.dynamics is not None:
+            yield from _negative(joint, "damping", joint.dynamics.damping)
+            yield from _negative(joint, "friction", joint.dynamics.friction)
+        if joint.mimic is not None:
+            yield _mimic(joint, names)
+
+
+def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
+    lower = joint.limit.lower if joint.limit is not None else None
+    upper = joint.limit.upper if joint.limit is not None else None
+    if (lower or 0.0) < (upper or 0.0):
+        return
+    message = (
+        f"joint {joint.name!r} is {joint.type} but its range of positions is lower {lower}, upper "
+        f'{upper}, wanted lower < upper; write <limit lower="..." upper="..."/>, '
+        + ('or type="continuous" if it turns without end' if joint.type == "revolute" else "in m")
+    )
+    yield Finding("no_limits", "warning", f"joint {joint.name}", message)
+
+
+def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # noqa: ANN401
+    if text is None or not _is_finite(text) or float(text) >= 0:
+        return
+    harm = "Pinocchio refuses such a file" if key == "friction" else "simulators gain energy by it"
+    message = (
+        f"joint {joint.name!r} has {key} {text}, wanted 0 or more; robotid does not use it, but "
+        f"{harm}: mend the sign"
+    )
+    yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message, {key: float(text)})
+
+
+def _mimic(joint: Any, names: set[str]) -> Finding:  # noqa: ANN401
+    leader = joint.mimic.joint
+    if leader not in names or leader == joint.name:
+        message = (
+            f"joint {joint.name!r} mimics {leader!r}, which is no other movable joint of the file; "
+            "name the joint that leads it, or remove the <mimic>"
+        )
+        return Finding("mimic_joint", "warning", f"joint {joint.name}", message)
+    message = (
+        f"joint {joint.name!r} mimics {leader!r} (multiplier {joint.mimic.multiplier:g}, offset "
+        f"{joint.mimic.offset:g}) but is treated as a joint of its own; use mimic = 'coupled' if "
+        f"the drive of {leader!r} moves both"
+    )
+    return Finding("mimic_joint", "note", f"joint {joint.name}", message)
+
+
+def _link_findings(model: RobotModel) -> Iterator[Finding]:
+    """Yield faults of the inertials and where they are summed."""
+    inertials = model.tree.inertials
+    by_body: dict[int, list[LinkPlace]] = {}
+    for place in link_places(model):
+        by_body.setdefault(place.body, []).append(place)
+    for body, members in by_body.items():
+        having = [place.link for place in members if place.link in inertials]
+        for place in members:
+            if place.link in inertials:
+                matters = body >= 0 and not any(inertials[link].mass > 0 for link in having)
+                yield from impossible_inertial(place.link, inertials[place.link], matters)
+            elif body >= 0:
+                yield _missing(place.link, having)
+        lumped = [p.link for p in members if p.role == "fixed" and p.link in inertials]
+        if lumped and body >= 0:
+            moved = model.layout.bodies[body]
+            message = (
+                f"link {moved!r} is one body with {lumped}, joined to it by fixed joints: one sum "
+                "is identified, and a written URDF has it in this link; nothing needs doing"
+            )
+            yield Finding("fixed_lumped", "note", f"link {moved}", message)
+
+
+def _missing(link: str, having: list[str]) -> Finding:
+    if having:
+        message = (
+            f"link {link!r} moves but has no <inertial>, wanted one; the mass of its body is in "
+            f"{having}, so nothing needs doing if it is a mere frame"
+        )
+        return Finding("missing_inertial", "note", f"link {link}", message)
+    message = (
+        f"link {link!r} moves but has no <inertial>, nor has any link joined to it, wanted one: "
+        "its body counts as massless; add an estimate of mass, centre and inertia"
+    )
+    return Finding("missing_inertial", "warning", f"link {link}", message)
+
+
+def _rounded_angles(
+    model: RobotModel, robot: ET.Element, mapping: BaseMapping
+) -> Iterator[Finding]:
+    """Yield the joint angles that a URDF rounds, 3.1416 for pi, and what they do to the rank."""
+    seeming = int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
+    carrying = _carrying(model.tree)
+    for joint in robot.findall("joint"):
+        origin, name = joint.find("origin"), joint.get("name", "")
+        angles = origin.get("rpy", "0 0 0").split() if origin is not None else []
+        exact = {word: value for word in angles if (value := _exact(float(word))) is not None}
+        if not exact:
+            continue
+        wanted = ", ".join(f"{value!r} for {word}" for word, value in exact.items())
+        severity, effect = "note", "the number of identifiable parameters does not change"
+        if seeming > 0 and name in carrying:
+            severity = "warning"
+            effect = (
+                f"the file's rounding makes {seeming} more parameters look identifiable, though "
+                "only noise would fix their values; robotid leaves them out, other tools may not"
+            )
+        message = f"joint {name!r} has rpy {' '.join(angles)!r}, rounded: write {wanted}; {effect}"
+        evidence = {"largest_error": max(abs(float(word) - exact[word]) for word in exact)}
+        yield Finding("rounded_rpy", severity, f"joint {name}", message, evidence)
+
+
+def _carrying(tree: Tree) -> set[str]:
+    """Return the joints that move or carry one that does: their angles shape the dynamics."""
+    arriving = {joint.child: joint for joint in tree.joints}
+    carrying: set[str] = set()
+    for joint in tree.movable:
+        at: Joint | None = joint
+        while at is not None and at.name not in carrying:
+            carrying.add(at.name)
+            at = arriving.get(at.parent)
+    return carrying
+
+
+def _exact(angle: float) -> float | None:
+    """Return the multiple of pi/2 that an angle is a rounded form of, None if it is of none."""
+    turns = round(angle / (math.pi / 2))
+    exact = turns * math.pi / 2
+    return exact if turns and _EXACT < abs(angle - exact) < _ROUNDED else None
+
+
+def _plain(finding: Finding) -> Mapping[str, Any]:
+    kind, name = finding.where.split(" ", 1)
+    place = {} if kind == "file" else {kind: name}
+    return {
+        "code": finding.code,
+        "severity": finding.severity,
+        **place,
+        "message": finding.message,
+        "evidence": {key: float(value) for key, value in finding.evidence.items()},
+    }

@@ -1,0 +1,146 @@
+"""Inertials against the geometry that a URDF has: where no body of that shape can be so."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.identification.verdict import Finding
+from robotid.robot.geometry import body_points
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.tree import Inertial
+
+__all__ = ["audit_links"]
+
+_HEAVIEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: beyond solid tungsten, below foam
+_MARGIN = 0.1  # of the box's diagonal by which a centre of mass may lie outside
+_THIN = 0.01  # [m] to which each side of a box is widened: sheets have a volume, too
+_SMALL = 1e-3  # share of the robot's mass below which what is wrong of a body hardly matters
+_ROUND = tuple(10.0**k for k in range(-6, 3))  # inertias [kg m^2] and masses [kg] of templates
+_ALIKE = 1e-9  # relative difference of inertials that are copies
+_SIZE = 0.05  # relative difference of boxes that are of one size
+
+
+def audit_links(model: RobotModel) -> Iterator[Finding]:
+    """Yield what is implausible about the inertials of a robot.
+
+    Bodies are taken as they move, each link with all that is fixed to it. Geometry is the
+    collision's, or the visual one; a body whose geometry cannot be read is not compared.
+
+    Args:
+        model: The robot.
+
+    Yields:
+        "com_outside", "density", "gyration": of a body against the box around its geometry;
+        "copied_inertial": links of other size with the same inertial; "default_inertial": numbers
+        as templates have them; "geometry_unread": one note if bodies of a
+        file with meshes were not compared.
+    """
+    yield from _templates(model)
+    points = body_points(model)
+    size = model.layout.n_inertial
+    J = pseudo_inertia(model.standard_parameters()[:size])
+    for body, J_i in zip(model.layout.bodies, J, strict=True):
+        if body in points and J_i[3, 3] > 0:
+            is_small = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
+            for finding in _against_geometry(body, J_i, points[body]):
+                yield replace(finding, severity="note") if is_small else finding
+    yield from _copies(model, points)
+    unread = [body for body in model.layout.bodies if body not in points]
+    if unread and next(ET.parse(model.tree.path).getroot().iter("mesh"), None) is not None:
+        message = (
+            f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing or in meshes that "
+            "are not found: their mass and centre of mass were not compared with it; set "
+            "ROS_PACKAGE_PATH to compare them"
+        )
+        yield Finding("geometry_unread", "note", f"link {unread[0]}", message)
+
+
+def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
+    """Yield what the box around a body's geometry does not allow."""
+    at, mass = f"link {body}", float(J[3, 3])
+    low, high = points.min(axis=0), points.max(axis=0)
+    sides = np.maximum(high - low, _THIN)
+    diagonal = float(np.linalg.norm(sides))
+    centre = J[:3, 3] / mass
+    outside = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
+    if outside > _MARGIN * diagonal:
+        message = (
+            f"link {body!r}: its centre of mass {_metres(centre)} lies {outside:.3g} m outside the "
+            f"box of its geometry, {_metres(low)} to {_metres(high)}; check the frame and the unit "
+            "of <inertial><origin>"
+        )
+        yield Finding("com_outside", "warning", at, message, {"outside": outside})
+    density = mass / float(np.prod(sides))
+    if not _LIGHTEST <= density <= _HEAVIEST:
+        wanted = f"{_LIGHTEST:g} to {_HEAVIEST:g}"
+        message = (
+            f"link {body!r}: {mass:.4g} kg in a box of {_metres(sides)} m are {density:.3g} "
+            f"kg/m^3, wanted {wanted}; check the mass, and whether meshes are in mm"
+        )
+        yield Finding("density", "warning", at, message, {"density": density})
+    second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance from it
+    farthest = float(np.max(np.sum((points - centre) ** 2, axis=1))) ** 0.5
+    gyration = max(float(second), 0.0) ** 0.5
+    if gyration > farthest + 0.5 * _THIN:
+        message = (
+            f"link {body!r}: its inertia puts the mass {gyration:.3g} m from its centre on "
+            f"average, but its geometry ends at {farthest:.3g} m; check the unit of the inertia, "
+            "and that it is about the centre of mass"
+        )
+        evidence = {"gyration": gyration, "farthest": farthest}
+        yield Finding("gyration", "warning", at, message, evidence)
+
+
+def _templates(model: RobotModel) -> Iterator[Finding]:
+    """Yield inertials whose numbers nobody measured."""
+    for link, inertial in model.tree.inertials.items():
+        ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
+        is_round = any(np.isclose(ixx, value, rtol=_ALIKE) for value in _ROUND)
+        if not (ixx == iyy == izz and ixy == ixz == iyz == 0 and is_round):
+            continue
+        if inertial.mass not in (*_ROUND, 0.5) and np.any(inertial.com):
+            continue
+        message = (
+            f"link {link!r} has the mass {inertial.mass:g} kg and {ixx:g} kg m^2 about every axis, "
+            "as templates have; take mass, centre and inertia from CAD, or identify them"
+        )
+        evidence = {"mass": inertial.mass, "moment": ixx}
+        yield Finding("default_inertial", "warning", f"link {link}", message, evidence)
+
+
+def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
+    """Yield links that have the inertial of another one of another size."""
+    inertials = model.tree.inertials
+    owners = [body for body in model.layout.bodies if body in inertials and body in points]
+    groups: list[list[str]] = []
+    for link in owners:
+        for group in groups:
+            if _is_copy(inertials[link], inertials[group[0]]):
+                group.append(link)
+                break
+        else:
+            groups.append([link])
+    for group in groups:
+        boxes = np.sort([np.ptp(points[link], axis=0) for link in group], axis=1)
+        spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
+        if len(group) < 2 or spread < _SIZE or inertials[group[0]].mass <= 0:
+            continue
+        message = (
+            f"the links {group} have the same mass, centre of mass and inertia, but other sizes; "
+            "one was copied: write each link's own"
+        )
+        evidence = {"links": float(len(group)), "difference": spread}
+        yield Finding("copied_inertial", "warning", f"link {group[0]}", message, evidence)
+
+
+def _is_copy(one: Inertial, other: Inertial) -> bool:
+    a, b = (np.array([x.mass, *x.com, *x.inertia], dtype=float) for x in (one, other))
+    return bool(np.allclose(a, b, rtol=_ALIKE, atol=1e-12))
+
+
+def _metres(values: Array) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"

@@ -1,0 +1,113 @@
+"""Audit of a URDF's inertials by themselves: what no body can have."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.identification.verdict import Finding
+from robotid.robot.bodies import link_places
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import Inertial
+
+__all__ = ["impossible_inertial", "impossible_inertials", "negative_masses"]
+
+_SLACK = 1e-9  # relative violation of the triangle inequality that is rounding
+
+
+def negative_masses(robot: ET.Element) -> Iterator[Finding]:
+    """Yield the negative masses of a file, which no model is built from.
+
+    Args:
+        robot: Root element of a URDF.
+
+    Yields:
+        Findings.
+    """
+    for link in robot.findall("link"):
+        mass = link.find("inertial/mass")
+        try:
+            value = float(mass.get("value", "nan")) if mass is not None else 0.0
+        except ValueError:  # a finding of its own
+            continue
+        if value < 0:
+            name = link.get("name", "")
+            message = f"link {name!r} has the mass {value:g} kg, wanted more than 0; mend the sign"
+            yield Finding("negative_mass", "error", f"link {name}", message, {"mass": value})
+
+
+def impossible_inertials(model: RobotModel) -> list[Finding]:
+    """Return the moving inertials of a URDF that no body can have, as warnings about a fit to it.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        The findings.
+    """
+    inertials = model.tree.inertials
+    effect = "; a consistent fit takes the nearest possible body for what the URDF says"
+    return [
+        replace(finding, severity="warning", message=finding.message + effect)
+        for place in link_places(model)
+        if place.body >= 0 and place.link in inertials
+        for finding in impossible_inertial(place.link, inertials[place.link], matters=False)
+        if finding.severity == "error"
+    ]
+
+
+def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterator[Finding]:
+    """Yield what no body can have.
+
+    Args:
+        link: Name of the link.
+        inertial: What the URDF says of it.
+        matters: Whether a mass of 0 matters, since nothing else gives its body one.
+
+    Yields:
+        Findings.
+    """
+    at, mass = f"link {link}", inertial.mass
+    if mass == 0:
+        message = (
+            f"link {link!r} has the mass 0 kg, wanted more than 0; write its mass, or remove the "
+            "<inertial> if the link is a mere frame"
+        )
+        yield Finding("zero_mass", "warning" if matters else "note", at, message)
+    moments = _principal(inertial)
+    fault = _inertia_fault(moments)
+    if fault and (mass != 0 or any(inertial.inertia)):
+        severity = "note" if fault.startswith("flat") else "error"
+        A, B, C = (float(moment) for moment in moments)
+        evidence = {"smallest": A, "middle": B, "largest": C, "triangle": A + B - C}
+        message = f"link {link!r}: {fault}"
+        yield Finding("not_positive_definite", severity, at, message, evidence)
+
+
+def _principal(inertial: Inertial) -> Array:
+    ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
+    moments: Array = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    return moments  # ascending
+
+
+def _inertia_fault(moments: Array) -> str | None:
+    """Return what keeps a body with these principal moments of inertia from being possible."""
+    A, B, C = (float(moment) for moment in moments)
+    stated = f"principal moments of inertia {A:.4g}, {B:.4g}, {C:.4g} kg m^2"
+    advice = "take the inertia from CAD, about the centre of mass and in the stated frame"
+    margin = A + B - C
+    if min(A, 0.0) < -_SLACK * abs(C):
+        return f"its {stated} are not all positive, wanted > 0 ({A:.4g} is not); {advice}"
+    if margin < -_SLACK * abs(C):
+        return (
+            f"its {stated} break the triangle inequality: the two smaller ones add up to "
+            f"{A + B:.4g}, wanted more than {C:.4g}; {advice}"
+        )
+    if margin <= _SLACK * abs(C):
+        return (
+            f"flat or thin: of its {stated} the two smaller ones add up to no more than the third, "
+            "so the pseudo-inertia is singular; give it some thickness"
+        )
+    return None

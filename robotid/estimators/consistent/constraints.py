@@ -1,0 +1,243 @@
+"""What else is known of the bodies: bounds of mass, centre of mass, and bodies that are known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators.consistent.cones import Cone, svec
+from robotid.exceptions import SettingsError
+from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
+
+__all__ = ["SIGN_MARGIN", "Constraints", "check_constraints", "consistency_cone", "equalities"]
+
+#: Drive terms stay above this share of their scale, so that rounding cannot make them negative.
+SIGN_MARGIN = 1e-9
+_ROUNDING = 1e-9  # [kg], [m]: a pinned body may lie that far outside its bounds
+
+
+@dataclass(frozen=True, eq=False)
+class Constraints:
+    """Bounds beside physical consistency, by name of the body that a joint moves.
+
+    Attributes:
+        mass: Smallest and largest mass of a body [kg].
+        total_mass: Smallest and largest mass of all bodies together [kg], or None.
+        com: Half-spaces A c <= b that hold the centre of mass c of a body in its own frame, by
+            name: A of shape (k, 3), unit rows, and b of shape (k,) [m].
+        pinned: Bodies that keep the prior's values.
+    """
+
+    mass: dict[str, tuple[float, float]] = field(default_factory=dict)
+    total_mass: tuple[float, float] | None = None
+    com: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    pinned: tuple[str, ...] = ()
+
+
+def check_constraints(
+    constraints: Constraints, layout: ParameterLayout, prior: Array, held: Array
+) -> None:
+    """Refuse bounds that no parameters meet, before a solver looks for them.
+
+    Args:
+        constraints: The constraints.
+        layout: The standard parameters.
+        prior: Their prior values, shape (p,).
+        held: Known share of each body, shape (10 bodies,).
+
+    Raises:
+        SettingsError: If a body is unknown, bounds contradict each other, or a pinned body lies
+            outside its bounds or is not physically possible.
+    """
+    known = {*constraints.mass, *constraints.com, *constraints.pinned}
+    unknown = sorted(known - set(layout.bodies))
+    if unknown:
+        raise SettingsError(
+            f"constraints name {unknown}, which are no bodies of the model; links joined by fixed "
+            f"joints count to the one that a joint moves: {list(layout.bodies)}"
+        )
+    values = prior[: layout.n_inertial].reshape(-1, 10)
+    parts = held.reshape(-1, 10)
+    for body, (low, high) in constraints.mass.items():
+        i = layout.bodies.index(body)
+        _check_range(f"mass of {body}", low, high, "kg")
+        if high < parts[i, 0]:
+            raise SettingsError(
+                f"mass of {body} is bounded by {high:g} kg, but its links on locked joints alone "
+                f"weigh {parts[i, 0]:g} kg; raise the bound"
+            )
+    for body in constraints.pinned:
+        i = layout.bodies.index(body)
+        _check_pinned(constraints, body, values[i], parts[i])
+    if constraints.total_mass is not None:
+        _check_total(constraints, layout, values)
+
+
+def consistency_cone(
+    constraints: Constraints,
+    layout: ParameterLayout,
+    scale: Array,
+    held: Array,
+    shrink: Array,
+    margin: float,
+) -> Cone:
+    """Return the cone of possible parameters x = pi / scale.
+
+    Args:
+        constraints: Bounds beside physical consistency.
+        layout: The standard parameters.
+        scale: Unit of each parameter, shape (p,).
+        held: Known share of each body, shape (10 bodies,).
+        shrink: Matrices T^-1/2 that make pseudo-inertias free of units, shape (bodies, 4, 4).
+        margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body beside its held share [-].
+
+    Returns:
+        The cone; pinned bodies have no part in it.
+    """
+    p = len(layout.names)
+    signs = np.flatnonzero(layout.is_nonnegative())
+    G, h = [np.eye(p)[signs]], [np.full(len(signs), -SIGN_MARGIN)]
+    labels = [f"drive_signs {layout.names[i]}" for i in signs]
+    C, c, named = _bounds(constraints, layout)
+    C = C * scale
+    norms = np.linalg.norm(C, axis=1)
+    G.append(C / norms[:, None])
+    h.append(c / norms)
+    labels += named
+    basis = pseudo_inertia_basis()
+    S, s = [np.zeros((0, p))], [np.zeros(0)]
+    for i, J_held in enumerate(pseudo_inertia(held)):
+        if layout.bodies[i] in constraints.pinned:
+            continue
+        part = slice(10 * i, 10 * i + 10)
+        block = np.zeros((10, p))
+        block[:, part] = svec(shrink[i] @ basis @ shrink[i]).T * scale[part]
+        S.append(block)
+        s.append(-svec(shrink[i] @ J_held @ shrink[i] + margin * np.eye(4)))
+        labels.append(f"pseudo_inertia {layout.bodies[i]}")
+    return Cone(np.vstack(G), np.concatenate(h), np.vstack(S), np.concatenate(s), tuple(labels))
+
+
+def equalities(
+    constraints: Constraints, layout: ParameterLayout, prior: Array
+) -> tuple[Array, Array]:
+    """Return what is known exactly, as E pi = e: pinned bodies, and masses without a range.
+
+    Args:
+        constraints: The constraints.
+        layout: The standard parameters.
+        prior: Their prior values, shape (p,).
+
+    Returns:
+        E, shape (k, p), and e, shape (k,).
+    """
+    p = len(layout.names)
+    pinned = [i for i, body in enumerate(layout.bodies) if body in constraints.pinned]
+    kept = [10 * i + k for i in pinned for k in range(10)]
+    E, e = [np.eye(p)[kept]], [prior[kept]]
+    for body, (low, high) in constraints.mass.items():
+        i = layout.bodies.index(body)
+        if low == high and i not in pinned:
+            E.append(np.eye(p)[[10 * i]])
+            e.append(np.array([low]))
+    if constraints.total_mass is not None and np.ptp(constraints.total_mass) == 0:
+        E.append(_all_masses(layout)[None])
+        e.append(np.array([constraints.total_mass[0]]))
+    return np.vstack(E), np.concatenate(e)
+
+
+def _bounds(constraints: Constraints, layout: ParameterLayout) -> tuple[Array, Array, list[str]]:
+    """Return C, c and labels of the rows C pi + c >= 0 of bounds that leave a range."""
+    p = len(layout.names)
+    rows: list[Array] = []
+    constants: list[float] = []
+    labels: list[str] = []
+
+    def add(row: Array, low: float, high: float, label: str) -> None:
+        if low == high:
+            return
+        for sign, bound in ((1.0, low), (-1.0, high)):
+            if np.isfinite(bound):
+                rows.append(sign * row)
+                constants.append(-sign * bound)
+                labels.append(label)
+
+    for body, (low, high) in constraints.mass.items():
+        if body not in constraints.pinned:
+            add(np.eye(p)[10 * layout.bodies.index(body)], low, high, f"mass {body}")
+    if constraints.total_mass is not None:
+        add(_all_masses(layout), *constraints.total_mass, "total_mass all")
+    for body, (A, b) in constraints.com.items():
+        if body in constraints.pinned:
+            continue
+        i = layout.bodies.index(body)
+        for normal, distance in zip(A, b, strict=True):
+            row = np.zeros(p)
+            row[10 * i] = distance
+            row[10 * i + 1 : 10 * i + 4] = -normal
+            rows.append(row)
+            constants.append(0.0)
+            labels.append(f"centre_of_mass {body}")
+    return np.array(rows).reshape(-1, p), np.array(constants), labels
+
+
+def _all_masses(layout: ParameterLayout) -> Array:
+    row = np.zeros(len(layout.names))
+    row[: layout.n_inertial : 10] = 1.0
+    return row
+
+
+def _check_range(what: str, low: float, high: float, unit: str) -> None:
+    if not low <= high:
+        raise SettingsError(
+            f"{what} is bounded by [{low:g}, {high:g}] {unit}: the first is above the second; "
+            "write the smaller one first"
+        )
+    if high <= 0:
+        raise SettingsError(f"{what} is bounded by {high:g} {unit}, wanted a positive bound")
+
+
+def _check_pinned(constraints: Constraints, body: str, values: Array, held: Array) -> None:
+    (J,) = pseudo_inertia(values - held)
+    if np.linalg.eigvalsh(J)[0] <= 0:
+        raise SettingsError(
+            f"{body} is pinned, but its inertial in the URDF is not physically possible; mend it, "
+            "or leave it out of 'pinned'"
+        )
+    low, high = constraints.mass.get(body, (0.0, np.inf))
+    if not low - _ROUNDING <= values[0] <= high + _ROUNDING:
+        raise SettingsError(
+            f"{body} is pinned at the URDF's {values[0]:g} kg, outside its bounds "
+            f"[{low:g}, {high:g}] kg; leave it out of 'pinned' or of 'mass'"
+        )
+    if body in constraints.com:
+        A, b = constraints.com[body]
+        centre = values[1:4] / values[0]
+        beyond = float((A @ centre - b).max())
+        if beyond > _ROUNDING:
+            raise SettingsError(
+                f"{body} is pinned, but the URDF's centre of mass {np.round(centre, 4).tolist()} m "
+                f"lies {1e3 * beyond:.1f} mm outside its bounds; leave it out of 'pinned' or widen "
+                "them"
+            )
+
+
+def _check_total(constraints: Constraints, layout: ParameterLayout, values: Array) -> None:
+    low, high = constraints.total_mass or (0.0, np.inf)
+    _check_range("total_mass", low, high, "kg")
+    bounds = np.array(
+        [
+            [values[i, 0]] * 2 if body in constraints.pinned else constraints.mass.get(body, _OPEN)
+            for i, body in enumerate(layout.bodies)
+        ]
+    )
+    least, most = bounds.sum(axis=0)
+    if high < least - _ROUNDING or low > most + _ROUNDING:
+        raise SettingsError(
+            f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bodies' own bounds and "
+            f"pinned masses allow [{least:g}, {most:g}] kg; make them agree"
+        )
+
+
+_OPEN: Sequence[float] = (0.0, np.inf)

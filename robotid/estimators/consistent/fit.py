@@ -1,0 +1,373 @@
+"""Physically consistent fit: a convex cone programme on the factors.
+
+Every body gets a positive definite pseudo-inertia, every drive armature and friction of the right
+sign; where the data say nothing the parameters stay near their prior.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from robotid._typing import Array
+from robotid.estimators.batch.least_squares import WLS
+from robotid.estimators.consistent.cone_programme import Programme
+from robotid.estimators.consistent.cones import Subspace
+from robotid.estimators.consistent.constraints import (
+    Constraints,
+    check_constraints,
+    consistency_cone,
+    equalities,
+)
+from robotid.estimators.consistent.penalties import (
+    METRICS,
+    Penalty,
+    WeightChoice,
+    body_units,
+    make_penalty,
+)
+from robotid.estimators.consistent.solvers import SOLVERS, ConeSolution
+from robotid.estimators.determination import base_spread, determine
+from robotid.estimators.estimator import Estimate, Estimator, as_factors
+from robotid.exceptions import DataError, NotConvergedError
+from robotid.regressor.factors import Factors
+from robotid.regressor.problem import Problem
+from robotid.robot.parameters import ParameterLayout
+
+__all__ = ["Consistent"]
+
+_ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
+
+
+@dataclass(frozen=True, eq=False)
+class Consistent(Estimator):
+    """Physically consistent estimate of the standard parameters.
+
+    Minimises, over the standard parameters pi,
+
+        sum_j |tau_j - W_b,j K pi|^2 / sigma_j^2 + prior_weight penalty(pi)
+
+    subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
+    coefficients >= 0, and the further constraints. The noise levels sigma_j are those of the fit
+    without the inequalities, from weighted least squares onwards.
+
+    Attributes:
+        layout: The standard parameters.
+        K: Map to the base parameters, shape (b, p).
+        prior: Prior value of each parameter, shape (p,), as the URDF's.
+        prior_std: How far a parameter may plausibly lie from its prior, shape (p,), positive.
+        held: Share of each body that is known and may not be negative beside it, as the links on
+            locked joints, shape (10 bodies,); None for nothing.
+        margin: Smallest eigenvalue of a body's pseudo-inertia relative to its prior size [-].
+        prior_weight: Weight of the prior [-].
+        independent_share: Share of the rows that count as independent, 2 cutoff / rate.
+        max_iterations: Bound on the iterations of the cone solver.
+        metric: How the distance from the prior is measured: "euclidean",
+            "riemannian" or "entropic"; see :func:`robotid.estimators.consistent.penalties.make_penalty`.
+        constraints: Bounds beside physical consistency.
+        solver: "clarabel" or "scs".
+        choice: How ``prior_weight`` was chosen, if it was.
+        check: Whether the other solver solves it, too; its difference is stated in the details.
+
+    References:
+        Sousa, Cortesao (2014), Physical feasibility of robot base inertial parameter
+        identification: a linear matrix inequality approach; Wensing, Kim, Slotine (2018), Linear
+        Matrix Inequalities for Physically Consistent Inertial Parameter Identification, (8).
+    """
+
+    layout: ParameterLayout
+    K: Array
+    prior: Array
+    prior_std: Array
+    held: Array | None = None
+    margin: float = 1e-4
+    prior_weight: float = 1.0
+    independent_share: float = 1.0
+    max_iterations: int = 200
+    metric: str = "euclidean"
+    constraints: Constraints = field(default_factory=Constraints)
+    solver: str = "clarabel"
+    check: bool = False
+    choice: WeightChoice | None = None
+
+    def __post_init__(self) -> None:
+        p = len(self.layout.names)
+        for name, shape in (("prior", (p,)), ("prior_std", (p,)), ("K", (len(self.K), p))):
+            if getattr(self, name).shape != shape:
+                raise DataError(f"{name} has shape {getattr(self, name).shape}, wanted {shape}")
+        if not (np.isfinite(self.prior_std) & (self.prior_std > 0)).all():
+            raise DataError("prior_std must be positive and finite for every parameter")
+        if not np.isfinite(self.prior).all() or not np.isfinite(self._held).all():
+            raise DataError("prior and held must be finite for every parameter")
+        if not (self.margin > 0 and self.prior_weight > 0):
+            raise DataError(
+                f"margin {self.margin} and prior_weight {self.prior_weight} must be positive"
+            )
+        if self.metric not in METRICS or self.solver not in SOLVERS:
+            raise DataError(
+                f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
+                f"{self.solver!r}, wanted one of {list(SOLVERS)}"
+            )
+        check_constraints(self.constraints, self.layout, self.prior, self._held)
+
+    def fit(self, data: Problem | Factors) -> Estimate:
+        """Estimate the standard parameters; see :meth:`Estimator.fit`.
+
+        Args:
+            data: A problem in base parameters, or its factors.
+
+        Returns:
+            The estimate over the p standard parameters. The covariance is that of the fit without
+            the inequalities; :meth:`redrawn` tells that with them. Rank, condition number and the
+            names of undetermined parameters are those of the base parameters.
+
+        Raises:
+            DataError: If there are fewer rows than parameters.
+            NotConvergedError: If the cone solver does not solve it.
+        """
+        factors = as_factors(data)
+        wls = self._wls(factors)
+        sigma = self.noise(factors, wls.sigma)
+        rows = self.rows(factors, sigma)
+        solution, covariance = self.minimise(rows)
+        details = self._details(solution.x)
+        if self.check:
+            details["check"] = self._second_opinion(rows, solution.x, factors)
+        return Estimate(
+            theta=solution.x,
+            covariance=covariance,
+            names=self.layout.names,
+            sigma=sigma,
+            rank=wls.rank,
+            condition=wls.condition,
+            undetermined=self.undetermined(rows, factors.names),
+            converged=True,
+            n_iter=solution.n_iter,
+            message=solution.message,
+            prior_std=self.spread_before,
+            details=details,
+        )
+
+    def project(self, estimate: Estimate) -> Estimate:
+        """Return the possible standard parameters nearest to an estimate of the base parameters.
+
+        Nearest in the metric of its covariance C, the prior beside it, with the constraints of
+        :meth:`fit`: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi).
+
+        Args:
+            estimate: Base parameters, as a recursive estimator has them at any moment. Those of
+                infinite variance count as unknown.
+
+        Returns:
+            The estimate over the p standard parameters.
+
+        Raises:
+            DataError: If no base parameter has a finite variance, or C is not positive definite.
+            NotConvergedError: If the cone solver does not solve it.
+        """
+        known = np.flatnonzero(np.isfinite(np.diag(estimate.covariance)))
+        if not len(known):
+            raise DataError(
+                "an estimate without a covariance cannot be projected: it has no metric; use 'rls' "
+                "or 'kalman', which have one"
+            )
+        rows = _information_rows(estimate, known)  # (k, b + 1)
+        solution, covariance = self.minimise(rows)
+        return replace(
+            estimate,
+            theta=solution.x,
+            covariance=covariance,
+            names=self.layout.names,
+            undetermined=self.undetermined(rows, estimate.names),
+            n_iter=estimate.n_iter + solution.n_iter,
+            message=f"{estimate.message}; made physically possible, {solution.message}",
+            prior_std=self.spread_before,
+            details=self._details(solution.x),
+        )
+
+    def noise(self, factors: Factors, sigma: Array | None = None) -> Array:
+        """Return the noise level of each joint, by the fit without the inequalities.
+
+        Args:
+            factors: The factors, of base parameters.
+            sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
+
+        Returns:
+            Noise levels, shape (n,) [N m or N]; see :meth:`Programme.noise`.
+        """
+        start = self._wls(factors).sigma if sigma is None else sigma
+        return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
+
+    def rows(self, factors: Factors, sigma: Array) -> Array:
+        """Return the rows [R d] with |R K pi - d|^2 the weighted squares of the residual.
+
+        Args:
+            factors: The factors, of base parameters.
+            sigma: Noise level per joint, shape (n,) [N m or N].
+
+        Returns:
+            Upper triangular factor, shape (b + 1, b + 1), free of units.
+        """
+        return factors.weighted(sigma / np.sqrt(self.independent_share))
+
+    def minimise(self, rows: Array) -> tuple[ConeSolution, Array]:
+        """Minimise |rows [K pi; -1]|^2 and the weighted penalty over the cone.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+
+        Returns:
+            The solution, its x being pi, shape (p,); and the covariance without the inequalities.
+
+        Raises:
+            NotConvergedError: If the cone solver or Newton's method does not solve it.
+        """
+        return self.programme.minimise(rows, self.prior_weight)
+
+    def redrawn(
+        self, rows: Array, pi: Array, meat: Array, draws: int, rng: np.random.Generator
+    ) -> tuple[Array, list[str]]:
+        """Return how fits lie about this one whose data and prior are drawn anew.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+            pi: The fit, shape (p,).
+            meat: Covariance of the score of the rows, shape (b, b).
+            draws: How many.
+            rng: Source of the noise.
+
+        Returns:
+            See :meth:`Programme.redrawn`.
+        """
+        return self.programme.redrawn(rows, self.prior_weight, pi, meat, draws, rng)
+
+    def objective(self, rows: Array, pi: Array) -> float:
+        """Return what :meth:`minimise` minimises.
+
+        Args:
+            rows: Information, shape (k, b + 1).
+            pi: Standard parameters, shape (p,).
+
+        Returns:
+            The weighted squares of the residual plus the weighted penalty [-].
+        """
+        return self.programme.objective(rows, pi, self.prior_weight)
+
+    def active(self, pi: Array, tolerance: float = _ACTIVE) -> tuple[Array, tuple[str, ...]]:
+        """Return the constraints that bind at parameters, linearised there.
+
+        Args:
+            pi: Standard parameters, shape (p,).
+            tolerance: Slack below which a constraint counts as active, free of units.
+
+        Returns:
+            Gradients with respect to pi, shape (a, p), of what the constraints hold at 0, and the
+            family and owner of each, as "pseudo_inertia forearm"; equalities are not among them.
+        """
+        gradients, labels = self.programme.cone.active(pi / self.prior_std, tolerance)
+        return gradients / self.prior_std, labels
+
+    @cached_property
+    def programme(self) -> Programme:
+        """The convex programme, for any data and weight."""
+        size, scale = self.layout.n_inertial, self.prior_std
+        E, e = equalities(self.constraints, self.layout, self.prior)
+        cone = consistency_cone(
+            self.constraints, self.layout, scale, self._held, body_units(scale[:size]), self.margin
+        )
+        penalty = make_penalty(self.metric, self.layout, self.prior, scale, self._held)
+        space = Subspace.of(E * scale, e)
+        return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)
+
+    @property
+    def penalty(self) -> Penalty:
+        """The penalty on the distance from the prior."""
+        return self.programme.penalty
+
+    @property
+    def spread_before(self) -> Array:
+        """Standard deviation of each parameter by the prior alone, shape (p,)."""
+        covariance = self.programme.prior_covariance(self.prior_weight)
+        spread: Array = np.sqrt(np.diag(covariance))
+        return spread
+
+    def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the base parameters that the data do not determine by themselves.
+
+        See :func:`robotid.estimators.determination.determine`; whatever metric and weight the prior has.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+            base_names: Names of the base parameters.
+
+        Returns:
+            Their names.
+        """
+        known = self.layout.owned_by(self.constraints.pinned)
+        before = base_spread(self.K, self.prior_std, known)
+        return determine(base_names, rows[:, :-1], before).undetermined
+
+    @property
+    def _held(self) -> Array:
+        return np.zeros(self.layout.n_inertial) if self.held is None else self.held
+
+    def _wls(self, factors: Factors) -> Estimate:
+        """Return weighted least squares; directions that the data leave open keep the prior."""
+        prior = self.K @ self.prior
+        return WLS(prior=prior, independent_share=self.independent_share).fit(factors)
+
+    def _details(self, pi: Array) -> dict[str, Any]:
+        """Return how it was fitted, as plain values."""
+        is_bound = self.programme.space.basis.shape[1] < len(pi)
+        chosen = (
+            {}
+            if self.choice is None
+            else {
+                "chosen_by": self.choice.how,
+                "curve": [list(pair) for pair in self.choice.curve],
+            }
+        )
+        return {
+            "prior": {"metric": self.metric, "weight": self.prior_weight, **chosen},
+            "solver": self.solver,
+            "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
+            "active": sorted(set(self.active(pi)[1])),
+            "pinned": list(self.constraints.pinned),
+        }
+
+    def _second_opinion(self, rows: Array, pi: Array, factors: Factors) -> dict[str, Any]:
+        """Return what the other solver makes of it, as plain values."""
+        (other,) = (name for name in SOLVERS if name != self.solver)
+        try:
+            solution, _ = replace(self, solver=other).minimise(rows)
+        except NotConvergedError as error:
+            return {"solver": other, "status": error.status}
+        objective = self.objective(rows, pi)
+        change = factors.R[:, :, :-1] @ (self.K @ (solution.x - pi))
+        torque = np.sqrt((change**2).sum() / factors.torque_squares().sum())
+        return {
+            "solver": other,
+            "status": solution.message,
+            "objective_difference": (self.objective(rows, solution.x) - objective) / objective,
+            "torque_difference": float(torque),
+        }
+
+
+def _information_rows(estimate: Estimate, known: Array) -> Array:
+    """Return rows [L^-1 (beta -> known), L^-1 beta] with L L^T the covariance of what is known."""
+    C = estimate.covariance[np.ix_(known, known)]
+    scale = np.sqrt(np.diag(C))
+    try:
+        L = scale[:, None] * np.linalg.cholesky(C / np.outer(scale, scale))
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            "the covariance of the estimate is not positive definite, so it has no metric to "
+            "project in; give the estimator more samples or a prior"
+        ) from error
+    chosen = np.zeros((len(known), len(estimate.theta) + 1))
+    chosen[np.arange(len(known)), known] = 1.0
+    chosen[:, -1] = estimate.theta[known]
+    rows: Array = scipy.linalg.solve_triangular(L, chosen, lower=True)
+    return rows

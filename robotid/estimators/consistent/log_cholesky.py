@@ -1,0 +1,307 @@
+"""The consistent fit without a cone: nonlinear least squares in log-Cholesky parameters."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.linalg
+
+from robotid._typing import Array
+from robotid.estimators.consistent.cones import svec, unsvec
+from robotid.estimators.consistent.constraints import SIGN_MARGIN, Constraints
+from robotid.estimators.consistent.fit import Consistent
+from robotid.estimators.consistent.penalties import body_units
+from robotid.estimators.estimator import Estimate, Estimator, as_factors
+from robotid.exceptions import SettingsError
+from robotid.regressor.factors import Factors
+from robotid.regressor.problem import Problem
+from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
+
+__all__ = [
+    "LogCholesky",
+    "from_log_cholesky",
+    "log_cholesky_curvature",
+    "log_cholesky_jacobian",
+    "to_log_cholesky",
+]
+
+_INSIDE = 1e-6  # a start on the boundary is moved inside by that, free of units
+_STEPS = 500
+_SETTLED = 1e-14  # predicted decrease at which it has converged, relative to the objective
+_FLAT = 1e-9  # smallest curvature that damping counts with, relative
+_TOO_STIFF = 1e16  # damping at which no step lowers the objective any more
+_LONGEST = 4.0  # change of a coordinate in one step: most stand in an exponential
+_SPREAD = 1.0  # of random starts, in log-Cholesky parameters
+
+
+@dataclass(frozen=True, eq=False)
+class LogCholesky(Estimator):
+    """The fit of :class:`Consistent`, over coordinates in which every point is possible.
+
+    Beside its held share and its margin, a body's pseudo-inertia is U U^T with U an upper
+    triangle whose diagonal is exponential, and a drive's coefficient an exponential. The problem
+    is not convex in them: it starts from the cone programme's solution, moved inside, and from
+    random points; the best end is taken. How far each ends above the cone programme is in the
+    details as ``gaps``, relative to the objective.
+
+    Attributes:
+        fit_in_cone: The cone programme of the same problem.
+        starts: Number of random starts.
+        rng: Source of the random starts.
+
+    References:
+        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
+    """
+
+    fit_in_cone: Consistent
+    starts: int = 0
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    def __post_init__(self) -> None:
+        bounds: Constraints = self.fit_in_cone.constraints
+        if bounds.mass or bounds.total_mass or bounds.com or bounds.pinned:
+            raise SettingsError(
+                "estimator 'log_cholesky' knows no constraints beside physical consistency; use "
+                "'consistent' for bounds and pinned links"
+            )
+
+    def fit(self, data: Problem | Factors) -> Estimate:
+        """Estimate the standard parameters; see :meth:`Estimator.fit`.
+
+        Args:
+            data: A problem in base parameters, or its factors.
+
+        Returns:
+            The estimate over the p standard parameters; the covariance is that of the fit without
+            the inequalities.
+
+        Raises:
+            DataError: If there are fewer rows than parameters.
+            NotConvergedError: If the cone programme is not solved.
+        """
+        factors = as_factors(data)
+        cone = self.fit_in_cone.fit(factors)
+        rows = self.fit_in_cone.rows(factors, cone.sigma)
+        lowest = self.fit_in_cone.objective(rows, cone.theta)
+        first = self._coordinates(cone.theta)
+        middle = self._coordinates(self.fit_in_cone.penalty.centre)
+        points = [first] + [
+            middle + _SPREAD * self.rng.standard_normal(len(middle)) for _ in range(self.starts)
+        ]
+        ends = [self._descend(rows, z) for z in points]
+        best = min(ends, key=lambda end: end[1])
+        return replace(
+            cone,
+            theta=self._parameters(best[0])[0],
+            converged=best[3],
+            n_iter=best[2],
+            message=f"log-Cholesky, {best[2]} steps; cone programme: {cone.message}",
+            details={
+                **cone.details,
+                "gaps": [(value - lowest) / lowest for _, value, _, _ in ends],
+            },
+        )
+
+    def _descend(self, rows: Array, z: Array) -> tuple[Array, float, int, bool]:
+        """Minimise from a point by damped Newton steps; return the end, its value and the steps."""
+        fit, damping = self.fit_in_cone, 1e-3
+        value = fit.objective(rows, self._parameters(z)[0])
+        for step in range(1, _STEPS + 1):
+            slope, H = self.derivatives(rows, z)
+            unit = np.sqrt(np.maximum(np.abs(np.diag(H)), _FLAT * np.abs(np.diag(H)).max()))
+            while True:
+                move = _damped_step(H / np.outer(unit, unit), slope / unit, damping) / unit
+                move *= min(1.0, _LONGEST / np.abs(move).max())
+                predicted = -float(slope @ move)
+                if predicted <= _SETTLED * value or damping > _TOO_STIFF:
+                    return z, value, step, damping <= _TOO_STIFF
+                lower = fit.objective(rows, self._parameters(z + move)[0])
+                if lower < value:
+                    break
+                damping = max(4.0 * damping, 1e-12)
+            z, value, damping = z + move, lower, damping / 10.0
+        return z, value, _STEPS, False
+
+    def derivatives(self, rows: Array, z: Array) -> tuple[Array, Array]:
+        """Return gradient and Hessian of the objective with respect to the coordinates.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of :meth:`Consistent.rows`.
+            z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
+
+        Returns:
+            Gradient, shape (p,), and Hessian, shape (p, p).
+        """
+        fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
+        pi, J = self._parameters(z)
+        D = rows[:, :-1] @ fit.K
+        in_pi = 2.0 * D.T @ (D @ pi - rows[:, -1]) + fit.prior_weight * fit.penalty.gradient(pi)
+        curvature = 2.0 * D.T @ D + fit.prior_weight * fit.penalty.hessian(pi)
+        H = J.T @ curvature @ J
+        # what the coordinates themselves bend: tr(G d2M) with G the gradient in the matrices
+        grow = np.linalg.inv(self._shrink)
+        G = grow @ unsvec((in_pi[:size].reshape(-1, 10) @ _TO_PI.T).reshape(-1)) @ grow
+        bent = log_cholesky_curvature(z[:size].reshape(-1, 10), G)
+        for i, block in enumerate(bent):
+            part = slice(10 * i, 10 * i + 10)
+            H[part, part] += block
+        signs = size + np.flatnonzero(self._signs)
+        slope: Array = J.T @ in_pi
+        H[signs, signs] += slope[signs]  # the second derivative of an exponential is its first
+        return slope, H
+
+    def _coordinates(self, pi: Array) -> Array:
+        """Return the coordinates of parameters, moved inside if they are on the boundary."""
+        fit = self.fit_in_cone
+        size, shrink = fit.layout.n_inertial, self._shrink
+        rest = shrink @ pseudo_inertia(pi[:size] - self._held) @ shrink - fit.margin * np.eye(4)
+        values, vectors = np.linalg.eigh(rest)
+        inside = (vectors * np.maximum(values, _INSIDE)[:, None]) @ vectors.transpose(0, 2, 1)
+        drives = (pi / fit.prior_std)[size:]
+        signs = self._signs
+        drives[signs] = np.log(np.maximum(drives[signs] - SIGN_MARGIN, _INSIDE))
+        return np.concatenate([to_log_cholesky(inside).reshape(-1), drives])
+
+    def _parameters(self, z: Array) -> tuple[Array, Array]:
+        """Return pi, shape (p,), and its Jacobian, shape (p, p)."""
+        fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
+        bodies = z[:size].reshape(-1, 10)
+        grow = np.linalg.inv(self._shrink)
+        rest = grow @ (from_log_cholesky(bodies) + fit.margin * np.eye(4)) @ grow
+        slopes = grow[:, None] @ log_cholesky_jacobian(bodies) @ grow[:, None]  # (n, 10, 4, 4)
+        drives = z[size:].copy()
+        slope = np.ones_like(drives)
+        drives[self._signs] = slope[self._signs] = np.exp(drives[self._signs])
+        drives[self._signs] += SIGN_MARGIN
+        scale = fit.prior_std[size:]
+        pi = np.concatenate([_inertial(rest).reshape(-1) + self._held, drives * scale])
+        blocks = [_inertial(slopes_i).T for slopes_i in slopes]
+        return pi, scipy.linalg.block_diag(*blocks, np.diag(slope * scale))
+
+    @property
+    def _held(self) -> Array:
+        held = self.fit_in_cone.held
+        return np.zeros(self.fit_in_cone.layout.n_inertial) if held is None else held
+
+    @property
+    def _shrink(self) -> Array:
+        return body_units(self.fit_in_cone.prior_std[: self.fit_in_cone.layout.n_inertial])
+
+    @property
+    def _signs(self) -> Array:
+        layout = self.fit_in_cone.layout
+        return layout.is_nonnegative()[layout.n_inertial :]
+
+
+def from_log_cholesky(z: Array) -> Array:
+    """Return the matrices U U^T of log-Cholesky parameters.
+
+    U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2], [0, 0, exp d3, t3], [0, 0, 0, 1]].
+
+    Args:
+        z: alpha d1 d2 d3 s12 s23 s13 t1 t2 t3 of each matrix, shape (n, 10).
+
+    Returns:
+        Positive definite matrices, shape (n, 4, 4).
+
+    References:
+        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
+    """
+    U = _factor(z)
+    J: Array = U @ U.transpose(0, 2, 1)
+    return J
+
+
+def to_log_cholesky(J: Array) -> Array:
+    """Return the log-Cholesky parameters of matrices; the inverse of :func:`from_log_cholesky`.
+
+    Args:
+        J: Positive definite matrices, shape (n, 4, 4).
+
+    Returns:
+        Parameters, shape (n, 10).
+    """
+    U = np.linalg.cholesky(J[:, ::-1, ::-1])[:, ::-1, ::-1]  # upper: J = U U^T
+    alpha = np.log(U[:, 3, 3])
+    U = U / U[:, 3:, 3:]
+    diagonal = np.log(np.diagonal(U, axis1=1, axis2=2)[:, :3])
+    upper = [U[:, i, j] for i, j in _UPPER]
+    return np.column_stack([alpha, diagonal, *upper])
+
+
+def log_cholesky_jacobian(z: Array) -> Array:
+    """Return the derivatives of U U^T with respect to the parameters.
+
+    Args:
+        z: Parameters, shape (n, 10).
+
+    Returns:
+        Derivatives, shape (n, 10, 4, 4).
+    """
+    half = _slopes(z) @ _factor(z).transpose(0, 2, 1)[:, None]
+    slopes: Array = half + half.transpose(0, 1, 3, 2)
+    return slopes
+
+
+def log_cholesky_curvature(z: Array, G: Array) -> Array:
+    """Return the second derivatives of tr(G U U^T) with respect to the parameters.
+
+    Args:
+        z: Parameters, shape (n, 10).
+        G: Symmetric matrices, shape (n, 4, 4).
+
+    Returns:
+        Hessians, shape (n, 10, 10).
+    """
+    dU, U = _slopes(z), _factor(z)
+    H = 2.0 * np.einsum("nkai,nab,nlbi->nkl", dU, G, dU, optimize=True)
+    along = 2.0 * np.einsum("nab,nkai,nbi->nk", G, dU, U, optimize=True)  # tr(G dU U^T), twice
+    # U is exponential in alpha, and its diagonal in d
+    H[:, 0, :] += along
+    H[:, 1:, 0] += along[:, 1:]
+    for k in range(1, 4):
+        H[:, k, k] += along[:, k]
+    curvature: Array = H
+    return curvature
+
+
+_UPPER = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # s12 s23 s13 t1 t2 t3
+
+
+def _factor(z: Array) -> Array:
+    U = np.zeros((len(z), 4, 4))
+    for i in range(3):
+        U[:, i, i] = np.exp(z[:, 1 + i])
+    U[:, 3, 3] = 1.0
+    for k, (i, j) in enumerate(_UPPER):
+        U[:, i, j] = z[:, 4 + k]
+    scaled: Array = np.exp(z[:, 0])[:, None, None] * U
+    return scaled
+
+
+def _slopes(z: Array) -> Array:
+    """Return the derivatives of U, shape (n, 10, 4, 4)."""
+    U = _factor(z)
+    dU = np.zeros((len(z), 10, 4, 4))
+    dU[:, 0] = U
+    for i in range(3):
+        dU[:, 1 + i, i, i] = U[:, i, i]
+    for k, (i, j) in enumerate(_UPPER):
+        dU[:, 4 + k, i, j] = np.exp(z[:, 0])
+    return dU
+
+
+def _damped_step(H: Array, slope: Array, damping: float) -> Array:
+    """Return the Newton step with eigenvalues made positive, which never goes uphill."""
+    values, vectors = np.linalg.eigh(H)
+    bent = np.maximum(np.abs(values), 1e-15) + damping
+    step: Array = -vectors @ ((vectors.T @ slope) / bent)
+    return step
+
+
+_TO_PI = np.linalg.inv(svec(pseudo_inertia_basis()))  # svec(J) @ _TO_PI = pi
+
+
+def _inertial(J: Array) -> Array:
+    """Return the inertial parameters of symmetric matrices, shape (..., 10)."""
+    parameters: Array = svec(J) @ _TO_PI
+    return parameters

@@ -1,0 +1,3 @@
+"""Estimators that read one sample after the other."""
+
+__all__: list[str] = []

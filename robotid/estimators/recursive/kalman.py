@@ -1,0 +1,237 @@
+"""Kalman filter whose parameters walk at random."""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators.estimator import Estimate, require_rows
+from robotid.estimators.recursive.base import RecursiveEstimator, as_problem, fold, scaled_rows
+from robotid.exceptions import DataError
+from robotid.regressor.factors import Factors
+from robotid.regressor.problem import Problem, Sample
+
+__all__ = ["Kalman", "KalmanState"]
+
+_PATIENCE = 50  # samples in a row that the gate may turn away from a joint
+_PRIOR_LED = 0.9  # a parameter whose spread shrinks by less than this is undetermined
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanState:
+    """What the filter knows.
+
+    Attributes:
+        theta: Parameters, shape (c,).
+        P: Their covariance, shape (c, c).
+        products: Sum of innovation times residual per joint, shape (n,): rows times variance.
+        rows: Rows taken per joint, shape (n,).
+        gated: Rows turned away per joint, shape (n,).
+        in_a_row: Rows turned away since the last one taken, shape (n,).
+        steps: Number of samples seen.
+    """
+
+    theta: Array
+    P: Array
+    products: Array
+    rows: Array
+    gated: Array
+    in_a_row: Array
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Kalman(RecursiveEstimator[KalmanState]):
+    """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
+
+    The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
+    out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. It is as forgiving of an
+    inexact K, symmetric to the last bit, and its products have only n columns. A row whose
+    innovation is improbable is turned away and counted; a joint that is turned away 50 times in a
+    row is believed again.
+
+    Attributes:
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        prior: Parameters before any data, shape (c,).
+        prior_std: How far each may lie from it, shape (c,), positive; or its covariance, (c, c).
+        walk: Standard deviation of the random walk per sample, as a share of prior_std [-].
+        gate: Probability with which a good row passes the chi-square gate (one degree of freedom
+            per row), below 1; None to let all pass.
+        independent_share: Share of the rows that count as independent, 2 cutoff / rate.
+
+    Raises:
+        DataError: If a setting is out of its range.
+
+    References:
+        Bierman (1977), Factorization Methods for Discrete Sequential Estimation, II (Joseph form);
+        Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking, 5.4.
+    """
+
+    sigma: Array
+    prior: Array
+    prior_std: Array
+    walk: float = 0.0
+    gate: float | None = 1 - 1e-7
+    independent_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "prior_std"):
+            values = getattr(self, name)
+            diagonal = np.diag(values) if values.ndim == 2 else values
+            if not (np.isfinite(values).all() and (diagonal > 0).all()):
+                raise DataError(f"{name} must be positive and finite, found {diagonal}")
+        if not np.isfinite(self.prior).all():
+            raise DataError("prior must be finite for every parameter")
+        if not self.walk >= 0:
+            raise DataError(f"walk is {self.walk}, wanted 0 or a positive number")
+        if self.gate is not None and not 0.5 <= self.gate < 1:
+            raise DataError(f"gate is {self.gate}, wanted at least 0.5 and below 1, or None")
+
+    def init(self, c: int) -> KalmanState:
+        """Return the state before any sample; see :meth:`RecursiveEstimator.init`.
+
+        Args:
+            c: Number of parameters.
+
+        Returns:
+            The state.
+
+        Raises:
+            DataError: If the prior has another size.
+        """
+        if self.prior.shape != (c,) or len(self.prior_std) != c:
+            raise DataError(
+                f"prior {self.prior.shape} and prior_std {self.prior_std.shape}: wanted {c} "
+                "parameters"
+            )
+        n = len(self.sigma)
+        P = self.prior_std if self.prior_std.ndim == 2 else np.diag(self.prior_std**2)
+        none = np.zeros(n, dtype=int)
+        return KalmanState(self.prior, P, np.zeros(n), none, none, none, 0)
+
+    def update(self, state: KalmanState, sample: Sample) -> KalmanState:
+        """Return the state after one more sample; see :meth:`RecursiveEstimator.update`.
+
+        Args:
+            state: The state before.
+            sample: One instant.
+
+        Returns:
+            The state after.
+
+        Raises:
+            DataError: If the sample is not finite or of another shape; the state stays valid.
+        """
+        c = len(state.theta)
+        used = np.flatnonzero(sample.weight)
+        # in units of each row's noise, that of rows which are not independent enlarged
+        scale = self.sigma / np.sqrt(self.independent_share)
+        rows = scaled_rows(sample, scale, c)
+        Y, e = rows[:, :c], rows[:, c] - rows[:, :c] @ state.theta  # (k, c), (k,)
+        P = self._walked(state.P)
+        PY = P @ Y.T  # (c, k)
+        T = Y @ PY  # (k, k), covariance of the prediction, then of the innovation
+        kept = self._passes(e, np.diag(T), state.in_a_row[used])
+        if not kept.all():
+            Y, e, PY, T = Y[kept], e[kept], PY[:, kept], T[np.ix_(kept, kept)]
+        T.flat[:: len(T) + 1] += 1.0
+        solved = np.linalg.solve(T, np.column_stack([PY.T, e])) if len(T) else np.zeros((0, c + 1))
+        K, residual = solved[:, :c].T, solved[:, c]  # (c, k), (k,): tau - Y theta afterwards
+        A = K @ (PY - K @ T / 2).T
+        rows, gated, in_a_row = _count(state, used, kept)
+        products = state.products.copy()
+        taken = used[kept]
+        products[taken] += scale[taken] ** 2 / sample.weight[taken] * e * residual
+        return KalmanState(
+            state.theta + K @ e,
+            P - (A + A.T),  # symmetric to the last bit
+            products,
+            rows,
+            gated,
+            in_a_row,
+            state.steps + 1,
+        )
+
+    def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
+        """Return the estimate that a state holds; see :meth:`RecursiveEstimator.estimate`.
+
+        Args:
+            state: The state.
+            names: Names of the c parameters.
+
+        Returns:
+            The estimate; a parameter about which the data say next to nothing is undetermined,
+            and as uncertain as its prior.
+        """
+        std = self._prior_spread()
+        after = np.sqrt(np.maximum(np.diag(state.P), 0.0))
+        # the mean of innovation times residual is the noise variance, whatever P is
+        variance = np.maximum(state.products, 0.0) / np.maximum(state.rows, 1)
+        is_open = after > _PRIOR_LED * std
+        eigenvalues = np.linalg.eigvalsh(state.P / np.outer(std, std))
+        return Estimate(
+            theta=state.theta,
+            covariance=state.P,
+            names=names,
+            sigma=np.sqrt(variance),
+            rank=int(np.sum(eigenvalues < _PRIOR_LED**2)),
+            condition=float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], 1e-300))),
+            undetermined=tuple(np.array(names)[is_open].tolist()),
+            converged=True,
+            n_iter=state.steps,
+            message=f"{state.steps} samples, {int(state.gated.sum())} rows turned away by the "
+            f"gate, {int(state.rows.sum())} taken",
+        )
+
+    def fit(self, data: Problem | Factors) -> Estimate:
+        """Fold all samples of a problem; see :meth:`Estimator.fit`.
+
+        Args:
+            data: A problem in base parameters.
+
+        Returns:
+            The estimate after the last sample.
+
+        Raises:
+            DataError: If there are fewer rows than parameters, or a sample is not finite.
+        """
+        problem = as_problem(data)
+        c = len(problem.names)
+        state = fold(self, problem.samples(), self.init(c))
+        require_rows(int(state.rows.sum()), c, problem.n_joints)
+        return self.estimate(state, problem.names)
+
+    def _prior_spread(self) -> Array:
+        if self.prior_std.ndim == 1:
+            return self.prior_std
+        spread: Array = np.sqrt(np.diag(self.prior_std))
+        return spread
+
+    def _walked(self, P: Array) -> Array:
+        """Return the covariance after one step of the random walk."""
+        if self.walk == 0:
+            return P
+        P = P.copy()
+        P.flat[:: len(P) + 1] += (self.walk * self._prior_spread()) ** 2
+        return P
+
+    def _passes(self, e: Array, variance: Array, in_a_row: Array) -> Array:
+        """Return which rows the gate lets pass: e^2 / (variance + 1) within chi-square's bound."""
+        if self.gate is None:
+            return np.ones(len(e), dtype=bool)
+        bound = NormalDist().inv_cdf((1 + self.gate) / 2) ** 2
+        passes: Array = (e**2 <= bound * (variance + 1)) | (in_a_row >= _PATIENCE)
+        return passes
+
+
+def _count(state: KalmanState, used: Array, kept: Array) -> tuple[Array, Array, Array]:
+    """Return the rows taken, turned away, and turned away since the last one taken."""
+    rows = state.rows.copy()
+    rows[used] += kept
+    if kept.all() and not state.in_a_row.any():
+        return rows, state.gated, state.in_a_row
+    gated, in_a_row = state.gated.copy(), state.in_a_row.copy()
+    gated[used] += ~kept
+    in_a_row[used] = np.where(kept, 0, in_a_row[used] + 1)
+    return rows, gated, in_a_row

@@ -1,0 +1,3 @@
+"""What programs read: the URDF with its sidecar, and result.json."""
+
+__all__: list[str] = []

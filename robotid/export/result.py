@@ -1,0 +1,337 @@
+"""result.json: what an identification found, in the schema that other programs read."""
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid import __version__
+from robotid._typing import Array
+from robotid.exceptions import DataError, ModelError
+from robotid.identification.bands import REACH
+from robotid.identification.evaluation import Evaluation
+from robotid.identification.metrics import Metrics
+from robotid.identification.pipeline import Identification, structural_mapping
+from robotid.identification.verdict import Finding
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+from robotid.versions import versions
+
+__all__ = [
+    "build_result",
+    "file_sha256",
+    "read_result",
+    "recording_metrics",
+    "stated_parameters",
+    "write_json",
+]
+
+SCHEMA_VERSION = 1
+_WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
+
+
+def build_result(
+    identification: Identification,
+    settings: Mapping[str, Any],
+    findings: Sequence[Finding] = (),
+    outputs: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Return the content of result.json, plain values only and all of them finite.
+
+    Args:
+        identification: What was found.
+        settings: The job, in the shape of its file.
+        findings: Warnings.
+        outputs: Files written beside it, by kind.
+
+    Returns:
+        The dictionary, schema_version 1.
+    """
+    model, verdict = identification.model, identification.verdict
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "robotid": __version__,
+        "versions": versions(),
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": dict(settings),
+        "inputs": _inputs(identification),
+        "outputs": dict(outputs or {}),
+        "structure": {
+            "standard": model.layout.n_inertial,
+            "base_inertial": len(structural_mapping(model, inertial_only=True).K),
+            "base": len(identification.base),
+            "rank": identification.determination.rank,
+            "condition": _finite(identification.wls.condition),
+            "undetermined": list(identification.determination.undetermined),
+            "not_told_apart": identification.determination.to_list(),
+        },
+        "base_parameters": _base_parameters(identification),
+        "uncertainty": {
+            "method": identification.errors.method,
+            "stretches": identification.errors.stretches,
+            "inflation": identification.errors.inflation,
+        },
+        "standard_parameters": _standard_parameters(identification),
+        "drive_parameters": _drive_parameters(identification),
+        "consistency": _consistency(identification),
+        "identification": _metrics(identification.metrics()),
+        "validation": [
+            recording_metrics(e, "estimate") | {"band": _band(identification, e)}
+            for e in identification.validation
+        ],
+        "warnings": [{"code": f.code, "message": f.message, "where": f.where} for f in findings],
+        "wls": {
+            "base_values": identification.wls.theta.tolist(),
+            "base_std_errors": [_finite(error) for error in identification.wls.std_error],
+            "identification": _metrics(identification.metrics("wls")),
+            "validation": [recording_metrics(e, "wls") for e in identification.validation],
+        },
+        "verdict": verdict.to_dict(),
+    }
+
+
+def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
+    """Return the metrics of one recording as result.json has them.
+
+    Args:
+        evaluation: The recording.
+        name: Which parameters predict.
+
+    Returns:
+        The dictionary.
+    """
+    return {"log": evaluation.recording.log.path, **_metrics(evaluation.metrics[name])}
+
+
+def read_result(path: str | Path) -> dict[str, Any]:
+    """Read a result.json.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        DataError: If it is missing, no JSON, or of another schema.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(f"there is no result {str(source)!r}")
+    try:
+        result = json.loads(source.read_text(encoding="utf-8"))
+    except ValueError as error:  # no JSON, or no UTF-8
+        raise DataError(f"{source.name} is not JSON: {error}") from error
+    version = result.get("schema_version") if isinstance(result, dict) else None
+    if version != SCHEMA_VERSION or "verdict" not in result:
+        raise DataError(
+            f"{source.name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
+            "written by 'robotid identify'"
+        )
+    missing = [key for key in _WANTED if key not in result]
+    if missing:
+        raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
+    return dict(result)
+
+
+def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
+    """Return the standard parameters that a result states.
+
+    Args:
+        result: Content of a result.json.
+        model: Its robot.
+
+    Returns:
+        Parameters, shape (p,), SI units, in ``layout.names`` order.
+
+    Raises:
+        ModelError: If a parameter of the robot is not in it.
+    """
+    stated = {
+        entry["name"]: entry["value"]
+        for entry in (*result["standard_parameters"], *result["drive_parameters"])
+    }
+    missing = [name for name in model.layout.names if name not in stated]
+    if missing:
+        raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
+    return np.array([stated[name] for name in model.layout.names])
+
+
+def write_json(content: Mapping[str, Any], target: str | Path) -> None:
+    """Write JSON beside its target, then put it in place.
+
+    Args:
+        content: What to write; non-finite numbers are refused.
+        target: The file.
+    """
+    path = Path(target)
+    text = json.dumps(content, indent=1, allow_nan=False)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside.write_text(text + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def file_sha256(path: str | Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
+
+    Args:
+        path: The file, or the folder of a bag.
+
+    Returns:
+        64 hexadecimal digits.
+    """
+    source = Path(path)
+    if source.is_dir():
+        files = sorted(file for file in source.iterdir() if file.is_file())
+        listing = "".join(f"{file_sha256(file)}  {file.name}\n" for file in files)  # as sha256sum
+        return hashlib.sha256(listing.encode()).hexdigest()
+    with source.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _inputs(identification: Identification) -> list[dict[str, Any]]:
+    inputs = [{"role": "urdf", **_source(identification.model.tree.path)}]
+    for role in ("identification", "validation"):
+        for evaluation in getattr(identification, role):
+            recording = evaluation.recording
+            extent = recording.extent
+            inputs.append(
+                {
+                    "role": role,
+                    **_source(recording.log.path),
+                    "samples": extent.samples,
+                    "rate": extent.rate,
+                    "start": extent.start,
+                    "end": extent.end,
+                    "rows_used": extent.rows_used,
+                    "segments": extent.segments,
+                    "signals": dataclasses.asdict(recording.signals),
+                }
+            )
+    return inputs
+
+
+def _source(path: str) -> dict[str, Any]:
+    return {"path": str(path), "sha256": file_sha256(path) if path else None}
+
+
+def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
+    mapping, units = identification.mapping, identification.model.layout.units
+    return [
+        {
+            "name": name,
+            "expression": expression,
+            "value": float(value),
+            "std_error": _finite(error),
+            "interval_95": [_finite(end) for end in interval],
+            "unit": units[i],
+        }
+        for name, expression, value, error, interval, i in zip(
+            mapping.base_names,
+            mapping.expressions,
+            identification.base,
+            identification.base_error,
+            identification.base_interval,
+            mapping.independent,
+            strict=True,
+        )
+    ]
+
+
+def _standard_parameters(identification: Identification) -> list[dict[str, Any]]:
+    return _entries(identification, slice(0, identification.model.layout.n_inertial))
+
+
+def _drive_parameters(identification: Identification) -> list[dict[str, Any]]:
+    return _entries(identification, slice(identification.model.layout.n_inertial, None))
+
+
+def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:
+    layout = identification.model.layout
+    return [
+        {
+            "name": name,
+            "value": float(value),
+            "std_error": _finite(error),
+            "unit": unit,
+            "prior": float(prior),
+            "source": source,
+        }
+        for name, value, error, unit, prior, source in zip(
+            layout.names[part],
+            identification.standard[part],
+            identification.standard_error[part],
+            layout.units[part],
+            identification.prior[part],
+            identification.sources[part],
+            strict=True,
+        )
+    ]
+
+
+def _consistency(identification: Identification) -> dict[str, Any]:
+    layout = identification.model.layout
+    J = pseudo_inertia(identification.standard[: layout.n_inertial])
+    return {
+        "is_consistent": identification.is_consistent,
+        "links": [
+            {"name": body, "mass": float(J_i[3, 3]), "min_eigenvalue": _smallest(J_i)}
+            for body, J_i in zip(layout.bodies, J, strict=True)
+        ],
+        "total_mass": float(J[:, 3, 3].sum()),
+        "mass_matrix": dataclasses.asdict(identification.mass_matrix),
+        "fit": dict(identification.estimate.details),
+        "sources": {
+            kind: identification.sources.count(kind) for kind in ("data", "mixed", "prior")
+        },
+    }
+
+
+def _smallest(J: Array) -> float:
+    return float(np.linalg.eigvalsh(J)[0])
+
+
+def _metrics(metrics: Metrics) -> dict[str, Any]:
+    return {
+        "per_joint": {
+            joint: {
+                "rmse": m.rmse,
+                "unit": m.unit,
+                "relative_error_pct": m.relative_error_pct,
+                "r2": m.r2,
+                "rows": m.rows,
+                "urdf_relative_error_pct": m.baselines["urdf"],
+                "gravity_only_relative_error_pct": m.baselines["gravity_only"],
+                "better_than_constant": m.better_than_constant,
+            }
+            for joint, m in metrics.per_joint.items()
+        },
+        "pooled_rmse": metrics.pooled_rmse,
+    }
+
+
+def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the 95 % band of the predicted torque: its half width, and what lies in it."""
+    recording, band = evaluation.recording, identification.band(evaluation)
+    held = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
+    return {
+        row: {
+            "half_width": float(REACH * np.sqrt(np.mean(total**2))),
+            "of_parameters": float(REACH * np.sqrt(np.mean(parameters**2))),
+            "held_pct": _finite(100 * share),
+        }
+        for row, total, parameters, share in zip(
+            identification.model.row_names, band.total.T, band.parameters.T, held, strict=True
+        )
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

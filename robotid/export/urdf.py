@@ -1,0 +1,260 @@
+"""Write an identified model as a URDF with a sidecar, and read the pair back.
+
+Only the inertials of the original file change, every other byte stays. What a URDF has no place
+for, armature and friction of coupled drives above all, goes into ``<name>.drive.json`` beside it.
+"""
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid import __version__
+from robotid._typing import Array
+from robotid.exceptions import DataError, ModelError
+from robotid.export.sidecar import SCHEMA_VERSION, digest, load_identified, sidecar_facts
+from robotid.export.xml_splice import (
+    Document,
+    Edit,
+    apply,
+    insert,
+    parse,
+    remove,
+    replace,
+    set_attributes,
+)
+from robotid.regressor.torque import random_regressor
+from robotid.robot.bodies import LinkPlace, held_parameters, link_places
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.tree import read_tree
+
+__all__ = ["read_with_yourdfpy", "write_urdf"]
+
+_STATES = 64  # random states at which the written file must give the same torque
+_SAME = 1e-6  # largest relative difference of a row's torque over them
+
+
+def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bool = False) -> Path:
+    """Write standard parameters into a copy of the model's URDF, and a sidecar beside it.
+
+    The link that a body's joint moves gets the body's inertial; links joined to it by fixed
+    joints lose theirs, since the sum holds it; links behind locked joints keep theirs. Both files
+    are read back and must give the torque of pi before they are put in place.
+
+    Args:
+        model: The robot; the file it was read from is the one that is copied.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        target: The URDF to write; never the original itself.
+        dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``.
+
+    Returns:
+        Path of the sidecar, ``<target stem>.drive.json``.
+
+    Raises:
+        DataError: If pi does not have p finite entries.
+        ModelError: If a link or a drive would be physically impossible, the original is gone or
+            cannot be edited, the target is not usable, or the written file differs from pi.
+    """
+    source, goal = Path(model.tree.path), Path(target)
+    _check_parameters(model, pi)
+    _check_target(source, goal)
+    original, places = source.read_bytes(), link_places(model)
+    written = _link_parameters(model, pi)
+    document = parse(original, source.name)
+    edits = _inertial_edits(document, written, places)
+    if dynamics:
+        edits += _dynamics_edits(document, model, pi)
+    content = apply(document, edits)
+    sidecar = goal.with_name(f"{goal.stem}.drive.json")
+    readers = ["robotid", "yourdfpy"] if _suits_yourdfpy(source) else ["robotid"]
+    facts = {
+        "schema_version": SCHEMA_VERSION,
+        "robotid": __version__,
+        "robot": model.name,
+        "urdf": goal.name,
+        "urdf_sha256": digest(content),
+        "source": {"urdf": source.name, "sha256": digest(original)},
+        **sidecar_facts(model, pi, places),
+        "read_back_with": readers,
+    }
+    partial = Path(tempfile.mkdtemp(prefix=f".{goal.stem}-", dir=goal.parent))
+    try:
+        (partial / goal.name).write_bytes(content)
+        text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
+        (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
+        _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
+        if "yourdfpy" in readers:
+            _check_masses(partial / goal.name)
+        os.replace(partial / sidecar.name, sidecar)
+        os.replace(partial / goal.name, goal)
+    finally:
+        shutil.rmtree(partial)
+    return sidecar
+
+
+def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
+    """Read a URDF with yourdfpy, a reader that shares no line with this package's.
+
+    Args:
+        path: The URDF file. Meshes are not loaded.
+
+    Returns:
+        yourdfpy's ``Robot``: its damping and friction are text, and None what is not stated.
+
+    Raises:
+        ModelError: If yourdfpy cannot read the file.
+    """
+    import yourdfpy
+
+    try:
+        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    # it checks nothing by itself, so a fault of the file comes out as one of these
+    except (AttributeError, IndexError, KeyError, SyntaxError, TypeError, ValueError) as error:
+        fault = f"{type(error).__name__}: {error}"
+        raise ModelError(f"yourdfpy cannot read {Path(path).name}: {fault}") from error
+
+
+def _check_parameters(model: RobotModel, pi: Array) -> None:
+    wanted = (len(model.layout.names),)
+    if pi.shape != wanted:
+        raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
+    for name, value in zip(model.layout.names, pi, strict=True):
+        if not math.isfinite(value):
+            raise DataError(f"{name} is {value}, wanted a finite number")
+
+
+def _check_target(source: Path, target: Path) -> None:
+    if not source.is_file():
+        raise ModelError(f"the model's URDF {str(source)!r}, which is copied, is gone; restore it")
+    if not target.parent.is_dir():
+        raise ModelError(f"there is no folder {str(target.parent)!r} to write to; make it first")
+    if target.is_dir():
+        raise ModelError(f"the target {str(target)!r} is a folder; name a file in it")
+    if target.exists() and target.samefile(source):
+        raise ModelError(f"the target {str(target)!r} is the original URDF; choose another name")
+
+
+def _link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
+    """Return the ten parameters of each link to write, after refusing impossible values."""
+    layout = model.layout
+    advice = "identify with the 'consistent' estimator, which keeps bodies and drives possible"
+    own = pi[: layout.n_inertial] - held_parameters(model)
+    for link, J in zip(layout.bodies, pseudo_inertia(own), strict=True):
+        smallest = float(np.linalg.eigvalsh(J)[0])
+        if not smallest > 0:
+            held = f" without the links behind {list(model.locked)}" if model.locked else ""
+            raise ModelError(
+                f"link {link!r}{held} would be no possible body: the smallest eigenvalue of its "
+                f"pseudo-inertia is {smallest:.3g}, wanted > 0; {advice}"
+            )
+    for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
+        raise ModelError(
+            f"{layout.names[i]} is {pi[i]:.3g} {layout.units[i]}, wanted 0 or more; {advice}"
+        )
+    return dict(zip(layout.bodies, own.reshape(-1, 10), strict=True))
+
+
+def _inertial_edits(
+    document: Document, written: Mapping[str, Array], places: Sequence[LinkPlace]
+) -> list[Edit]:
+    removed = {place.link for place in places if place.is_lumped}
+    edits = []
+    for link in document.root.find_all("link"):
+        name, inertials = link.attributes.get("name", ""), link.find_all("inertial")
+        if name in removed:
+            edits += [remove(document, inertial) for inertial in inertials]
+        elif name in written and inertials:
+            edits.append(replace(document, inertials[0], _inertial(written[name])))
+        elif name in written:
+            edits.append(insert(document, link, _inertial(written[name])))
+    return edits
+
+
+def _inertial(values: Array) -> list[str]:
+    """Return an ``<inertial>`` about the centre of mass, line by line."""
+    m, first = values[0], values[1:4]
+    c = first / m
+    ixx, ixy, iyy, ixz, iyz, izz = values[4:]
+    about_origin = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    about_com = about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))  # (3, 3), Steiner
+    axes = "xyz"
+    moments = [
+        f'i{axes[i]}{axes[j]}="{_text(about_com[i, j])}"' for i in range(3) for j in range(i, 3)
+    ]
+    return [
+        "<inertial>",
+        f'<origin xyz="{" ".join(map(_text, c))}" rpy="0 0 0"/>',
+        f'<mass value="{_text(m)}"/>',
+        f"<inertia {' '.join(moments)}/>",
+        "</inertial>",
+    ]
+
+
+def _text(value: float) -> str:
+    return repr(float(value) + 0.0)  # no "-0.0"
+
+
+def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
+    attributes = {"viscous": "damping", "coulomb": "friction"}
+    values = dict(zip(model.layout.names, pi, strict=True))
+    edits: list[Edit] = []
+    for joint in document.root.find_all("joint"):
+        name, found = joint.attributes.get("name", ""), joint.find_all("dynamics")
+        if name not in model.joints:
+            continue
+        names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
+        new = {names[key]: _text(values[key]) for key in names if key in values}
+        if new and found:
+            edits += set_attributes(document, found[0], new)
+        elif new:
+            words = " ".join(f'{key}="{value}"' for key, value in new.items())
+            edits.append(insert(document, joint, [f"<dynamics {words}/>"]))
+    return edits
+
+
+def _suits_yourdfpy(source: Path) -> bool:
+    """Whether yourdfpy reads the original; if not, that is no fault of what is written."""
+    try:
+        read_with_yourdfpy(source)
+    except ModelError:
+        return False
+    return True
+
+
+def _check_torque(model: RobotModel, pi: Array, urdf: Path, sidecar: Path) -> None:
+    """Raise if the files, read back, do not give the torque of pi in every row."""
+    loaded, read_back = load_identified(urdf, sidecar)
+    if loaded.layout != model.layout:
+        raise ModelError(f"{urdf.name} was not written: read back, it has other bodies or joints")
+    wanted, found = (
+        (random_regressor(robot, _STATES, np.random.default_rng(0)) @ x).reshape(_STATES, -1)
+        for robot, x in ((model, pi), (loaded, read_back))
+    )
+    difference = np.linalg.norm(found - wanted, axis=0)  # (n_rows,)
+    off = np.flatnonzero(difference > _SAME * np.linalg.norm(wanted, axis=0))
+    if off.size:
+        raise ModelError(
+            f"{urdf.name} was not written: read back, it gives another torque than the parameters "
+            f"at {[model.row_names[i] for i in off]}; has {model.tree.path} changed since the "
+            "model was read?"
+        )
+
+
+def _check_masses(urdf: Path) -> None:
+    """Raise if yourdfpy finds another mass in any link than this package does."""
+    inertials = read_tree(urdf).inertials
+    for link in read_with_yourdfpy(urdf).links:
+        found = link.inertial.mass if link.inertial is not None else None
+        wanted = inertials[link.name].mass if link.name in inertials else None
+        if found != wanted:
+            raise ModelError(
+                f"{urdf.name} was not written: yourdfpy reads the mass of link {link.name!r} as "
+                f"{found}, robotid as {wanted}"
+            )

@@ -1,0 +1,403 @@
+"""identify(): from a model and logs to parameters and how far they can be trusted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import WLS, Consistent, Estimate
+from robotid.estimators.consistent.log_cholesky import LogCholesky
+from robotid.estimators.determination import Determination, base_spread, determine
+from robotid.exceptions import DataError, RankDeficientError
+from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.evaluation import Evaluation, pool, prepare
+from robotid.identification.metrics import Metrics
+from robotid.identification.prior import spread_of
+from robotid.identification.recordings import LoadedRecordings, Recordings
+from robotid.identification.robust import Outlier, find_outliers, reweigh
+from robotid.identification.settings import (
+    ESTIMATORS,
+    RECURSIVE,
+    EstimatorSettings,
+    Prior,
+    consistent_fit,
+    make_estimator,
+)
+from robotid.identification.standard_errors import (
+    Redraws,
+    StandardErrors,
+    measured_errors,
+    with_wls_errors,
+)
+from robotid.identification.summary import (
+    identification_html,
+    identification_line,
+    identification_text,
+)
+from robotid.identification.verdict import Doubt, Verdict, judge
+from robotid.logs.data import Log
+from robotid.logs.signals import SignalSettings
+from robotid.regressor.base_parameters import BaseMapping, base_mapping
+from robotid.regressor.factors import Factors
+from robotid.regressor.torque import random_regressor
+from robotid.robot.bodies import held_parameters
+from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+from robotid.workers.pieces import join
+
+__all__ = [
+    "ESTIMATORS",
+    "EstimatorSettings",
+    "Identification",
+    "conclude",
+    "identify",
+    "structural_mapping",
+]
+
+_GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
+_FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
+_KNOWN = 1e-300  # the spread of what was known exactly
+_FROM_PRIOR = 0.9  # ... and above this share, the prior's
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Everything that an identification found.
+
+    Attributes:
+        model: The robot as the URDF describes it.
+        mapping: Standard to base parameters.
+        estimator: The estimator's settings.
+        estimate: What the estimator returned: base parameters, or standard ones ("consistent").
+        wls: Weighted least squares on the same factors, base parameters.
+        prior: Standard parameters of the URDF, shape (p,).
+        prior_std: How far they may plausibly be wrong, shape (p,).
+        standard: Standard parameters, shape (p,).
+        standard_covariance: Their covariance given the prior, shape (p, p).
+        base: Base parameters, shape (b,).
+        base_error: Their standard errors, shape (b,); inf where the data say nothing.
+        identification: The recordings that were fitted, with predictions "estimate" and "wls".
+        validation: The same of the recordings that were kept apart.
+        errors: What the standard errors rest on.
+        factors: What the fitted rows come down to, base parameters.
+        determination: Which base parameters the fitted rows determine.
+        alarms: Faults of the recordings that make the result wrong, as the doctor found them.
+        doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
+        report: File of the report, if one was written with the result.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    estimator: EstimatorSettings
+    estimate: Estimate
+    wls: Estimate
+    prior: Array
+    prior_std: Array
+    standard: Array
+    standard_covariance: Array
+    base: Array
+    base_error: Array
+    identification: tuple[Evaluation, ...]
+    validation: tuple[Evaluation, ...]
+    errors: StandardErrors
+    factors: Factors
+    determination: Determination
+    alarms: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+    report: str = ""
+
+    def __repr__(self) -> str:
+        return identification_line(self)
+
+    def _repr_html_(self) -> str:
+        return identification_html(self)
+
+    def summary(self) -> str:
+        """Return verdict, reasons and errors by joint as text."""
+        return identification_text(self)
+
+    __str__ = summary
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether every body, every drive and the mass matrix are physically possible.
+
+        A body must be so without its links on locked joints, which keep their own inertials; the
+        mass matrix must be positive definite at random poses.
+        """
+        size = self.model.layout.n_inertial
+        J = pseudo_inertia(self.standard[:size] - held_parameters(self.model))
+        signs = self.standard[self.model.layout.is_nonnegative()]
+        is_possible = bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
+        return is_possible and self.mass_matrix.is_positive
+
+    @cached_property
+    def mass_matrix(self) -> MassMatrixCheck:
+        """The mass matrix of the standard parameters over random poses."""
+        return check_mass_matrix(self.model, self.standard)
+
+    @property
+    def standard_error(self) -> Array:
+        """Standard errors of the standard parameters given the prior, shape (p,)."""
+        # exact data leave a variance of rounding size, of either sign
+        errors: Array = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
+        return errors
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Where each standard parameter comes from: "data", "mixed" or "prior"."""
+        # what a bound says is neither
+        unbounded = self.errors.unbounded
+        after = self.standard_error if unbounded is None else unbounded
+        share = after / np.maximum(self.prior_std, _KNOWN)
+        names = np.where(
+            share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
+        )
+        kept = self.model.layout.owned_by(self.estimate.details.get("pinned", ()))
+        masses = self.estimator.constraints.get("mass", {}).items()
+        known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
+        kept = kept | np.isin(self.model.layout.names, known)
+        return tuple(np.where(kept, "prior", names).tolist())
+
+    @property
+    def base_interval(self) -> Array:
+        """95 % interval of each base parameter, shape (b, 2); infinite where it is open."""
+        half = self.errors.reach * self.base_error
+        return np.column_stack([self.base - half, self.base + half])
+
+    def band(self, evaluation: Evaluation) -> TorqueBand:
+        """Return how far the torques predicted for a recording can be trusted.
+
+        Args:
+            evaluation: One of the recordings.
+
+        Returns:
+            The band.
+        """
+        K, C = self.mapping.K, self.standard_covariance
+        return torque_band(
+            self.model,
+            self.mapping,
+            evaluation.recording.trajectory,
+            K @ C @ K.T,
+            self.estimate.sigma,
+        )
+
+    @cached_property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Rows of the fitted recordings that the estimate does not explain, the worst first."""
+        return find_outliers(self.model, self.identification, self.standard)
+
+    def metrics(self, name: str = "estimate") -> Metrics:
+        """Return the metrics over all fitted recordings.
+
+        Args:
+            name: "estimate" or "wls".
+
+        Returns:
+            The metrics.
+        """
+        return pool(self.model, self.identification, name)
+
+    @property
+    def refitted(self) -> tuple[Evaluation, ...]:
+        """Validation recordings that hold rows which were fitted: they show no prediction."""
+        return tuple(evaluation for evaluation in self.validation if evaluation.is_refitted)
+
+    @property
+    def verdict(self) -> Verdict:
+        """How far to trust the result."""
+        kept = [evaluation for evaluation in self.validation if not evaluation.is_refitted]
+        return judge(
+            self.metrics(),
+            {e.recording.name: e.metrics["estimate"] for e in kept},
+            undetermined=self.determination.undetermined,
+            is_consistent=self.is_consistent,
+            joints=self.model.joints,
+            alarms=self.alarms,
+            doubts=self.doubts,
+            refitted=[evaluation.recording.name for evaluation in self.refitted],
+        )
+
+
+def identify(
+    model: RobotModel,
+    logs: Sequence[Log],
+    *,
+    validation: Sequence[Log] = (),
+    signals: SignalSettings | None = None,
+    estimator: EstimatorSettings | str = "consistent",
+) -> Identification:
+    """Identify a robot's parameters from motion logs.
+
+    Args:
+        model: The robot, from its URDF.
+        logs: Recordings to fit; their joints must be the model's, in its order.
+        validation: Recordings kept apart to measure the prediction with.
+        signals: How logs become trajectories; the defaults if None.
+        estimator: Name or settings of the estimator.
+
+    Returns:
+        The identification.
+
+    Raises:
+        DataError: If a log does not fit the model or is too short.
+        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        NotConvergedError: If a solver fails.
+        SettingsError: If a setting is out of range.
+    """
+    choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
+    settings = signals or SignalSettings()
+    if not logs:
+        raise DataError("no log was given; at least one is needed to identify anything")
+    fitted = [prepare(model, log, settings) for log in logs]
+    kept = [prepare(model, log, settings) for log in validation]
+    return conclude(model, LoadedRecordings(model, fitted, kept), choice)
+
+
+def conclude(
+    model: RobotModel, recordings: Recordings, choice: EstimatorSettings
+) -> Identification:
+    """Identify a robot's parameters from recordings, in memory or not.
+
+    Args:
+        model: The robot.
+        recordings: The recordings.
+        choice: Which estimator.
+
+    Returns:
+        The identification.
+
+    Raises:
+        DataError: If a row of a log cannot be used.
+        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
+        NotConvergedError: If a solver fails.
+    """
+    mapping = structural_mapping(model)
+    prior = model.standard_parameters()
+    reductions, grown = recordings.reduce(mapping), 1.0
+    if choice.robust != "none":
+        robust = reweigh(model, mapping, recordings, reductions, choice.robust, prior)
+        recordings, reductions = robust.recordings, robust.reductions
+        grown = robust.loss_of_efficiency**2
+    reduction = join(reductions)
+    stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
+    factors, share = reduction.factors, recordings.share
+    spread = spread_of(model, reduction.squares, reduction.samples)
+    rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
+    before = Prior(prior, spread, share, rough.sigma, stretches)
+    known = model.layout.owned_by(choice.constraints.get("pinned", ()))
+    rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
+    determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
+    try:
+        estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
+    except RankDeficientError as error:
+        raise determination.refusal(error) from error
+    wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
+    if choice.name in _GRADIENT and not choice.physical:
+        estimate = with_wls_errors(estimate, wls)
+    else:
+        sigma = np.ones_like(rough.sigma) if choice.name == "ols" else rough.sigma
+        estimate, errors = measured_errors(
+            estimate,
+            stretches,
+            factors,
+            share,
+            mapping.K,
+            estimate.sigma if estimate.names == mapping.names else sigma,
+            is_filter=choice.name == "kalman" or choice.forgetting < 1,
+            redraws=None if fit is None else Redraws(fit, choice.draws, np.random.default_rng(0)),
+        )
+    if grown != 1.0:
+        estimate = replace(estimate, covariance=grown * estimate.covariance)
+        wls = replace(wls, covariance=grown * wls.covariance)
+    standard, covariance = _standard(estimate, mapping, prior, spread)
+    base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
+    wls_standard = mapping.to_standard(wls.theta, prior, spread)
+    candidates = {"estimate": standard, "wls": wls_standard}
+    fitted, kept = recordings.evaluate(candidates, prior)
+    is_base = estimate.names == mapping.base_names
+    return Identification(
+        model=model,
+        mapping=mapping,
+        estimator=choice,
+        estimate=estimate,
+        wls=wls,
+        prior=prior,
+        prior_std=spread if estimate.prior_std is None else estimate.prior_std,
+        standard=standard,
+        standard_covariance=covariance,
+        base=mapping.to_base(standard),
+        base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
+        identification=fitted,
+        validation=kept,
+        errors=errors,
+        factors=factors,
+        determination=determination,
+    )
+
+
+def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
+    """Return the base parameters that any motion of a robot can show.
+
+    Args:
+        model: The robot.
+        inertial_only: Whether to leave the drive terms out.
+
+    Returns:
+        The mapping; always the same for the same robot.
+    """
+    columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
+    samples = 2 * columns // model.n_rows + 20
+    W = random_regressor(model, samples, np.random.default_rng(0))
+    return base_mapping(
+        W[:, :columns],
+        model.layout.names[:columns],
+        scales=model.layout.scales(model.length)[:columns],
+        preference=model.layout.preference()[:columns],
+    )
+
+
+def _run(
+    choice: EstimatorSettings,
+    model: RobotModel,
+    mapping: BaseMapping,
+    prior: Prior,
+    recordings: Recordings,
+    factors: Factors,
+    wls: Estimate,
+) -> tuple[Estimate, Consistent | None]:
+    """Return the estimate and, if it is physically consistent, what made it so.
+
+    Batch estimators read the factors, recursive ones the samples.
+    """
+    estimator = make_estimator(choice, model, mapping, prior)
+    if isinstance(estimator, LogCholesky):
+        return estimator.fit(factors), estimator.fit_in_cone
+    if choice.name not in RECURSIVE:
+        fit = estimator if isinstance(estimator, Consistent) else None
+        return estimator.fit(factors), fit
+    estimate = estimator.fit(recordings.problem(mapping, with_mass=choice.needs_mass))
+    if not choice.physical:
+        return estimate, None
+    if choice.name in _GRADIENT:
+        estimate = with_wls_errors(estimate, wls)
+    fit = consistent_fit(choice, model, mapping, prior)
+    return fit.project(estimate), fit
+
+
+def _standard(
+    estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Return the standard parameters and their covariance, prior included."""
+    if estimate.names == mapping.names:
+        return estimate.theta, estimate.covariance
+    G, K = mapping.gain(spread), mapping.K
+    before = np.diag(spread**2)
+    # what the data leave open (infinite variance) stays as wide as the prior has it
+    base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
+    covariance = before - G @ K @ before + G @ base @ G.T
+    return mapping.to_standard(estimate.theta, prior, spread), covariance

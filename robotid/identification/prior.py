@@ -1,0 +1,98 @@
+"""What is known before any data: the URDF's parameters and how far the truth may lie from them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.logs.data import Trajectory
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+
+__all__ = ["prior_spread", "spread_of"]
+
+_SMALLEST_MASS = 0.1  # of the mean mass: a link may be that wrong even if its URDF says 0
+_SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
+
+
+def prior_spread(model: RobotModel, trajectories: Sequence[Trajectory]) -> Array:
+    """Return how far each standard parameter may plausibly lie from its prior value.
+
+    The spread of a body is its own size: its mass m, m r and m r^2, with r the distance of the
+    centre of mass plus the radius of gyration. That of a drive term is what would alone explain
+    the measured torque: rms(tau) over rms of what it multiplies; an armature at least the inertia
+    its joint carries.
+
+    Args:
+        model: The robot, with the URDF's parameters.
+        trajectories: The motions that drive terms are scaled with.
+
+    Returns:
+        Spreads, shape (p,), positive, SI units.
+    """
+    squares = np.sum([trajectory.squares for trajectory in trajectories], axis=0)
+    return spread_of(model, squares, sum(len(trajectory.t) for trajectory in trajectories))
+
+
+def spread_of(model: RobotModel, squares: Array, samples: int) -> Array:
+    """Return the same from sums over the motions.
+
+    Args:
+        model: The robot, with the URDF's parameters.
+        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows).
+        samples: Number of samples.
+
+    Returns:
+        Spreads, shape (p,), positive, SI units.
+    """
+    rms = np.sqrt(squares / max(samples, 1))
+    return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
+
+
+def _inertial_spread(model: RobotModel) -> Array:
+    size = model.layout.n_inertial
+    J = pseudo_inertia(model.standard_parameters()[:size])
+    mean = max(float(np.mean(J[:, 3, 3])), 1e-6)
+    mass = np.maximum(np.abs(J[:, 3, 3]), _SMALLEST_MASS * mean)
+    gyration = np.sqrt(np.abs(np.trace(J[:, :3, :3], axis1=1, axis2=2)) / mass)
+    radius = np.linalg.norm(J[:, :3, 3], axis=1) / mass + gyration
+    radius = np.maximum(radius, _SMALLEST_RADIUS * model.length)
+    one = np.ones(len(mass))
+    spread: Array = mass[:, None] * np.column_stack([one, *[radius] * 3, *[radius**2] * 6])
+    return spread.reshape(-1)
+
+
+def _drive_spread(model: RobotModel, rms: Array) -> Array:
+    first = model.n_rows - len(model.joints)
+    tau, v, a = (_positive(row[first:]) for row in rms)
+    carried = _carried_inertia(model)
+    spread = {
+        "armature": np.maximum(carried, tau / a),
+        "viscous": tau / v,
+        "coulomb": tau,
+        "offset": tau,
+    }
+    own = [spread[term][j] for j in range(len(model.joints)) for term in model.layout.terms]
+    coupled = []
+    for coupling in model.layout.couplings:
+        rows = [model.joints.index(joint) for joint, _ in coupling.ratios]
+        coupled += [spread[term][rows].mean() for term in model.layout.coupling_terms]
+    return np.array(own + coupled)
+
+
+def _positive(rms: Array) -> Array:
+    """Return the root mean square of each column, never 0."""
+    floor = 1e-3 * rms.max() if rms.max() > 0 else 1.0
+    bounded: Array = np.maximum(rms, floor)
+    return bounded
+
+
+def _carried_inertia(model: RobotModel) -> Array:
+    """Return the inertia each joint carries at the neutral posture, shape (n,)."""
+    pin_model = model.pin_model
+    M = pin.crba(pin_model, pin_model.createData(), pin.neutral(pin_model))
+    M = np.triu(M) + np.triu(M, 1).T
+    G = model.velocity_map
+    diagonal = np.diag(G.T @ M @ G)[model.n_rows - len(model.joints) :]
+    return np.maximum(diagonal, 0.0)

@@ -1,0 +1,264 @@
+"""Fits that a few bad rows do not move: iteratively reweighted least squares; outliers by name."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import WLS
+from robotid.exceptions import NotConvergedError, SettingsError
+from robotid.identification.evaluation import Evaluation
+from robotid.identification.recordings import LoadedRecordings, Recordings
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.columns import drive_columns
+from robotid.regressor.prediction import predict
+from robotid.robot.model import RobotModel
+from robotid.workers.pieces import Reduction, join
+
+__all__ = [
+    "LOSSES",
+    "Outlier",
+    "Reweighted",
+    "find_outliers",
+    "loss_slope",
+    "loss_weight",
+    "reweigh",
+]
+
+#: Losses with a bounded influence of each row, and the bound of their quadratic part in standard
+#: deviations, for which they lose 5 % against least squares where noise is normal.
+LOSSES = {"huber": 1.345, "tukey": 4.685}
+_MAD = 1.4826  # standard deviations of normal noise per median absolute deviation
+_TOLERANCE = 1e-3  # change of the parameters in standard errors that ends the iteration
+_MAX_ITERATIONS = 50
+_OUTLIER = 12.0  # standard deviations from which a row is named
+_MATTERS = 0.1  # of the joint's torque, from which a row is named
+_NEAR = 0.5  # [s] rows closer than this are one outlier, smeared by the filter
+
+
+@dataclass(frozen=True, eq=False)
+class Reweighted:
+    """What reweighting ends with.
+
+    Attributes:
+        recordings: The recordings with their rows' weights.
+        reductions: What the weighted rows come down to.
+        loss_of_efficiency: By how much the weighted rows understate standard errors [-].
+        share: Share of the rows with less than half their weight [-].
+        n_iter: Number of passes over the rows.
+    """
+
+    recordings: Recordings
+    reductions: tuple[Reduction, ...]
+    loss_of_efficiency: float
+    share: float
+    n_iter: int
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A row, or rows close to each other, that the fit does not explain.
+
+    Attributes:
+        log: The file.
+        joint: The joint.
+        t: Time of the worst row [s].
+        torque: Torque there, as filtered [N m or N].
+        predicted: Predicted torque [N m or N].
+        size: Their difference over the joint's usual residual [-].
+        rows: How many rows there are.
+    """
+
+    log: str
+    joint: str
+    t: float
+    torque: float
+    predicted: float
+    size: float
+    rows: int
+
+
+def loss_weight(loss: str, r: Array) -> Array:
+    """Return the weight of rows in the equivalent least squares.
+
+    Args:
+        loss: "huber" or "tukey".
+        r: Residuals in standard deviations, any shape.
+
+    Returns:
+        Weights from 0 to 1, psi(r) / r.
+
+    References:
+        Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting
+        of power series.
+    """
+    size, bound = np.abs(r), LOSSES[loss]
+    if loss == "huber":
+        weight: Array = bound / np.maximum(size, bound)
+        return weight
+    weight = np.maximum(1.0 - (size / bound) ** 2, 0.0) ** 2
+    return weight
+
+
+def loss_slope(loss: str, r: Array) -> Array:
+    """Return psi'(r), how much a row still resists a change of the parameters.
+
+    Args:
+        loss: "huber" or "tukey".
+        r: Residuals in standard deviations, any shape.
+
+    Returns:
+        Slopes, at most 1.
+    """
+    u = (r / LOSSES[loss]) ** 2
+    slope: Array = np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
+    return slope
+
+
+def reweigh(
+    model: RobotModel,
+    mapping: BaseMapping,
+    recordings: Recordings,
+    reductions: tuple[Reduction, ...],
+    loss: str,
+    prior: Array,
+) -> Reweighted:
+    """Weigh rows down that fit badly, until the fit does not change any more.
+
+    The scale of each joint's residual is its median absolute deviation, which outliers hardly move.
+    "tukey", which ignores bad rows altogether, starts where "huber" ends, whose minimum is unique.
+
+    Args:
+        model: The robot.
+        mapping: Standard to base parameters.
+        recordings: The recordings, in memory.
+        reductions: What they come down to without weights.
+        loss: "huber" or "tukey".
+        prior: Standard parameters of the URDF, shape (p,), kept where the data say nothing.
+
+    Returns:
+        The recordings with weights.
+
+    Raises:
+        NotConvergedError: If the weights do not settle.
+        SettingsError: If the recordings are not in memory.
+    """
+    if not isinstance(recordings, LoadedRecordings):
+        raise SettingsError(
+            f"robust is {loss!r}: its weights are found in several passes over rows in memory; "
+            "raise rows_in_memory in [reduction], cut the log with start and end, or leave it out"
+        )
+    passes = 0
+    weighted, stages = recordings, ["huber"] if loss == "huber" else ["huber", "tukey"]
+    for stage in stages:
+        before = None
+        for _ in range(_MAX_ITERATIONS):
+            beta = mapping.to_base(prior)
+            fit = WLS(prior=beta).fit(join(reductions).factors)
+            if before is not None:
+                moved = np.abs(fit.theta - before) / np.maximum(fit.std_error, 1e-300)
+                if moved.max() < _TOLERANCE:
+                    break
+            before = fit.theta
+            standard = mapping.to_standard(fit.theta, prior)
+            residuals = _scaled_residuals(model, recordings, standard)
+            weights = tuple(loss_weight(stage, r) for r in residuals)
+            weighted = replace(recordings, weights=weights)
+            reductions = weighted.reduce(mapping)
+            passes += 1
+        else:
+            raise NotConvergedError(
+                f"the weights of the {stage} loss still change after {_MAX_ITERATIONS} passes; "
+                "look for logs of different robots, or use robust = 'none'",
+                "max_iterations",
+            )
+    used = np.concatenate([r.mask.ravel() for r in recordings.fitted])
+    scaled = np.concatenate([r.ravel() for r in residuals])[used]
+    weight = loss_weight(loss, scaled)
+    slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
+    return Reweighted(
+        weighted, reductions, float(weight.mean()) / slope, float((weight < 0.5).mean()), passes
+    )
+
+
+def find_outliers(
+    model: RobotModel, evaluations: Sequence[Evaluation], standard: Array
+) -> tuple[Outlier, ...]:
+    """Return the rows that the fit does not explain, the worst first.
+
+    Near a change of direction a row may also be off by the step of Coulomb friction: where a drive
+    sticks, its friction is anywhere between the two bounds.
+
+    Args:
+        model: The robot.
+        evaluations: Recordings with the torque that the estimate predicts.
+        standard: The estimate, shape (p,).
+
+    Returns:
+        Outliers of 12 times the joint's usual residual and 10 % of its torque, and more; rows
+        within half a second of each other are one.
+    """
+    found: list[Outlier] = []
+    for e in evaluations:
+        motion, mask = e.recording.trajectory, e.recording.mask
+        prediction = e.torques["estimate"]
+        scales = _scales([motion.tau - prediction], [mask])
+        step = _friction_step(model, standard)
+        turning = np.abs(motion.v) * (e.recording.signals.cutoff or np.inf) <= np.abs(motion.a)
+        excess = np.abs(motion.tau - prediction) - np.where(turning, step, 0.0)
+        rms = np.sqrt(np.mean(motion.tau**2, axis=0))
+        sizes = np.where(excess >= _MATTERS * rms, excess / scales, 0.0)
+        for j, joint in enumerate(model.row_names):
+            rows = np.flatnonzero((sizes[:, j] >= _OUTLIER) & mask[:, j])
+            edges = np.flatnonzero(np.diff(motion.t[rows]) > _NEAR) + 1
+            for i, k in pairwise([0, *edges.tolist(), len(rows)] if len(rows) else []):
+                worst = rows[i:k][np.argmax(sizes[rows[i:k], j])]
+                found.append(
+                    Outlier(
+                        Path(e.recording.log.path).name or "log",
+                        joint,
+                        float(motion.t[worst]),
+                        float(motion.tau[worst, j]),
+                        float(prediction[worst, j]),
+                        float(sizes[worst, j]),
+                        k - i,
+                    )
+                )
+    return tuple(sorted(found, key=lambda outlier: -outlier.size))
+
+
+def _friction_step(model: RobotModel, standard: Array) -> Array:
+    """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
+    step = np.zeros(model.n_rows)
+    drives = drive_columns(model.layout, model.n_rows)
+    for value, drive in zip(standard[model.layout.n_inertial :], drives, strict=True):
+        if drive.term == "coulomb":
+            for row, ratio in drive.ratios.items():
+                step[row] += 2.0 * abs(ratio * value)
+    return step
+
+
+def _scaled_residuals(
+    model: RobotModel, recordings: LoadedRecordings, standard: Array
+) -> list[Array]:
+    """Return the residuals of each recording in standard deviations of their joint."""
+    residuals = [
+        r.trajectory.tau - predict(model, [standard], r.trajectory)[0] for r in recordings.fitted
+    ]
+    scales = _scales(residuals, [r.mask for r in recordings.fitted])
+    return [residual / scales for residual in residuals]
+
+
+def _scales(residuals: Sequence[Array], masks: Sequence[Array]) -> Array:
+    """Return the scale of each joint's residual, from its median size over the rows used."""
+    scales = []
+    for j in range(residuals[0].shape[1]):
+        used = [r[mask[:, j], j] for r, mask in zip(residuals, masks, strict=True)]
+        together = np.concatenate(used)
+        scales.append(_MAD * float(np.median(np.abs(together))) if len(together) else np.inf)
+    # data without noise leave residuals of rounding size, in which nothing is an outlier
+    torque = max(float(np.abs(r).max()) for r in residuals)
+    return np.maximum(scales, max(1e-9 * torque, 1e-300))

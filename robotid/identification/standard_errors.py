@@ -1,0 +1,195 @@
+"""Standard errors of estimates, from how much the scores of stretches of the logs scatter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import Consistent, Estimate
+from robotid.estimators.batch.least_squares import solve_factor
+from robotid.exceptions import NotConvergedError
+from robotid.identification.uncertainty import FEWEST, Scatter, quantile, scatter
+from robotid.regressor.factors import Factors
+
+__all__ = ["Redraws", "StandardErrors", "measured_errors", "with_wls_errors"]
+
+_LEAST_SOLVED = 0.8  # share of the redrawn fits below which they tell nothing
+
+
+@dataclass(frozen=True, eq=False)
+class StandardErrors:
+    """What the standard errors of an estimate rest on.
+
+    Attributes:
+        method: In words.
+        stretches: Number of stretches whose scores were compared.
+        inflation: How much more the scores scatter than those of independent rows would [-].
+        freedom: Degrees of freedom of each base parameter's standard error, shape (b,).
+        unbounded: Standard errors of the standard parameters with the bounds left out, shape (p,);
+            None if no bound binds.
+    """
+
+    method: str
+    stretches: int
+    inflation: float
+    freedom: Array
+    unbounded: Array | None = None
+
+    @property
+    def reach(self) -> Array:
+        """Standard errors that a 95 % interval of each base parameter reaches, shape (b,)."""
+        return quantile(self.freedom)
+
+
+@dataclass(frozen=True, eq=False)
+class Redraws:
+    """How the spread of a physically consistent fit is told where its bounds bind.
+
+    Attributes:
+        fit: The fit.
+        draws: Fits to data and prior drawn anew; 0 leaves the bounds out.
+        rng: Source of the noise.
+    """
+
+    fit: Consistent
+    draws: int
+    rng: np.random.Generator
+
+
+def measured_errors(
+    estimate: Estimate,
+    stretches: Sequence[Factors],
+    factors: Factors,
+    share: float,
+    K: Array,
+    sigma: Array,
+    *,
+    is_filter: bool = False,
+    redraws: Redraws | None = None,
+) -> tuple[Estimate, StandardErrors]:
+    """Return an estimate with the covariance that the scatter of the stretches shows.
+
+    With bread B, the covariance if rows were independent, and meat M, the covariance of the score:
+
+    * of base parameters: B M B, as of any least squares on correlated rows;
+    * of standard parameters, with the prior's information L in B = (K^T H K + L)^-1:
+      B (K^T M K + L) B, the mean square error about a truth that the prior describes. Where
+      inequalities bind, fits to redrawn data and prior tell it; without ``redraws`` they are left
+      out;
+    * of a filter that forgets: its own covariance, grown by the mean inflation.
+
+    Args:
+        estimate: Base parameters, shape (b,), or standard ones, shape (p,), with the covariance
+            that rows would leave of which ``share`` are independent.
+        stretches: Factors of the stretches, base parameters.
+        factors: Those of all stretches together.
+        share: Share of the rows that the covariance takes to be independent [-].
+        K: Map to the base parameters, shape (b, p).
+        sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
+        is_filter: Whether it weighs rows otherwise, too, as a filter that forgets or gates.
+        redraws: How the spread is told of an estimate whose details name active bounds.
+
+    Returns:
+        The estimate, and what its standard errors rest on. With fewer than 12 stretches rows count
+        as independent by that share.
+
+    Raises:
+        NotConvergedError: If more than a fifth of the redrawn fits are not solved.
+    """
+    b = len(factors.names)
+    binds = bool(estimate.details.get("active")) and redraws is not None and redraws.draws > 0
+    if len(stretches) < FEWEST:
+        method = (
+            f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
+            f"only {len(stretches)} stretches longer than the filter's memory"
+        )
+        errors = StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
+        if redraws is None or not binds:
+            return estimate, errors
+        R = factors.weighted(sigma)[:b, :b]
+        return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
+    is_open = ~np.isfinite(np.diag(estimate.covariance))
+    C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
+    if len(estimate.theta) != b:
+        found = scatter(stretches, K @ estimate.theta, sigma, share * K @ C @ K.T)
+        covariance = _about_prior(C, K, found, factors.weighted(sigma)[:b, :b], share)
+    elif not is_filter:
+        bread = solve_factor(factors, sigma, estimate.theta).covariance
+        found = scatter(stretches, estimate.theta, sigma, bread)
+        covariance = found.covariance
+    else:
+        found = scatter(stretches, estimate.theta, sigma, share * C)
+        covariance = C * (share * found.inflation)
+    covariance[is_open, is_open] = np.inf
+    estimate = replace(estimate, covariance=covariance)
+    method = f"the scatter of the scores of {len(stretches)} stretches"
+    errors = StandardErrors(method, len(stretches), found.inflation, found.freedom())
+    if redraws is not None and binds:
+        return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
+    return estimate, errors
+
+
+def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
+    """Return a gradient method's estimate with the covariance that the factors know.
+
+    It ends beside the minimum of least squares: its mean square error is the covariance of that
+    minimum plus the square of the distance to it, which is measured.
+
+    Args:
+        estimate: Base parameters, shape (b,).
+        wls: Weighted least squares of the same rows.
+
+    Returns:
+        The estimate, with what weighted least squares says of the data.
+    """
+    distance = estimate.theta - wls.theta
+    covariance = wls.covariance + np.outer(distance, distance)
+    reason = "standard errors are those of wls plus the distance to it"
+    return replace(
+        estimate,
+        covariance=covariance,
+        rank=wls.rank,
+        condition=wls.condition,
+        undetermined=wls.undetermined,
+        message=estimate.message.split("; a gradient method")[0] + f"; {reason}",
+    )
+
+
+def _bounded(
+    estimate: Estimate,
+    errors: StandardErrors,
+    redraws: Redraws,
+    factors: Factors,
+    sigma: Array,
+    meat: Array,
+) -> tuple[Estimate, StandardErrors]:
+    """Return the estimate with the mean square distance of redrawn fits as its covariance.
+
+    The meat is that of the rows as :meth:`Consistent.rows` has them, of which a share counts.
+    """
+    rows = redraws.fit.rows(factors, sigma)
+    found, failures = redraws.fit.redrawn(rows, estimate.theta, meat, redraws.draws, redraws.rng)
+    if len(found) < _LEAST_SOLVED * redraws.draws:
+        raise NotConvergedError(
+            f"the spread of the fit where its bounds bind is not known: Clarabel solved "
+            f"{len(found)} of {redraws.draws} fits to redrawn data; set draws = 0 for standard "
+            "errors without the bounds",
+            failures[0],
+        )
+    missing = f" ({len(failures)} more not solved: {failures[0]})" if failures else ""
+    method = f"{errors.method}; bounds bind: {len(found)} fits to redrawn data and prior{missing}"
+    freedom = 1.0 / (1.0 / errors.freedom + 1.0 / len(found))
+    covariance = found.T @ found / len(found)
+    return (
+        replace(estimate, covariance=covariance),
+        replace(errors, method=method, freedom=freedom, unbounded=estimate.std_error),
+    )
+
+
+def _about_prior(C: Array, K: Array, found: Scatter, R: Array, share: float) -> Array:
+    """Return C (share^2 K^T M K + L) C with L = C^-1 - share K^T R^T R K."""
+    KC = K @ C
+    RKC = R @ KC
+    covariance: Array = C - share * RKC.T @ RKC + share**2 * KC.T @ found.meat @ KC
+    return 0.5 * (covariance + covariance.T)

@@ -1,0 +1,255 @@
+"""How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from robotid.identification.metrics import JointMetrics, Metrics
+
+__all__ = ["NOT_EVALUATED", "Doubt", "Finding", "JointVerdict", "Verdict", "judge"]
+
+#: Status of a joint that no kept recording moves: never a pass.
+NOT_EVALUATED = "not evaluated"
+
+_GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
+_POOR = 50.0  # [%] a joint predicted worse than this is not usable
+_OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something a user must know.
+
+    Attributes:
+        code: A fixed word for programs.
+        severity: "note", "warning" or "error".
+        where: What it is about: a link, a joint, a parameter or a file.
+        message: What was found, what was wanted, what to do.
+        evidence: The figures it rests on, by name.
+    """
+
+    code: str
+    severity: str
+    where: str
+    message: str
+    evidence: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why a result may be wrong although it predicts torque well.
+
+    Attributes:
+        code: Code of the finding that it comes from.
+        joint: The joint that it is about; empty for all of the result.
+        message: Why, in words.
+    """
+
+    code: str
+    joint: str
+    message: str
+
+
+@dataclass(frozen=True)
+class JointVerdict:
+    """How far to trust the torque that is predicted for one joint.
+
+    Attributes:
+        status: "good", "usable", "poor" or "not evaluated".
+        reasons: Why, the worst first; for "good" what was checked.
+    """
+
+    status: str
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How far to trust a result.
+
+    Attributes:
+        status: "good", "usable" or "poor".
+        reasons: Why, the worst first; for "good" what was checked.
+        joints: The same of each joint of the model.
+        alarms: Faults of the recordings that it was told of.
+        doubts: Doubts that it was told of.
+    """
+
+    status: str
+    reasons: tuple[str, ...]
+    joints: Mapping[str, JointVerdict] = field(default_factory=dict)
+    alarms: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as plain values, as result.json has it."""
+        return {
+            "status": self.status,
+            "reasons": list(self.reasons),
+            "per_joint": {
+                joint: {"status": verdict.status, "reasons": list(verdict.reasons)}
+                for joint, verdict in self.joints.items()
+            },
+            "alarms": list(self.alarms),
+            "doubts": [asdict(doubt) for doubt in self.doubts],
+        }
+
+
+def judge(
+    identification: Metrics,
+    validation: Mapping[str, Metrics],
+    *,
+    undetermined: Sequence[str],
+    is_consistent: bool,
+    joints: Sequence[str] = (),
+    alarms: Sequence[str] = (),
+    doubts: Sequence[Doubt] = (),
+    refitted: Sequence[str] = (),
+) -> Verdict:
+    """Return the verdict on a result.
+
+    Args:
+        identification: Metrics over the fitted recordings.
+        validation: Metrics of each kept recording, by its name.
+        undetermined: Base parameters that the data do not determine by themselves.
+        is_consistent: Whether the parameters are physically possible.
+        joints: The model's joints; one without a row in any recording is not evaluated.
+        alarms: Faults of the recordings that make any result of them wrong.
+        doubts: Why the result may be wrong however well it predicts.
+        refitted: Kept recordings, by name, that are left out since they hold fitted rows.
+
+    Returns:
+        The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
+        of a joint with a doubt, and that of all joints with one about all.
+    """
+    moved = [joint for m in (identification, *validation.values()) for joint in m.per_joint]
+    names = dict.fromkeys([*joints, *moved])
+    found = {joint: _found_on(joint, identification, validation) for joint in names}
+    poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
+    reasons = [*alarms, *poor]
+    if not validation:
+        why = (
+            f"{list(refitted)} hold rows that were fitted"
+            if refitted
+            else "no validation log given"
+        )
+        reasons.append(f"the prediction of a new motion was not evaluated: {why}")
+    reasons += [reason for _, doubt, _ in found.values() for reason in doubt]
+    reasons += _in_words(doubts)
+    reasons += _unseen(names, identification, validation)
+    if undetermined:
+        reasons.append(
+            f"the data do not determine {len(undetermined)} base parameters by themselves: "
+            f"{list(undetermined)}"
+        )
+    if not is_consistent:
+        reasons.append(
+            "the standard parameters are not physically consistent, so no URDF was written; the "
+            "base parameters predict torque all the same"
+        )
+    per_joint = {
+        joint: _joint_verdict(
+            sorted(worse, key=_rank),
+            [*doubt, *_in_words([d for d in doubts if d.joint in ("", joint)])],
+            errors,
+            is_still=joint not in moved,
+        )
+        for joint, (worse, doubt, errors) in found.items()
+    }
+    status = "poor" if poor or alarms else "usable" if reasons else "good"
+    if not reasons:
+        worst = max(error for _, _, errors in found.values() for error in errors)
+        reasons = [
+            f"every joint is predicted within {worst:.1f} % on recordings that were not fitted, "
+            "better than by a constant and than by the URDF, and every parameter is physically "
+            "consistent"
+        ]
+    return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
+
+
+def _found_on(
+    joint: str, identification: Metrics, validation: Mapping[str, Metrics]
+) -> tuple[list[str], list[str], list[float]]:
+    """Return what makes a joint poor, what makes it doubtful, and its errors [%], log by log."""
+    poor, doubts, errors = [], [], []
+    for log, metrics in validation.items():
+        measured = metrics.per_joint.get(joint)
+        if measured is not None:
+            found = _judge_joint(joint, log, measured, identification.per_joint.get(joint))
+            poor += found[0]
+            doubts += found[1]
+            errors.append(_error(measured))
+    return poor, doubts, errors
+
+
+def _unseen(
+    names: Iterable[str], identification: Metrics, validation: Mapping[str, Metrics]
+) -> list[str]:
+    """Return which joints move in no recording, and which in no kept one."""
+    kept = {joint for m in validation.values() for joint in m.per_joint}
+    fitted = identification.per_joint
+    still = [joint for joint in names if joint not in kept and joint not in fitted]
+    missing = [joint for joint in names if joint not in kept and joint in fitted]
+    if still and not fitted:  # measured again without the fitted recordings
+        still, missing = [], still
+    reasons = [f"the joints {still} move in no recording: not evaluated"] if still else []
+    if missing and validation:
+        reasons.append(f"the joints {missing} do not move in any validation log: not evaluated")
+    return reasons
+
+
+def _joint_verdict(
+    poor: list[str], doubts: list[str], errors: list[float], *, is_still: bool
+) -> JointVerdict:
+    """Return the verdict on a joint from what was found on each kept recording."""
+    if not errors:
+        where = "recording" if is_still else "kept recording"
+        return JointVerdict(NOT_EVALUATED, (f"it does not move in any {where}", *doubts))
+    if poor or doubts:
+        return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
+    said = f"predicted within {max(errors):.1f} %, better than by a constant and than by the URDF"
+    return JointVerdict("good", (said,))
+
+
+def _in_words(doubts: Sequence[Doubt]) -> list[str]:
+    """Return one sentence per kind of doubt, with the joints that share it."""
+    shared: dict[tuple[str, str], list[str]] = {}
+    for doubt in doubts:
+        shared.setdefault((doubt.message, doubt.code), []).append(doubt.joint)
+    return [
+        f"{', '.join(joints)}: {message} ({code})" if any(joints) else f"{message} ({code})"
+        for (message, code), joints in shared.items()
+    ]
+
+
+def _judge_joint(
+    joint: str, log: str, measured: JointMetrics, fitted: JointMetrics | None
+) -> tuple[list[str], list[str]]:
+    """Return what makes the result poor, and what makes it doubtful, on one joint."""
+    error = _error(measured)
+    urdf = measured.baselines.get("urdf")
+    if measured.relative_error_pct is None:
+        return [f"{joint}: the torque on {log} is 0 throughout: nothing was predicted"], []
+    if not measured.better_than_constant:
+        return [f"{joint}: worse than a constant torque on {log} ({error:.1f} %)"], []
+    if urdf is not None and error > urdf:
+        return [f"{joint}: {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
+    if error > _POOR:
+        return [f"{joint}: predicted to {error:.1f} % only on {log}"], []
+    if error > _GOOD:
+        return [], [f"{joint}: predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"]
+    if fitted is not None and error > max(_OPTIMISM * _error(fitted), 5.0):
+        return [], [
+            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted"
+        ]
+    return [], []
+
+
+def _rank(reason: str) -> int:
+    """Return 0 for what is worse than a constant, 1 for worse than the URDF, 2 for the rest."""
+    return 0 if "a constant" in reason else 1 if "the URDF" in reason else 2
+
+
+def _error(measured: JointMetrics) -> float:
+    value = measured.relative_error_pct
+    return float("inf") if value is None else value

@@ -1,0 +1,209 @@
+"""CSV files as tables of named columns."""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.logs.table import Place, RowReader, Table
+
+__all__ = ["open_csv", "write_csv"]
+
+_BLOCK = 4096  # lines read at a time
+
+
+def open_csv(path: Path) -> Table:
+    """Return the table in a CSV file.
+
+    Args:
+        path: The file: UTF-8, its first line names the columns.
+
+    Returns:
+        The table.
+
+    Raises:
+        DataError: If there is no header, a cell is no number, or a row has another length.
+    """
+    names, separator = _csv_header(path)
+    return Table(names, partial(_read_csv, path), rows=_CsvRows(path, names, separator))
+
+
+def write_csv(table: Mapping[str, Array], path: Path) -> None:
+    """Write columns as CSV: the shortest decimals that give the same bits.
+
+    Args:
+        table: Arrays of shape (N,) by name.
+        path: The file.
+    """
+    rows = np.column_stack(list(table.values()))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(table)
+        writer.writerows(row.tolist() for row in rows)
+
+
+@dataclass(frozen=True)
+class _CsvRows(RowReader):
+    """Rows of a CSV file; see :class:`robotid.logs.table.RowReader`."""
+
+    path: Path
+    names: list[str]
+    separator: str
+
+    def count(self) -> int:
+        """Return the number of lines behind the first."""
+        with self.path.open("rb") as file:
+            blocks = iter(partial(file.read, 2**20), b"")
+            return sum(block.count(b"\n") for block in blocks) - 1
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        """Yield one column; see :meth:`RowReader.scan`."""
+        for lines, place, rows in self._blocks(Place(), None):
+            yield self._parse(lines, [name], place, 0, rows)[name], place
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        """Return some rows; see :meth:`RowReader.read`."""
+        parts = []
+        for lines, place, rows in self._blocks(near, stop):
+            start, end = max(first - place.row, 0), min(stop - place.row, rows)
+            if start < end:
+                parts.append(self._parse(lines, wanted, place, start, end))
+        return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+
+    def _blocks(self, near: Place, stop: int | None) -> Iterator[tuple[list[str], Place, int]]:
+        """Yield lines, blank ones among them, the place of the first and how many are rows."""
+        with self.path.open("rb") as file:
+            place = near
+            if near.offset == 0:
+                place = Place(0, 2, len(file.readline()))
+            file.seek(place.offset)
+            while stop is None or place.row < stop:
+                raw = list(islice(file, _BLOCK))
+                rows = len(raw) - sum(line.isspace() for line in raw)
+                if not raw:
+                    return
+                try:
+                    lines = [line.decode() for line in raw]
+                except UnicodeDecodeError as error:
+                    raise _not_utf8(self.path, error) from error
+                if rows:
+                    yield lines, place, rows
+                size = sum(map(len, raw))
+                place = Place(place.row + rows, place.line + len(raw), place.offset + size)
+
+    def _parse(
+        self, lines: Sequence[str], wanted: Sequence[str], place: Place, start: int, stop: int
+    ) -> dict[str, Array]:
+        """Return rows start to stop of some lines."""
+        columns = [self.names.index(name) for name in wanted]
+        count, where = len(self.names), self.path.name
+        rows = _whole_rows(lines, count, self.separator, where, place.line)
+        try:
+            values = np.loadtxt(islice(rows, start, stop), usecols=columns, **_how(self.separator))
+        except DataError:
+            raise
+        except ValueError as error:
+            raise _bad_cell(self.path, self.names, columns, self.separator) from error
+        return dict(zip(wanted, values.T, strict=True))
+
+
+@contextmanager
+def _open_csv(path: Path) -> Iterator[TextIO]:
+    """Open a text file, whether or not it starts with a byte order mark."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            yield file
+    except UnicodeDecodeError as error:
+        raise _not_utf8(path, error) from error
+
+
+def _not_utf8(path: Path, error: UnicodeDecodeError) -> DataError:
+    return DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8")
+
+
+def _how(separator: str) -> dict[str, Any]:
+    """Return how NumPy reads the cells."""
+    return {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
+
+
+def _csv_header(path: Path) -> tuple[list[str], str]:
+    """Return the column names of a CSV file and what separates them."""
+    with _open_csv(path) as file:
+        line = file.readline()
+    if not line.strip():
+        raise DataError(f"{path.name} is empty; its first line must name the columns")
+    separator = max(",;\t", key=line.count)  # the comma, if there is none
+    cells = next(csv.reader([line.strip("\r\n").lstrip("# ")], delimiter=separator))
+    names = [cell.strip() for cell in cells]
+    if all(_is_number(name) for name in names):
+        raise DataError(f"{path.name} has no header; its first line must name the columns")
+    return names, separator
+
+
+def _read_csv(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
+    """Return the wanted columns of a CSV file."""
+    names, separator = _csv_header(path)
+    columns = [names.index(name) for name in wanted]
+    with _open_csv(path) as file:
+        file.readline()
+        rows = _whole_rows(file, len(names), separator, path.name)
+        first = list(islice(rows, 1))
+        if not first:
+            raise DataError(f"{path.name} has a header but no rows; record at least 2")
+        try:
+            values = np.loadtxt(chain(first, rows), usecols=columns, **_how(separator))
+        except (DataError, UnicodeDecodeError):
+            raise
+        except ValueError as error:
+            raise _bad_cell(path, names, columns, separator) from error
+    return dict(zip(wanted, values.T, strict=True))
+
+
+def _whole_rows(
+    lines: Iterable[str], count: int, separator: str, where: str, first: int = 2
+) -> Iterator[str]:
+    """Yield the lines that are not blank, and refuse those with too few or too many cells."""
+    for number, line in enumerate(lines, start=first):
+        if line.isspace():
+            continue
+        if line.count(separator) != count - 1:  # unless a separator stands in quotes
+            found = len(next(csv.reader([line], delimiter=separator)))
+            if found != count:
+                raise DataError(
+                    f"{where}: line {number} has {found} cells, the header has {count}; mend it"
+                )
+        yield line
+
+
+def _bad_cell(path: Path, names: list[str], columns: list[int], separator: str) -> DataError:
+    """Return the error that names the first cell that is not a number."""
+    with _open_csv(path) as file:
+        file.readline()
+        for row, line in enumerate(_whole_rows(file, len(names), separator, path.name)):
+            cells = next(csv.reader([line], delimiter=separator))
+            for i in columns:
+                if not _is_number(cells[i]):
+                    found = repr(cells[i]) if cells[i].strip() else "empty"
+                    hint = "; write decimals with a point" if "," in cells[i] else ""
+                    return DataError(
+                        f"{path.name}: {names[i]} is {found} at row {row}, wanted a number{hint}; "
+                        "remove the row or mend the recording"
+                    )
+    return DataError(f"{path.name} holds a cell that is not a plain decimal number")
+
+
+def _is_number(text: str) -> bool:
+    """Return whether a cell holds a number, NaN and infinity among them."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,306 @@
+"""A robot's motion as arrays: `Log` as it was recorded, `Trajectory` as it is identified from.
+
+Reading and writing files is in `robotid.logs.read`.
+"""
+
+import difflib
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+
+__all__ = ["Log", "Trajectory"]
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A recording, sample by sample, in SI units. The arrays cannot be written to.
+
+    Attributes:
+        t: Time stamps, strictly increasing, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        tau: Joint torques, shape (N, n) [N m or N].
+        joints: Names of the n joints, in the order of the columns.
+        v: Measured velocities, shape (N, n) [rad/s or m/s], or None.
+        a: Measured accelerations, shape (N, n) [rad/s^2 or m/s^2], or None.
+        path: The file it was read from; "" if it was made in memory.
+        notes: What the reader should know, as columns that were ignored.
+    """
+
+    t: Array
+    q: Array
+    tau: Array
+    joints: tuple[str, ...]
+    v: Array | None = None
+    a: Array | None = None
+    path: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = _where(self.path)
+        _settle(self, where, {"q": self.q, "dq": self.v, "ddq": self.a, "tau": self.tau})
+        if len(self.t) < 2:
+            raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
+        require_increasing(self.t, where)
+
+    def window(self, start: float | None = None, end: float | None = None) -> "Log":
+        """Return the rows from start to end, both included.
+
+        Args:
+            start: First time stamp kept, on the log's own clock [s]; None for the first row.
+            end: Last time stamp kept [s]; None for the last row.
+
+        Returns:
+            The shorter log.
+
+        Raises:
+            DataError: If fewer than two rows are left.
+        """
+        first = self.t[0] if start is None else start
+        last = self.t[-1] if end is None else end
+        rows = np.flatnonzero((self.t >= first) & (self.t <= last))
+        if len(rows) < 2:
+            raise DataError(
+                f"{_where(self.path)}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
+                f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
+            )
+        kept = slice(rows[0], rows[-1] + 1)
+        cut: dict[str, Any] = {
+            name: x if x is None else x[kept] for name, x in self._arrays().items()
+        }
+        return replace(self, t=self.t[kept], **cut)
+
+    def select(self, joints: Sequence[str]) -> "Log":
+        """Return the log of some joints.
+
+        Args:
+            joints: Names of the joints kept, in the order wanted.
+
+        Returns:
+            The narrower log.
+
+        Raises:
+            DataError: If a joint is not in the log.
+        """
+        for name in joints:
+            if name not in self.joints:
+                raise DataError(
+                    f"joint {name!r} is not in {_where(self.path)}; joints: {list(self.joints)}"
+                    f"{suggestion(name, self.joints)}"
+                )
+        kept = [self.joints.index(name) for name in joints]
+        cut: dict[str, Any] = {
+            name: x if x is None else x[:, kept] for name, x in self._arrays().items()
+        }
+        return replace(self, joints=tuple(joints), **cut)
+
+    def _arrays(self) -> dict[str, Any]:
+        """Return the arrays with a column per joint."""
+        return {"q": self.q, "tau": self.tau, "v": self.v, "a": self.a}
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion that is smooth within each segment, in SI units. The arrays cannot be written to.
+
+    Attributes:
+        t: Time stamps, shape (N,) [s].
+        q: Joint positions, shape (N, n) [rad or m].
+        v: Velocities, shape (N, n) [rad/s or m/s].
+        a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
+        tau: Torques, shape (N, n) [N m or N].
+        joints: Names of the n joints, in the order of the columns.
+        rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
+        segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
+        direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
+            shape (N, c) [-], in the order of :func:`robotid.regressor.columns.friction_speeds`; None: the
+            sign of the speed itself.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    joints: tuple[str, ...]
+    rate: float | None
+    segment: Array
+    direction: Array | None = None
+
+    def __post_init__(self) -> None:
+        _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
+        segment = np.asarray(self.segment)
+        if segment.shape != self.t.shape or segment.dtype.kind not in "iu":
+            raise DataError(
+                f"trajectory: segment is {segment.dtype} of shape {segment.shape}, wanted integers "
+                f"of shape {self.t.shape}"
+            )
+        object.__setattr__(self, "segment", _frozen(segment, np.int_))
+        if self.direction is not None:
+            direction = _frozen(self.direction)
+            if direction.ndim != 2 or len(direction) != len(self.t):
+                raise DataError(
+                    f"trajectory: direction has shape {direction.shape}, wanted ({len(self.t)}, c)"
+                    ": a column for each speed that Coulomb friction follows"
+                )
+            names = [f"direction {k}" for k in range(direction.shape[1])]
+            require_finite(direction, self.t, names, "trajectory")
+            object.__setattr__(self, "direction", direction)
+        if self.rate is not None and not 0 < self.rate < np.inf:
+            raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
+
+    @property
+    def squares(self) -> Array:
+        """Sums of tau^2, v^2 and a^2 over the samples, shape (3, n)."""
+        return np.array([np.einsum("kj,kj->j", x, x) for x in (self.tau, self.v, self.a)])
+
+    def part(self, start: int, stop: int) -> "Trajectory":
+        """Return the samples start to stop.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one; beyond the end means to the end.
+
+        Returns:
+            The samples.
+        """
+        window = slice(start, stop)
+        arrays = {key: getattr(self, key)[window] for key in ("t", "q", "v", "a", "tau")}
+        direction = None if self.direction is None else self.direction[window]
+        return replace(self, segment=self.segment[window], direction=direction, **arrays)
+
+
+def suggestion(name: str, known: Collection[str]) -> str:
+    """Return the question whether the nearest known name was meant, or "" if none is near.
+
+    Args:
+        name: The name that is not known.
+        known: The names that are.
+
+    Returns:
+        A sentence to put behind an error, with a full stop and a space before it.
+    """
+    near = difflib.get_close_matches(name, known, n=1)
+    return f". Did you mean {near[0]!r}?" if near else ""
+
+
+def repeated(names: Sequence[str]) -> list[str]:
+    """Return the names that occur more than once.
+
+    Args:
+        names: The names.
+
+    Returns:
+        Each repeated name once, sorted.
+    """
+    return sorted(name for name, count in Counter(names).items() if count > 1)
+
+
+def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]) -> None:
+    """Check joints, shapes and values of the arrays, and replace them by read-only ones."""
+    if isinstance(owner.joints, str) or not owner.joints:
+        raise DataError(f"{where}: joints is {owner.joints!r}, wanted at least one name in a tuple")
+    joints = tuple(owner.joints)
+    if twice := repeated(joints):
+        raise DataError(f"{where}: joints {twice} are named twice; name each joint once")
+    t = _frozen(owner.t)
+    if t.ndim != 1:
+        raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
+    require_finite(t[:, None], t, ["time"], where)
+    settled = {"t": t}
+    for name, values in arrays.items():
+        if values is None:
+            continue
+        array = _frozen(values)
+        if array.shape != (len(t), len(joints)):
+            raise DataError(
+                f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
+                f"for each time stamp, a column for each of the joints {list(joints)}"
+            )
+        require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
+        settled[{"dq": "v", "ddq": "a"}.get(name, name)] = array
+    for name, array in settled.items():
+        object.__setattr__(owner, name, array)
+    object.__setattr__(owner, "joints", joints)
+
+
+def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
+    """Return the values as a read-only array; copied unless they cannot be written to already."""
+    array: Array = np.asarray(values, dtype=dtype)
+    if array.flags.writeable:
+        array = array.copy()
+        array.flags.writeable = False
+    return array
+
+
+def require_finite(
+    values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
+) -> None:
+    """Refuse NaN and infinite values, naming the first.
+
+    Args:
+        values: Shape (N, k).
+        t: Time stamps of the rows, shape (N,) [s].
+        names: Names of the k columns.
+        where: What the log is called.
+        first: Number in its file of the first row.
+
+    Raises:
+        DataError: If a value is not finite.
+    """
+    if np.isfinite(values).all():
+        return
+    row, column = (int(i) for i in np.argwhere(~np.isfinite(values))[0])
+    found = "NaN" if np.isnan(values[row, column]) else str(values[row, column])
+    at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
+    raise DataError(
+        f"{where}: {names[column]} is {found} at row {first + row}{at}; remove the row or mend the "
+        "recording",
+        code="not_finite",
+    )
+
+
+def require_increasing(t: Array, where: str, first: int = 0) -> None:
+    """Refuse time stamps that repeat or go back, naming the first.
+
+    Args:
+        t: Time stamps, shape (N,) [s].
+        where: What the log is called.
+        first: Number in its file of the first row.
+
+    Raises:
+        DataError: If a time stamp is not after the one before.
+    """
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back) == 0:
+        return
+    k = int(back[0]) + 1
+    row, now, before = first + k, _stamp(t[k]), _stamp(t[k - 1])
+    if t[k] == t[k - 1]:
+        raise DataError(
+            f"{where}: t must increase, but t[{row}] = {now} s is a duplicate time stamp, "
+            f"the same as t[{row - 1}]; remove one of the two rows",
+            code="duplicate_stamp",
+        )
+    raise DataError(
+        f"{where}: t must increase, but t[{row}] = {now} s follows t[{row - 1}] = {before} s; "
+        "sort the rows, or mend the recording",
+        code="stamp_order",
+    )
+
+
+def _stamp(t: float) -> str:
+    """Return a time stamp with three decimals, or with as many as it has."""
+    return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
+
+
+def _where(path: str) -> str:
+    """Return what a log is called in errors."""
+    return Path(path).name or "log"

@@ -1,0 +1,155 @@
+"""Parquet files as tables of named columns; pyarrow is imported when one is opened."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, MissingDependencyError
+from robotid.logs.table import Place, RowReader, Table
+
+__all__ = ["load_pyarrow", "open_parquet", "write_parquet"]
+
+_BATCH = 16384  # rows decoded at a time, where not all are wanted
+_BUFFER = 2**16  # bytes of each column read at a time there, not whole row groups
+
+
+def open_parquet(path: Path) -> Table:
+    """Return the table in a Parquet file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The table; null becomes NaN.
+
+    Raises:
+        DataError: If the file is broken, or a column read holds no numbers.
+        MissingDependencyError: If pyarrow is not installed.
+    """
+    with _open(path) as file:
+        names = list(file.schema_arrow.names)
+    return Table(names, partial(_read, path), rows=_ParquetRows(path))
+
+
+def write_parquet(table: Mapping[str, Array], path: Path) -> None:
+    """Write columns as Parquet.
+
+    Args:
+        table: Arrays of shape (N,) by name.
+        path: The file.
+
+    Raises:
+        MissingDependencyError: If pyarrow is not installed.
+    """
+    pa = load_pyarrow("writing Parquet")
+    pa.parquet.write_table(pa.table(dict(table)), path)
+
+
+def load_pyarrow(purpose: str) -> ModuleType:
+    """Return pyarrow, with its parquet loaded.
+
+    Args:
+        purpose: What it is needed for, as "reading Parquet".
+
+    Returns:
+        The package.
+
+    Raises:
+        MissingDependencyError: If it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise MissingDependencyError(purpose, "pyarrow", "parquet") from error
+    package: ModuleType = pyarrow
+    return package
+
+
+@dataclass(frozen=True)
+class _ParquetRows(RowReader):
+    """Rows of a Parquet file; see :class:`robotid.logs.table.RowReader`."""
+
+    path: Path
+
+    def count(self) -> int:
+        """Return the number of rows."""
+        with _open(self.path) as file:
+            return int(file.metadata.num_rows)
+
+    def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
+        """Yield one column; see :meth:`RowReader.scan`."""
+        row = 0
+        with _open(self.path, _BUFFER) as file:
+            _check_types(file, [name], self.path.name)
+            for group in range(file.num_row_groups):  # one by one: read ones stay in memory
+                for batch in self._batches(file, name, [group]):
+                    yield _to_numpy(batch.column(0)), Place(row)
+                    row += batch.num_rows
+
+    def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
+        """Return some rows; see :meth:`RowReader.read`."""
+        values = {name: np.empty(stop - first) for name in wanted}
+        with _open(self.path, _BUFFER) as file:
+            _check_types(file, wanted, self.path.name)
+            sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+            edges = np.cumsum([0, *sizes])
+            groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
+            for name in wanted:  # one by one: each column read holds some pages in memory
+                row = int(edges[groups[0]])
+                for batch in self._batches(file, name, groups):
+                    start, end = max(first - row, 0), min(stop - row, batch.num_rows)
+                    if start < end:
+                        part = slice(row + start - first, row + end - first)
+                        values[name][part] = _to_numpy(batch.column(0).slice(start, end - start))
+                    row += batch.num_rows
+                    if row >= stop:
+                        break
+        return values
+
+    def _batches(self, file: Any, name: str, groups: Sequence[int]) -> Iterator[Any]:  # noqa: ANN401
+        """Yield batches of rows of one column."""
+        how = {"columns": [name], "row_groups": groups, "use_threads": False}
+        batches: Iterator[Any] = file.iter_batches(_BATCH, **how)
+        return batches
+
+
+@contextmanager
+def _open(path: Path, buffer: int = 0) -> Iterator[Any]:
+    """Open a Parquet file; what is wrong with it is told in our words."""
+    pa = load_pyarrow("reading Parquet")
+    try:
+        with pa.parquet.ParquetFile(path, buffer_size=buffer) as file:
+            yield file
+    except (pa.ArrowInvalid, OSError) as error:
+        raise DataError(f"{path.name}: broken Parquet file ({error}); export it again") from error
+
+
+def _read(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
+    """Return the wanted columns of a Parquet file; null becomes NaN."""
+    with _open(path) as file:
+        _check_types(file, wanted, path.name)
+        table = file.read(columns=list(wanted))
+    return {name: _to_numpy(table.column(name)) for name in wanted}
+
+
+def _check_types(file: Any, wanted: Sequence[str], where: str) -> None:  # noqa: ANN401
+    """Refuse columns that do not hold numbers."""
+    types = load_pyarrow("reading Parquet").types
+    for name in wanted:
+        kind = file.schema_arrow.field(name).type
+        if not (types.is_integer(kind) or types.is_floating(kind)):
+            raise DataError(f"{where}: {name} holds {kind}, wanted numbers; convert it")
+
+
+def _to_numpy(column: Any) -> Array:  # noqa: ANN401
+    """Return a column of a table or of a batch; null becomes NaN."""
+    values: Array = column.to_numpy(zero_copy_only=False).astype(np.float64, copy=False)
+    return values

@@ -1,0 +1,363 @@
+"""Log files of every format: one row per sample and one column per quantity and joint.
+
+Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
+`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Aliases are read, too.
+"""
+
+import difflib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+from robotid.logs.data import Log, repeated, require_finite, require_increasing, suggestion
+from robotid.logs.formats import open_table, write_columns
+from robotid.logs.table import LogSource, Table, prefixes
+from robotid.logs.units import PER_SECOND, LogUnits, check_units
+
+__all__ = ["LogLayout", "lay_out", "read_log", "write_log"]
+
+_NOUNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque or current"}
+_SI = LogUnits()
+_WHOLE = LogSource()
+
+
+def read_log(
+    path: str | Path,
+    joints: Sequence[str],
+    *,
+    gains: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    units: LogUnits = _SI,
+    prismatic: Collection[str] = (),
+    source: LogSource = _WHOLE,
+) -> Log:
+    """Return the log in a file.
+
+    Args:
+        path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, or the folder of
+            a ROS 2 bag.
+        joints: Names of the joints wanted, in the order wanted.
+        gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
+            current with a gain is preferred to a torque column.
+        columns: Name in the file by standard name, as ``{"tau_elbow": "M2"}``, where they differ.
+        start: First time stamp kept, on the log's own clock [s].
+        end: Last time stamp kept [s].
+        units: Units of the file, if not SI.
+        prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
+        source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
+
+    Returns:
+        The log in SI units; its notes tell what was ignored.
+
+    Raises:
+        DataError: If the file does not hold what is wanted, or looks like other units.
+        SettingsError: If gains, columns or the source name what is not read.
+        MissingDependencyError: If a package that reads the file is not installed.
+    """
+    layout, table = lay_out(
+        path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic, source=source
+    )
+    log = layout.to_log(table.read(layout.wanted))
+    check_units(log, units, prismatic)
+    return log if start is None and end is None else log.window(start, end)
+
+
+@dataclass(frozen=True)
+class LogLayout:
+    """Which columns of a file make up a log, and how.
+
+    Attributes:
+        path: The file.
+        joints: Names of the joints, in the order wanted.
+        columns: Names in the file by quantity: "time", "q", "tau", and "dq" and "ddq" if complete.
+        factors: What makes each torque column a torque, by joint.
+        units: Units of the file.
+        prismatic: Names of joints that slide.
+        source: Where in the file.
+        notes: What the reader should know.
+    """
+
+    path: str
+    joints: tuple[str, ...]
+    columns: Mapping[str, Sequence[str]]
+    factors: tuple[float, ...]
+    units: LogUnits
+    prismatic: tuple[str, ...]
+    source: LogSource
+    notes: tuple[str, ...]
+
+    @property
+    def wanted(self) -> list[str]:
+        """Names of all columns to read."""
+        return [name for names in self.columns.values() for name in names]
+
+    def stamps(self, values: Array) -> Array:
+        """Return time stamps in seconds.
+
+        Args:
+            values: The time column.
+
+        Returns:
+            Its values in seconds, same shape.
+        """
+        return values / PER_SECOND[self.units.time or "s"]
+
+    def to_log(self, table: Mapping[str, Array], first: int = 0) -> Log:
+        """Return the log that columns of the file make up, in SI units.
+
+        Args:
+            table: The wanted columns by name.
+            first: Number in the file of their first row.
+
+        Returns:
+            The log.
+
+        Raises:
+            DataError: If a value is not finite, or time does not increase.
+        """
+        values = {
+            kind: np.stack([table[name] for name in names], axis=1)
+            for kind, names in self.columns.items()
+        }
+        if self.units.angle == "deg":
+            radians = [1.0 if joint in self.prismatic else np.pi / 180 for joint in self.joints]
+            turned = [kind for kind in ("q", "dq", "ddq") if kind in values]
+            values |= {kind: values[kind] * radians for kind in turned}
+        values["tau"] = values["tau"] * np.array(self.factors)
+        t = self.stamps(values["time"][:, 0])
+        for kind, array in values.items():
+            names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
+            require_finite(array, t, names, Path(self.path).name, first)
+            array.flags.writeable = False  # so that the log need not copy it
+        require_increasing(t, Path(self.path).name, first)
+        return Log(
+            t=t,
+            q=values["q"],
+            v=values.get("dq"),
+            a=values.get("ddq"),
+            tau=values["tau"],
+            joints=self.joints,
+            path=self.path,
+            notes=self.notes,
+        )
+
+
+def lay_out(
+    path: str | Path,
+    joints: Sequence[str],
+    *,
+    gains: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: LogUnits = _SI,
+    prismatic: Collection[str] = (),
+    source: LogSource = _WHOLE,
+) -> tuple[LogLayout, Table]:
+    """Return which columns of a file make up a log, before any is read.
+
+    Args:
+        path: The file.
+        joints: Names of the joints wanted, in the order wanted.
+        gains: As of :func:`read_log`.
+        columns: As of :func:`read_log`.
+        units: As of :func:`read_log`.
+        prismatic: As of :func:`read_log`.
+        source: As of :func:`read_log`.
+
+    Returns:
+        The layout and the opened table.
+
+    Raises:
+        DataError: If the file does not hold what is wanted.
+        SettingsError: If gains, columns or the source name what is not read.
+        MissingDependencyError: If a package that reads the file is not installed.
+    """
+    file = Path(path)
+    if isinstance(joints, str) or not joints:
+        raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
+    opened = open_table(file, source)
+    finder = _Finder(
+        file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, [*opened.notes]
+    )
+    found = finder.find_all()  # names of columns by kind
+    factors = finder.factors(found["tau"])
+    layout = LogLayout(
+        str(file), tuple(joints), found, tuple(factors.tolist()), units, tuple(prismatic), source,
+        tuple(finder.notes),
+    )  # fmt: skip
+    return layout, opened
+
+
+def write_log(log: Log, path: str | Path) -> None:
+    """Write a log with standard column names; reading it gives the same numbers, to the last bit.
+
+    The file is written beside its final place and then moved there: it is never half-written.
+
+    Args:
+        log: The log.
+        path: A .csv, .parquet, .npz, .h5, .hdf5 or .mat file; one that exists is replaced.
+
+    Raises:
+        DataError: If the file name ends otherwise, or the format cannot hold a name.
+        MissingDependencyError: If a package that writes the format is not installed.
+        OSError: If the folder cannot be written to.
+    """
+    write_columns(_to_table(log), Path(path))
+
+
+@dataclass(frozen=True)
+class _Finder:
+    """Finds the columns of the wanted joints among the names in a file."""
+
+    where: str
+    names: list[str]
+    columns: Mapping[str, str]
+    joints: tuple[str, ...]
+    gains: Mapping[str, float]
+    source: LogSource
+    notes: list[str] = field(default_factory=list)
+    seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
+
+    def find_all(self) -> dict[str, list[str]]:
+        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete."""
+        self._check_arguments()
+        found = {
+            "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
+            "q": [self._find_of("q", joint) or self._missing("q", joint) for joint in self.joints],
+            "tau": [self._find_torque(joint) for joint in self.joints],
+        }
+        found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
+        extra = [name for name in self.names if name not in self.seen]
+        if extra:
+            self.notes.append(f"columns ignored: {extra}")
+        if twice := repeated([name for names in found.values() for name in names]):
+            raise SettingsError(f"{self.where}: {twice} are read twice; correct columns={{...}}")
+        return found
+
+    def factors(self, torques: Sequence[str]) -> Array:
+        """Return what makes each column a torque, shape (n,): a current's gain, or 1."""
+        currents = {self._find_of("current", joint): joint for joint in self.joints}
+        return np.array([self.gains[currents[n]] if n in currents else 1.0 for n in torques])
+
+    def _check_arguments(self) -> None:
+        """Refuse names twice in the file, and gains and columns of what is not read."""
+        if twice := repeated([name for name in self.names if name]):
+            raise DataError(f"{self.where} has more than one column {twice}; rename or remove one")
+        for joint, gain in self.gains.items():
+            if joint not in self.joints:
+                raise SettingsError(
+                    f"{self.where}: a gain is given for {joint!r}, which is not among the joints "
+                    f"read: {list(self.joints)}{suggestion(joint, self.joints)}"
+                )
+            if not np.isfinite(gain) or gain == 0:
+                raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
+        for joint in self.source.joints:
+            if joint not in self.joints:
+                raise SettingsError(
+                    f"{self.where}: log.joints renames {joint!r}, which is not among the joints "
+                    f"read: {list(self.joints)}{suggestion(joint, self.joints)}"
+                )
+        known = ["time", *(f"{kind}_{joint}" for kind in prefixes() for joint in self.joints)]
+        for standard, name in self.columns.items():
+            if standard not in known:
+                raise SettingsError(
+                    f"columns: {standard!r} is not the standard name of a column that is read, "
+                    f"as 'time' or 'tau_{self.joints[0]}'{suggestion(standard, known)}"
+                )
+            if name not in self.names:
+                raise DataError(
+                    f"{self.where} has no column {name!r}, which columns gives for {standard!r}; "
+                    f"columns found: {self.names}{suggestion(name, self.names)}"
+                )
+
+    def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
+        """Return the column of one quantity, or None."""
+        found = [a for a in aliases if a in self.names and a not in self.columns.values()]
+        if standard in self.columns:
+            found = [self.columns[standard]]
+        if len(found) > 1:
+            raise DataError(
+                f"{self.where} has {found[0]!r} and {found[1]!r}, two names of the same quantity; "
+                f"remove one, or pass columns={{{standard!r}: ...}}"
+            )
+        self.seen.update(found)
+        return found[0] if found else None
+
+    def _find_of(self, kind: str, joint: str) -> str | None:
+        """Return the column of one quantity of one joint, or None."""
+        named = self.source.joints.get(joint, joint)
+        return self._find(f"{kind}_{joint}", [prefix + named for prefix in self._prefixes()[kind]])
+
+    def _prefixes(self) -> dict[str, tuple[str, ...]]:
+        """Return how columns start, by quantity."""
+        return prefixes(self.source.effort)
+
+    def _find_torque(self, joint: str) -> str:
+        """Return the column of a joint's torque, or of its current if that has a gain."""
+        tau, current = self._find_of("tau", joint), self._find_of("current", joint)
+        has_gain = joint in self.gains
+        if tau and current:
+            used, unused = (current, tau) if has_gain else (tau, current)
+            self.notes.append(
+                f"{unused} ignored: {used} is read ({'a' if has_gain else 'no'} gain)"
+            )
+            return used
+        if tau and has_gain:
+            self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
+        if current and not has_gain:
+            raise DataError(
+                f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
+                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains; "
+                f"CLI --gain {joint}=...)",
+                code="missing_gain",
+            )
+        return tau or current or self._missing("tau", joint)
+
+    def _find_optional(self, kind: str) -> list[str]:
+        """Return the columns of a quantity that every joint has; none if some joint lacks it."""
+        found = {joint: self._find_of(kind, joint) for joint in self.joints}
+        names = [name for name in found.values() if name]
+        without = [joint for joint, name in found.items() if not name]
+        if names and without:
+            self.notes.append(f"{names} ignored: {without} have no {_NOUNS[kind]}")
+        return [] if without else names
+
+    def _missing(self, kind: str, joint: str) -> str:
+        """Refuse a file without a column, naming those of its kind and the nearest."""
+        standard = f"{kind}_{joint}" if joint else kind
+        noun = f"{_NOUNS[kind]} columns" if joint else "columns"
+        known = self._prefixes()
+        starts = (*known.get(kind, ("",)), *(known["current"] if kind == "tau" else ()))
+        named = self.source.joints.get(joint, joint)
+        others = {self.source.joints.get(other, other) for other in self.joints}
+        found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
+        for name in self.names:
+            for prefix in [prefix for prefix in starts if name.startswith(prefix)]:
+                found.append(name)
+                if name[len(prefix) :] not in others:
+                    ends[name[len(prefix) :]] = name
+        nearest = difflib.get_close_matches(named or kind, ends, n=1)
+        sought = f"{kind}_{named}" if joint else kind
+        leave_out = (
+            f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
+        )
+        near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
+        raise DataError(
+            f"{self.where} has no column {sought!r}; {noun} found: {found}. {hint.format(near)}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}",
+            code="missing_column",
+        )
+
+
+def _to_table(log: Log) -> dict[str, Array]:
+    """Return the columns of a log by standard name."""
+    table = {"time": log.t}
+    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
+        if values is not None:
+            table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    return table

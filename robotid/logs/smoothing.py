@@ -1,0 +1,263 @@
+"""Smooth motion of stretches without gaps, of whole ones or part by part.
+
+A part is resampled and filtered with rows around its own, which are cut off behind the filter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.logs.data import Log, Trajectory
+from robotid.logs.friction_direction import acting_directions
+from robotid.logs.settings import SignalSettings
+
+__all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"]
+
+#: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
+SPLINE = 64
+_FORGOTTEN = 42.0  # e-folds after which nothing is left of a filter's transient: 6e-19
+_LONGEST = 8.0  # periods of the filter: what is slow for longer is not taken to stick
+_ALL = slice(None)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A stretch of a log without a gap.
+
+    Attributes:
+        first: Its first row.
+        stop: The row after its last one.
+        start: Time stamp of its first row [s].
+        end: Time stamp of its last row [s].
+        number: Number of the stretch.
+    """
+
+    first: int
+    stop: int
+    start: float
+    end: float
+    number: int = 0
+
+    @property
+    def rows(self) -> int:
+        """Number of its rows."""
+        return self.stop - self.first
+
+
+def process_stretches(
+    log: Log,
+    stretches: Sequence[Stretch],
+    settings: SignalSettings,
+    *,
+    first: int = 0,
+    own: slice = _ALL,
+    speeds: Array | None = None,
+) -> Trajectory:
+    """Return the smooth motion of uninterrupted stretches, or of a part of them.
+
+    A part is as smooth as if the whole had been processed, if the log has the rows of its
+    stretches that are within :func:`filter_reach` of its own rows.
+
+    Args:
+        log: Rows of the stretches, all of them or a part.
+        stretches: The whole stretches, in order.
+        settings: The settings, resolved.
+        first: Row number that the log's first row has in the stretches.
+        own: Rows wanted, numbered as in the stretches; the log must have the row that follows.
+        speeds: Ratios of the speeds that Coulomb friction follows to those of the joints, shape
+            (c, n), as of :func:`robotid.regressor.columns.friction_speeds`.
+
+    Returns:
+        The trajectory, of no samples if no stretch is long enough; the segment numbers of its
+        samples are those of their stretches. Its directions are those that Coulomb friction acts
+        in, behind the filter of the torque: None without speeds, and where they are plain signs.
+    """
+    n = len(log.joints)
+    is_sharp = settings.cutoff is None and settings.friction_band == 0
+    ratios = np.empty((0, n)) if speeds is None or is_sharp else speeds
+    parts, counts = [], []
+    for stretch in stretches:
+        rows = slice(max(stretch.first - first, 0), min(stretch.stop - first, len(log.t)))
+        part = _process_part(log, rows, stretch, settings, first, own, ratios)
+        counts.append(0 if part is None else len(part[0]))
+        parts += [] if part is None else [part]
+    nothing = (np.empty(0), *[np.empty((0, n))] * 4, np.empty((0, len(ratios))))
+    t, q, v, a, tau, direction = (np.concatenate(x) for x in zip(nothing, *parts, strict=True))
+    return Trajectory(
+        t=t, q=q, v=v, a=a, tau=tau, joints=log.joints, rate=settings.rate,
+        segment=np.repeat([stretch.number for stretch in stretches], counts),
+        direction=direction if len(ratios) else None,
+    )  # fmt: skip
+
+
+def filter_reach(settings: SignalSettings) -> float:
+    """Return how long before and after a row others have a say in its smooth value [s].
+
+    That is more than twice as far as the filter reaches: the sign of a smooth speed depends on how
+    long a drive may stick, and is filtered once more.
+
+    Args:
+        settings: The settings, resolved.
+
+    Returns:
+        The time, delays included; some rows must be added to it for splines and differences.
+    """
+    late = max(abs(settings.torque_delay), abs(settings.velocity_delay))
+    if settings.cutoff is None or settings.rate is None:
+        return late
+    from scipy.signal import butter
+
+    order, cutoff, rate = settings.order, settings.cutoff, settings.rate
+    poles = butter(order, cutoff, fs=rate, output="zpk")[1]
+    digital = 1 / (-np.log(np.abs(poles).max()) * rate)
+    analog = 1 / (2 * np.pi * cutoff * np.sin(np.pi / (2 * order)))  # on a finer grid
+    return late + 2.0 * _FORGOTTEN * float(max(digital, analog)) + _LONGEST / cutoff
+
+
+def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError:
+    """Return the error of a log without a stretch that is long enough.
+
+    Args:
+        where: What the log is called.
+        stretches: How many uninterrupted stretches it has.
+        settings: The settings.
+
+    Returns:
+        The error.
+    """
+    return DataError(
+        f"{where}: none of its {stretches} uninterrupted stretches is long "
+        f"enough for the filter and a trim of {settings.trim:g} s at each end; record longer, "
+        "or lower trim",
+        code="too_short",
+    )
+
+
+def _process_part(
+    log: Log,
+    rows: slice,
+    stretch: Stretch,
+    settings: SignalSettings,
+    first: int,
+    own: slice,
+    speeds: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array] | None:
+    """Return t, q, v, a, tau and direction of the own rows, None if none is left."""
+    t = log.t[rows]
+    if stretch.rows < 5 or stretch.end - stretch.start <= 2 * settings.trim:
+        return None
+    grid = _Grid.of(stretch, settings)
+    if grid.count < 5:
+        return None
+    local = rows.start + first - stretch.first  # number in the stretch of the first row here
+    numbers = grid.numbers(t, local, is_last=rows.stop + first == stretch.stop)
+    times = t if grid.step is None else grid.at(numbers)
+    channels = {"q": log.q, "tau": log.tau}
+    if settings.velocity == "measured" and log.v is not None:
+        channels["v"] = log.v
+    if settings.acceleration == "measured" and log.a is not None:
+        channels["a"] = log.a
+    late = {"tau": settings.torque_delay, "v": settings.velocity_delay}
+    smooth = {
+        name: _filter(_resample(t - late.get(name, 0.0), x[rows], times), grid, settings)
+        for name, x in channels.items()
+    }
+    v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
+    a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
+    # through the torque's filter before any row is left out
+    direction = _filter(_acting(times, v @ speeds.T, settings), grid, settings)
+    inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
+    if grid.keep_every > 1:
+        inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
+    if own.start is not None and own.start > stretch.first:
+        inside &= times >= log.t[own.start - first]
+    if own.stop is not None and own.stop < stretch.stop:
+        inside &= times < log.t[own.stop - first]
+    kept = np.flatnonzero(inside)
+    if len(kept) == 0:
+        return None
+    q, tau = smooth["q"][kept], smooth["tau"][kept]
+    return times[kept], q, v[kept], a[kept], tau, direction[kept]
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The times that a stretch is filtered on: ``count`` points, every so many of them kept.
+
+    Without a step, they are the rows as recorded.
+    """
+
+    start: float
+    last: float
+    step: float | None
+    count: int
+    keep_every: int = 1
+
+    @classmethod
+    def of(cls, stretch: Stretch, settings: SignalSettings) -> "_Grid":
+        """Return the grid of a whole stretch."""
+        if settings.rate is None:
+            return cls(stretch.start, stretch.end, None, stretch.rows)
+        native = (stretch.rows - 1) / (stretch.end - stretch.start)
+        # a rate below the log's is reached by decimation after the filter, against aliasing
+        keep_every = max(1, round(native / settings.rate)) if settings.cutoff is not None else 1
+        step = 1.0 / (settings.rate * keep_every)
+        count = int(np.floor((stretch.end - stretch.start) / step * (1 + 1e-12))) + 1
+        return cls(stretch.start, stretch.start + step * (count - 1), step, count, keep_every)
+
+    @property
+    def rate(self) -> float:
+        """Points per second."""
+        return (self.count - 1) / (self.last - self.start)
+
+    def at(self, numbers: Array) -> Array:
+        """Return the times of some points."""
+        times: Array = self.start + (self.step or 0.0) * numbers
+        return times
+
+    def number_of(self, t: float) -> int:
+        """Return the first point that is not before t."""
+        k = np.arange(-2, 3) + round((t - self.start) / (self.step or 1.0))
+        return int(k[np.argmax(self.at(k) >= t)])
+
+    def numbers(self, t: Array, first: int, *, is_last: bool) -> Array:
+        """Return the points among rows t, numbered from ``first``, of the stretch."""
+        if self.step is None:
+            return np.arange(first, first + len(t))
+        start = 0 if first == 0 else self.number_of(float(t[0]))
+        return np.arange(start, self.count if is_last else self.number_of(float(t[-1])))
+
+
+def _acting(t: Array, w: Array, settings: SignalSettings) -> Array:
+    """Return the direction that Coulomb friction acts in, before any filter."""
+    if settings.friction_band > 0:
+        linear: Array = np.clip(w / settings.friction_band, -1.0, 1.0)
+        return linear
+    longest = _LONGEST / (settings.cutoff or np.inf)
+    return acting_directions(t, w, settings.min_velocity, longest)
+
+
+def _resample(t: Array, values: Array, grid: Array) -> Array:
+    """Return the values on the grid, by cubic splines through the true time stamps."""
+    if len(grid) == len(t) and np.array_equal(grid, t):
+        return values
+    from scipy.interpolate import CubicSpline
+
+    # of a channel moved in time nothing is known beyond its own ends
+    resampled: Array = CubicSpline(t, values, axis=0)(np.clip(grid, t[0], t[-1]))
+    return resampled
+
+
+def _filter(values: Array, grid: _Grid, settings: SignalSettings) -> Array:
+    """Return the values after a zero-phase Butterworth filter."""
+    if settings.cutoff is None:
+        return values
+    from scipy.signal import butter, sosfiltfilt
+
+    sos = butter(settings.order, settings.cutoff, fs=grid.rate, output="sos")
+    pad = min(len(values) - 1, int(2 * grid.rate / settings.cutoff))  # two periods
+    filtered: Array = sosfiltfilt(sos, values.T, axis=1, padlen=pad).T
+    return filtered

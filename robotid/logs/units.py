@@ -1,0 +1,183 @@
+"""Units of a log: stated, or suspected and refused; never guessed."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+from robotid.logs.data import Log
+
+__all__ = ["PER_SECOND", "LogUnits", "check_reach", "check_units"]
+
+#: Divisors that turn a time unit into seconds.
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_DEGREES = 180 / np.pi  # degrees in a radian
+_SLOWEST = 0.1  # [s] a longer median step is taken for another unit
+_FARTHEST = 4 * np.pi  # [rad] joints beyond two turns are taken for degrees
+_STRETCH = 0.1  # [s] motion is compared over stretches this long: noise and jitter average out
+_GAP = 5  # a step longer than this many median steps is a gap
+_ALIKE = 0.9  # correlation from which two signals are one but for a factor
+_NEAR = 0.1  # relative tolerance on that factor
+
+
+@dataclass(frozen=True)
+class LogUnits:
+    """Units of a log file; None means SI, and is refused if the numbers look otherwise.
+
+    Attributes:
+        time: Unit of the time stamps: "s", "ms", "us" or "ns". Velocities stay per second.
+        angle: Unit of q, dq and ddq of joints that turn: "rad" or "deg".
+    """
+
+    time: str | None = None
+    angle: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, known in (("time", list(PER_SECOND)), ("angle", ["rad", "deg"])):
+            value = getattr(self, name)
+            if value is not None and value not in known:
+                raise SettingsError(f"units: {name} is {value!r}, wanted one of {known}")
+
+
+def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
+    """Refuse a log whose numbers look like another unit than SI, unless the unit was stated.
+
+    The measured velocity is compared with the position over short stretches: the factor between
+    the integral of dq and the change of q is 1 if both are in SI units.
+
+    Args:
+        log: The log.
+        units: The units that were stated; what is stated is not suspected.
+        prismatic: Names of the joints that slide; the others turn.
+
+    Raises:
+        DataError: If time, angle or the sign of the velocity is suspect.
+    """
+    where = Path(log.path).name or "log"
+    turns = np.array([name not in prismatic for name in log.joints])
+    factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
+    if units.time is None:
+        _check_step(float(np.median(np.diff(log.t))), where)
+        _check_clock(log, factor, where)
+    if units.angle is None:
+        check_reach(log, units, prismatic)
+        _check_degrees(log, np.where(turns, factor, np.nan), where)
+    for j in np.flatnonzero(_is_near(factor, -1.0)):
+        raise DataError(
+            f"{where}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of q_{log.joints[j]}. "
+            "Negate one of them in the recording, or leave the dq columns out",
+            code="velocity_sign",
+        )
+
+
+def _check_step(step: float, where: str) -> None:
+    """Refuse a median time step that is too long for seconds."""
+    if step <= _SLOWEST * (1 + 1e-6):
+        return
+    unit = "ms" if step <= 1e2 else "us" if step <= 1e5 else "ns"
+    raise DataError(
+        f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]} "
+        f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
+        f"{_how_to_state('time', unit, 's')}",
+        code="time_unit",
+    )
+
+
+def _check_clock(log: Log, factor: Array, where: str) -> None:
+    """Refuse time stamps that make the measured velocity wrong by a power of 1000."""
+    for power, unit in ((1, "ms"), (2, "us"), (3, "ns"), (-1, "s"), (-2, "s"), (-3, "s")):
+        for j in np.flatnonzero(_is_near(np.abs(factor), 1000.0**power)):
+            looks = f"; the time looks like {_TIME_NAMES[unit]}" if power > 0 else ""
+            raise DataError(
+                f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt{looks}. "
+                f"{_how_to_state('time', unit, 's')}",
+                code="time_unit",
+            )
+
+
+def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
+    """Refuse joints that turn too far for radians, unless the unit was stated.
+
+    Args:
+        log: The log, or rows of it.
+        units: The units that were stated.
+        prismatic: Names of the joints that slide.
+
+    Raises:
+        DataError: If a joint turns too far.
+    """
+    if units.angle is not None:
+        return
+    turns = np.array([name not in prismatic for name in log.joints])
+    reach = np.where(turns, np.abs(log.q).max(axis=0), 0.0)  # (n,)
+    j = int(np.argmax(reach))
+    if reach[j] > _FARTHEST:
+        raise DataError(
+            f"{Path(log.path).name or 'log'}: q_{log.joints[j]} reaches {reach[j]:.4g}, which "
+            f"looks like degrees (in radians {reach[j] / (2 * np.pi):.1f} turns). "
+            f"{_how_to_state('angle', 'deg', 'rad')}",
+            code="angle_unit",
+        )
+
+
+def _check_degrees(log: Log, factor: Array, where: str) -> None:
+    """Refuse joints of which only one of position and velocity is in degrees."""
+    for wrong, ratio in (("velocity", _DEGREES), ("position", 1 / _DEGREES)):
+        for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
+            raise DataError(
+                f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the {wrong} "
+                "looks like degrees, the other like radians. Convert one of them in the recording. "
+                f"{_how_to_state('angle', 'deg', 'rad', both=True)}",
+                code="angle_unit",
+            )
+
+
+def _how_to_state(kind: str, unit: str, si: str, both: bool = False) -> str:
+    """Return how to state a unit, in the job file, on the command line and in Python."""
+    stated = si if both else unit
+    ways = (
+        f'units {kind} = "{stated}" (job file table [units], CLI --{kind}-unit {stated}, '
+        f'Python units=LogUnits({kind}="{stated}"))'
+    )
+    if stated == si:
+        return f"To read it as it is, state {ways}"
+    return f'State {ways}, or likewise "{si}" if that is right'
+
+
+def _velocity_factor(log: Log) -> Array:
+    """Return f with dq = f d(q)/dt for each joint, shape (n,); NaN where they are not alike."""
+    factor = np.full(len(log.joints), np.nan)
+    if log.v is None:
+        return factor
+    dt = np.diff(log.t)
+    median = float(np.median(dt))
+    length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
+    for j, (q, v) in enumerate(zip(log.q.T, log.v.T, strict=True)):
+        step = np.diff(q)
+        jump = _is_near(np.abs(step), 2 * np.pi) | _is_near(np.abs(step), 360.0)  # a full turn
+        broken = (dt > _GAP * median) | jump
+        moved = _sums(np.where(broken, 0.0, step), length)
+        swept = _sums(np.where(broken, 0.0, dt * (v[1:] + v[:-1]) / 2), length)
+        both = float(moved @ swept)
+        size = float(np.sqrt((moved @ moved) * (swept @ swept)))
+        if len(dt) >= 10 and abs(both) > _ALIKE * size:
+            factor[j] = np.copysign(np.sqrt((swept @ swept) / (moved @ moved)), both)
+    return factor
+
+
+def _sums(steps: Array, length: int) -> Array:
+    """Return the sums over each stretch of so many consecutive steps."""
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    sums: Array = total[length:] - total[:-length]
+    return sums
+
+
+def _is_near(values: Array, wanted: float) -> NDArray[np.bool_]:
+    """Return which values are within the tolerance of the one wanted."""
+    near: NDArray[np.bool_] = np.abs(values / wanted - 1) < _NEAR
+    return near

@@ -1,0 +1,3 @@
+"""Identification while the robot moves."""
+
+__all__: list[str] = []

@@ -1,0 +1,155 @@
+"""What the paper's errata amount to: in torque, and in energy that the printed arm invents."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.paper.dynamics import LinearPlant, mass_matrix
+from robotid.paper.planar_2r import (
+    PAPER_LINKS,
+    PAPER_PARAMETERS,
+    parameters,
+    printed_velocity_coefficient,
+    regressor,
+)
+from robotid.paper.study import AMPLITUDE, DURATION, MODELS, paper_arm
+from robotid.simulation.program import ProgramMotion
+
+__all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
+
+_STATES = 2000
+_REACH = (np.pi, 10.0, 20.0)  # [rad], [rad/s], [rad/s^2] of the random states
+_FREE = (np.array([[0.0, 1.0]]), np.array([[1.0, 2.0]]))  # [rad], [rad/s] start of free motion
+
+
+@dataclass(frozen=True)
+class Erratum:
+    """One place where the printed text is wrong.
+
+    Attributes:
+        where: The equation.
+        printed: What it says.
+        corrected: What it must say.
+        anywhere: Largest torque difference over random states [N m].
+        on_program: Largest torque difference along the program motion [N m].
+    """
+
+    where: str
+    printed: str
+    corrected: str
+    anywhere: float
+    on_program: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry of paper.json.
+
+        Returns:
+            Where, printed, corrected and the two torque differences.
+        """
+        return {
+            "where": self.where,
+            "printed": self.printed,
+            "corrected": self.corrected,
+            "max_torque_difference": self.anywhere,
+            "max_torque_difference_on_program": self.on_program,
+        }
+
+
+@dataclass(frozen=True)
+class EnergyDrift:
+    """Kinetic energy of the arm when no torque acts on it.
+
+    Attributes:
+        t: Times, shape (N,) [s].
+        energy: Per model, shape (N,) [J].
+    """
+
+    t: Array
+    energy: dict[str, Array]
+
+    def relative(self, name: str) -> Array:
+        """Return the energy gained since the start as a share of the energy then.
+
+        Args:
+            name: Name of the model.
+
+        Returns:
+            Shares, shape (N,).
+        """
+        energy = self.energy[name]
+        gained: Array = energy / energy[0] - 1.0
+        return gained
+
+
+def errata(rng: np.random.Generator) -> list[Erratum]:
+    """Return the errata that change a torque, each with the largest difference it makes.
+
+    Args:
+        rng: Source of the random states: q within pi rad, v within 10 rad/s, a within 20 rad/s^2.
+
+    Returns:
+        The errata of (26), of G, of (27) and of (23).
+    """
+    somewhere = tuple(reach * rng.uniform(-1, 1, (_STATES, 2)) for reach in _REACH)
+    program = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(np.linspace(0, DURATION, 401))
+    largest = [
+        [float(np.abs(difference).max()) for difference in _differences(*states)]
+        for states in (somewhere, program)
+    ]
+    texts = [
+        ("(26)", "C122 = C211 = h, C112 undefined", "C122 = −h, C211 = h, C112 = −2h"),
+        ("G, column 4", "[s₂ q̇₁²; −s₂ q̇₂²]", "[−s₂ q̇₂²; s₂ q̇₁²]"),
+        ("(27), p4", "p4 = L₁ m₂ȳ₂ + L₁ L₂ m₂", "p4 = L₁ m₂x̄₂ + L₁ L₂ m₂ = p3"),
+        ("(23), read as a torque residual at P̂ = P", "ΨᵀΨP̂ + Ψᵀu", "ΨᵀΨP̂ − Ψᵀu"),
+    ]
+    return [Erratum(*text, *sizes) for text, *sizes in zip(texts, *largest, strict=True)]
+
+
+def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
+    """Return the energy of each model in free motion, which a rigid arm keeps.
+
+    Args:
+        duration: Length of the motion [s].
+        dt: Step of the integration, Runge-Kutta of order 4 [s].
+
+    Returns:
+        Times and energies.
+    """
+    t = dt * np.arange(round(duration / dt) + 1)
+    return EnergyDrift(t, {name: _free_energy(name, len(t), dt) for name in MODELS})
+
+
+def _differences(q: Array, v: Array, a: Array) -> list[Array]:
+    """Return the torque that each erratum adds at N states, each shape (N, 2)."""
+    P = parameters(PAPER_LINKS)
+    five = parameters(PAPER_LINKS, form="corrected_five")
+    h = np.array([printed_velocity_coefficient(q_k, PAPER_LINKS) for q_k in q])
+    v1, v2 = v.T
+    missing = np.stack([2 * h * v2 * (v1 + v2), np.zeros(len(q))], axis=1)  # printed - corrected
+    G, G_printed = (regressor(q, v, a, form=form) for form in ("corrected_five", "printed"))
+    swapped = (G_printed - G) @ five
+    p4 = G_printed @ (PAPER_PARAMETERS - five)
+    residual = 2 * (regressor(q, v, a) @ P)  # Psi P + u, where it should be Psi P - u = 0
+    return [missing, swapped, p4, residual]
+
+
+def _free_energy(name: str, steps: int, h: float) -> Array:
+    dynamics, P = paper_arm(name)
+    plant, (q, v), nothing = LinearPlant(dynamics, P), _FREE, np.zeros((1, 2))
+    states = []
+    for _ in range(steps):
+        states.append((q[0], v[0]))
+        a1 = plant.acceleration(q, v, nothing)
+        v2 = v + h / 2 * a1
+        a2 = plant.acceleration(q + h / 2 * v, v2, nothing)
+        v3 = v + h / 2 * a2
+        a3 = plant.acceleration(q + h / 2 * v2, v3, nothing)
+        v4 = v + h * a3
+        a4 = plant.acceleration(q + h * v3, v4, nothing)
+        q, v = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    angles, speeds = (np.array(part) for part in zip(*states, strict=True))
+    D = mass_matrix(dynamics, angles, P)
+    energy: Array = np.einsum("ki,kij,kj->k", speeds, D, speeds) / 2
+    return energy

@@ -1,0 +1,302 @@
+"""The paper's planar two-joint arm in closed form, as printed and as mechanics has it.
+
+Its axes are vertical, so gravity does no work; at q = 0 it is stretched along x. The form
+``"printed"`` keeps three errata of the paper (Tzvetkova), the other forms mend them:
+
+1. (26) gives C122 = C211 = h and no C112, where h = L1 s2 (L2 m2 + m2 xbar2) + L1 c2 m2 ybar2;
+   mechanics gives C122 = -h, C211 = h, C112 = -2 h.
+2. Column 4 of G has its rows swapped: [s2 v1^2, -s2 v2^2] instead of [-s2 v2^2, s2 v1^2].
+3. (27) gives p4 = L1 (m2 ybar2) + L1 L2 m2, but column 4 needs L1 (m2 xbar2) + L1 L2 m2 = p3.
+   Columns 3 and 4 then act as their sum: the arm has four base parameters, not five.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.simulation.program import ProgramMotion
+
+__all__ = [
+    "PAPER_LINKS",
+    "PAPER_PARAMETERS",
+    "PARAMETER_NAMES",
+    "Form",
+    "PlanarLinks",
+    "mass_matrix",
+    "parameters",
+    "printed_velocity_coefficient",
+    "program_motion",
+    "regressor",
+    "urdf_text",
+    "velocity_vector",
+]
+
+#: As printed; errata 1 to 3 mended but p3 and p4 kept apart; columns 3 and 4 added up.
+Form: TypeAlias = Literal["printed", "corrected_five", "corrected"]
+#: Names of the c parameters of each form.
+PARAMETER_NAMES: dict[Form, tuple[str, ...]] = {
+    "printed": ("p1", "p2", "p3", "p4", "p5"),
+    "corrected_five": ("p1", "p2", "p3", "p4", "p5"),
+    "corrected": ("p1", "p2", "p3", "p5"),
+}
+
+#: The paper's steady state (figure 5) [kg m^2]; as p3 != p4, no five-column G conserves energy.
+PAPER_PARAMETERS: Array = np.array([22.0, 5.0, 3.0, 2.0, 0.1])
+PAPER_PARAMETERS.setflags(write=False)
+
+_BODY = """\
+  <joint name="joint_{i}" type="revolute">
+    <parent link="{parent}"/> <child link="link_{i}"/>
+    <origin xyz="{length!r} 0 0" rpy="0 0 0"/>
+    <axis xyz="0 0 1"/>
+    <limit lower="-3.0" upper="3.0" velocity="5.0" effort="500.0"/>
+  </joint>
+  <link name="link_{i}">
+    <inertial>
+      <origin xyz="{x!r} {y!r} 0" rpy="0 0 0"/>
+      <mass value="{m!r}"/>
+      <inertia ixx="{Ixx!r}" ixy="0" ixz="0" iyy="{Iyy!r}" iyz="0" izz="{Izz!r}"/>
+    </inertial>
+  </link>
+"""
+
+
+@dataclass(frozen=True)
+class PlanarLinks:
+    """The two links; frame O_i sits at the distal end of link i, so xbar < 0 is between its ends.
+
+    Attributes:
+        L1, L2: Lengths [m].
+        m1, m2: Masses [kg].
+        xbar1, xbar2, ybar1, ybar2: Centre of mass from O_i, along and across the link [m].
+        Izz1, Izz2: Inertia about the vertical axis through O_i, not the centre of mass [kg m^2].
+    """
+
+    L1: float
+    L2: float
+    m1: float
+    xbar1: float
+    ybar1: float
+    Izz1: float
+    m2: float
+    xbar2: float
+    ybar2: float
+    Izz2: float
+
+    def __post_init__(self) -> None:
+        if not all(0 < x < np.inf for x in (self.L1, self.L2, self.m1, self.m2, *self.central)):
+            inertias = f"inertias about the centres of mass {self.central}"
+            raise ModelError(f"lengths, masses and {inertias} must be positive: {self}")
+
+    @property
+    def central(self) -> tuple[float, float]:
+        """Inertia of each link about the vertical axis through its centre of mass [kg m^2]."""
+        Izz1 = self.Izz1 - self.m1 * (self.xbar1**2 + self.ybar1**2)
+        Izz2 = self.Izz2 - self.m2 * (self.xbar2**2 + self.ybar2**2)
+        return Izz1, Izz2
+
+
+#: A physically possible arm for which (27) as printed gives exactly ``PAPER_PARAMETERS``.
+PAPER_LINKS = PlanarLinks(1.0, 1.0, 10.0, -0.5, 0.0, 20.1, 1.9, 1.1 / 1.9, 0.1 / 1.9, 0.9)
+
+
+def parameters(links: PlanarLinks, *, form: Form = "corrected") -> Array:
+    """Return the parameters P of an arm.
+
+    Args:
+        links: Lengths and inertia of the links.
+        form: ``"printed"`` takes p4 as (27) has it, ``"corrected_five"`` takes p4 = p3.
+
+    Returns:
+        Parameters, shape (c,) [kg m^2], in the order of ``PARAMETER_NAMES[form]``.
+
+    Raises:
+        SettingsError: If there is no such form.
+
+    References:
+        Tzvetkova, (27).
+    """
+    _check_form(form)
+    L1, L2, m1, m2 = links.L1, links.L2, links.m1, links.m2
+    m1x, m2x, m2y = m1 * links.xbar1, m2 * links.xbar2, m2 * links.ybar2  # [kg m]
+    p1 = links.Izz1 + 2 * L1 * m1x + L1**2 * m1 + L1**2 * m2
+    p2 = links.Izz2 + 2 * L2 * m2x + L2**2 * m2
+    p3 = L1 * m2x + L1 * L2 * m2
+    p4 = L1 * m2y + L1 * L2 * m2 if form == "printed" else p3  # erratum 3
+    p5 = L1 * m2y
+    return np.array([p1, p2, p3, p5] if form == "corrected" else [p1, p2, p3, p4, p5])
+
+
+def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Array:
+    """Return the regressor G(q, v, a), with which G P = u.
+
+    Args:
+        q: Joint angles, shape (..., 2) [rad].
+        v: Joint velocities, shape (..., 2) [rad/s].
+        a: Joint accelerations, shape (..., 2) [rad/s^2].
+        form: Which of the three regressors.
+
+    Returns:
+        Regressor, shape (..., 2, c) [1/s^2].
+
+    Raises:
+        DataError: If q, v or a does not have two entries.
+        SettingsError: If there is no such form.
+
+    References:
+        Tzvetkova, (13) and the matrix G that stands before (27).
+    """
+    _check_form(form)
+    (_, q2), (v1, v2), (a1, a2) = _pair("q", q), _pair("v", v), _pair("a", a)
+    c2, s2, a12, v12 = np.cos(q2), np.sin(q2), 2 * a1 + a2, v2**2 + 2 * v1 * v2
+    row1 = [a1, a1 + a2, c2 * a12 - 2 * s2 * v1 * v2, -s2 * v2**2, -s2 * a12 - c2 * v12]
+    row2 = [0.0, a1 + a2, c2 * a1, s2 * v1**2, -s2 * a1 + c2 * v1**2]
+    if form == "printed":
+        row1[3], row2[3] = row2[3], row1[3]  # erratum 2
+    if form == "corrected":
+        row1[2:4], row2[2:4] = [row1[2] + row1[3]], [row2[2] + row2[3]]
+    G = np.empty((*np.shape(row1[2]), 2, len(row1)))
+    for column, pair in enumerate(zip(row1, row2, strict=True)):
+        G[..., 0, column], G[..., 1, column] = pair
+    return G
+
+
+def mass_matrix(q: Array, P: Array, *, form: Form = "corrected") -> Array:
+    """Return the mass matrix D(q, P), with the columns G(q, 0, e_j) P; none depends on p4.
+
+    Args:
+        q: Joint angles, shape (2,) [rad].
+        P: Parameters, shape (c,) [kg m^2].
+        form: Which of the three regressors P belongs to.
+
+    Returns:
+        Mass matrix, shape (2, 2) [kg m^2].
+
+    Raises:
+        DataError: If q does not have two entries, or P not c.
+        SettingsError: If there is no such form.
+
+    References:
+        Tzvetkova, (11) and (26), where "Ixx + Iyy" means second moments of mass, that is Izz.
+    """
+    M = np.stack([regressor(q, 0 * e_j, e_j, form=form) for e_j in np.eye(2)], axis=1)  # (2, 2, c)
+    return np.asarray(M @ _vector("P", P, len(PARAMETER_NAMES[form])))
+
+
+def velocity_vector(q: Array, v: Array, P: Array, *, form: Form = "corrected") -> Array:
+    """Return the centrifugal and Coriolis torques of (11), C(q, v, P) = G(q, v, 0) P.
+
+    Args:
+        q: Joint angles, shape (2,) [rad].
+        v: Joint velocities, shape (2,) [rad/s].
+        P: Parameters, shape (c,) [kg m^2].
+        form: Which of the three regressors P belongs to.
+
+    Returns:
+        Torques, shape (2,) [N m].
+
+    Raises:
+        DataError: If q or v does not have two entries, or P not c.
+        SettingsError: If there is no such form.
+
+    References:
+        Tzvetkova, (11); the printed G disagrees with (26) too.
+    """
+    G = regressor(q, v, np.zeros(2), form=form)  # (2, c)
+    return np.asarray(G @ _vector("P", P, len(PARAMETER_NAMES[form])))
+
+
+def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> float:
+    """Return h of erratum 1, which (26) prints for both C122 and C211.
+
+    Args:
+        q: Joint angles, shape (2,) [rad].
+        links: Lengths and inertia of the links.
+
+    Returns:
+        The coefficient [kg m^2].
+
+    Raises:
+        DataError: If q does not have two entries.
+
+    References:
+        Tzvetkova, (26).
+    """
+    _, q2 = _vector("q", q, 2)
+    along, across = links.L2 * links.m2 + links.m2 * links.xbar2, links.m2 * links.ybar2  # [kg m]
+    return float(links.L1 * (np.sin(q2) * along + np.cos(q2) * across))
+
+
+def program_motion(
+    t: Array | float, amplitude: Array, duration: float
+) -> tuple[Array, Array, Array]:
+    """Return the program motion q(t) = A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
+
+    The coefficients a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 take q from 0 to A and leave no
+    velocity and no acceleration at either end. Before 0 and after T the arm rests.
+
+    Args:
+        t: Times, any shape, as () or (N,) [s].
+        amplitude: A, the angle each joint moves through, shape (2,) [rad].
+        duration: T [s].
+
+    Returns:
+        q [rad], v [rad/s] and a [rad/s^2], each of the shape of t with an axis of 2 behind.
+
+    Raises:
+        DataError: If the amplitude does not have two entries.
+        SettingsError: If the duration is not a positive number.
+
+    References:
+        Tzvetkova, (28).
+    """
+    return ProgramMotion(_vector("amplitude", amplitude, 2), duration).evaluate(t)
+
+
+def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:
+    """Return the arm as URDF, in the frames of the joints and with every digit kept.
+
+    Args:
+        links: Lengths and inertia of the links.
+
+    Returns:
+        XML with links base_link, link_1, link_2 and joints joint_1, joint_2.
+
+    References:
+        Tzvetkova, (9): centres of mass move from the distal to the proximal end of a link.
+    """
+    head = '<?xml version="1.0"?>\n<!-- Generated by robotid.paper.planar_2r.urdf_text(). -->\n'
+    base = '<robot name="planar_2r">\n  <link name="base_link"/>\n'
+    central1, central2 = links.central
+    body1 = _body(1, "base_link", 0.0, links.L1 + links.xbar1, links.ybar1, links.m1, central1)
+    body2 = _body(2, "link_1", links.L1, links.L2 + links.xbar2, links.ybar2, links.m2, central2)
+    return head + base + body1 + body2 + "</robot>\n"
+
+
+def _body(i: int, parent: str, *numbers: float) -> str:
+    length, x, y, m, Izz = (float(number) for number in numbers)
+    # thin, yet possible: second moments 0.9 Izz along, 0.1 Izz across, 0.01 Izz normal to the link
+    Ixx, Iyy = 0.11 * Izz, 0.91 * Izz
+    return _BODY.format(i=i, parent=parent, length=length, x=x, y=y, m=m, Ixx=Ixx, Iyy=Iyy, Izz=Izz)
+
+
+def _check_form(form: str) -> None:
+    if form not in PARAMETER_NAMES:
+        raise SettingsError(f"form is {form!r}, wanted one of {list(PARAMETER_NAMES)}")
+
+
+def _vector(name: str, values: Array, size: int) -> Array:
+    array = np.asarray(values, dtype=float)
+    if array.shape != (size,):
+        raise DataError(f"{name} has shape {array.shape}, wanted ({size},)")
+    return array
+
+
+def _pair(name: str, values: Array) -> tuple[Array, Array]:
+    array = np.asarray(values, dtype=float)
+    if array.shape[-1:] != (2,):
+        raise DataError(f"{name} has shape {array.shape}, wanted (2,)")
+    return array[..., 0], array[..., 1]

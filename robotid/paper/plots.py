@@ -1,0 +1,243 @@
+"""The paper's figures, each for all three models."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.paper.errata import EnergyDrift
+from robotid.paper.random_motions import RandomRuns
+from robotid.paper.study import AMPLITUDE, CASES, DURATION, ModelStudy
+from robotid.report.plots import INK, STYLE
+from robotid.simulation.program import ProgramMotion
+
+__all__ = [
+    "convergence_figure",
+    "disturbed_figure",
+    "energy_figure",
+    "figure_3",
+    "figure_4",
+    "figure_5",
+    "trajectories_figure",
+]
+
+# readable on white and on black
+_COLOURS = ("#0b7fd1", "#d4622a", "#23985f", "#b08400", "#b5539c")
+_STYLES = ("-", "--", ":")  # of models whose curves lie on each other
+_SHOWN = (1, 2, 5, 20, 100)  # iterations drawn in figure 4
+_WIDTH = 9.3  # [inch] of every figure
+_FONT = 8.5  # [pt]
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def figure_3(joint: int) -> Any:  # noqa: ANN401
+    """Return figure 3(a) or 3(b), the program motion of one link.
+
+    Args:
+        joint: Number of the joint, 0 or 1.
+
+    Returns:
+        A figure of Matplotlib.
+
+    References:
+        Tzvetkova, (28).
+    """
+    t = np.linspace(0.0, DURATION, 201)
+    parts = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(t)
+    units = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]")
+    figure, row = _figure(3, height=2.4)
+    for axes, part, label, colour in zip(row, parts, units, _COLOURS, strict=False):
+        axes.plot(t, part[:, joint], color=colour)
+        axes.set(xlabel="time [s]", ylabel=label)
+    return figure
+
+
+def figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
+    """Return figure 4(a) or 4(b), the control of one joint in successive iterations.
+
+    Args:
+        studies: The models.
+        joint: Number of the joint, 0 or 1.
+
+    Returns:
+        A figure of Matplotlib.
+
+    References:
+        Tzvetkova, (21).
+    """
+    figure, rows = _grid(2, len(studies), height=4.4, share=True)
+    for upper, lower, study in zip(*rows, studies, strict=True):
+        kept = study.history.torques
+        torques: Sequence[Array] = [] if kept is None else list(kept[:, :, 0, joint])
+        for number, colour in zip(_SHOWN, _COLOURS, strict=True):
+            if number <= len(torques):
+                u = torques[number - 1]
+                t = np.arange(len(u)) * DURATION / len(u)
+                upper.plot(t, u, color=colour, lw=1.0, label=f"iteration {number}")
+                lower.plot(t, u - torques[-1], color=colour, lw=1.0)
+        upper.plot(*_control(study, joint), "--", color=INK, lw=1.2, label="program control")
+        upper.set_title(study.name, fontsize=_FONT)
+        lower.set_xlabel("time [s]")
+    rows[0][0].set_ylabel(f"torque u{joint + 1} [N m]")
+    rows[1][0].set_ylabel("less the last iteration [N m]")
+    _legend(figure, rows[0][0])
+    return figure
+
+
+def figure_5(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
+    """Return figure 5, the estimated parameters over the iterations.
+
+    Args:
+        studies: The models.
+
+    Returns:
+        A figure of Matplotlib.
+
+    References:
+        Tzvetkova, (24).
+    """
+    figure, row = _figure(len(studies), height=3.2, share=True)
+    colour = dict(zip(("p1", "p2", "p3", "p4", "p5"), _COLOURS, strict=True))
+    for axes, study in zip(row, studies, strict=True):
+        for i, name in enumerate(study.dynamics.names):
+            axes.plot(study.history.estimates[:, 0, i], color=colour[name], lw=1.3, label=name)
+            axes.axhline(study.P[i], color=colour[name], lw=0.8, ls=":")
+        axes.set_xlabel("iteration")
+        axes.set_title(study.name, fontsize=_FONT)
+    row[0].set_ylabel("estimate [kg m²]; dotted: true")
+    _legend(figure, row[0])
+    return figure
+
+
+def convergence_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
+    """Return PRX and the parameter error over the iterations.
+
+    Args:
+        studies: The models.
+
+    Returns:
+        A figure of Matplotlib.
+
+    References:
+        Tzvetkova, (23).
+    """
+    figure, (left, right) = _figure(2, height=3.2)
+    for study, colour, style in zip(studies, _COLOURS, _STYLES, strict=False):
+        numbers = np.arange(1, len(study.history.prx) + 1)
+        prx = study.history.prx[:, 0]
+        left.semilogy(numbers, prx, style, color=colour, lw=1.6, label=study.name)
+        right.semilogy(study.errors(), style, color=colour, lw=1.6)
+        right.semilogy(study.errors("on_program"), style, color=colour, lw=0.8)
+    left.set(xlabel="iteration", ylabel="largest entry of PRX [N m/s²]")
+    right.set(xlabel="iteration", ylabel="|P̂ − P| / |P|; thin: start on program")
+    for axes in (left, right):
+        _label_decades(axes)
+    _legend(figure, left)
+    return figure
+
+
+def disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
+    """Return the parameter error under disturbance and noise.
+
+    Args:
+        studies: The models.
+
+    Returns:
+        A figure of Matplotlib.
+    """
+    figure, row = _figure(len(studies), height=3.2, share=True)
+    shown = {"clean": "clean", "disturbed": "torque ±10 %", "noisy": "noise"}
+    shown["noisy_dead_zone"] = "noise, ε₂ = 1"
+    for axes, study in zip(row, studies, strict=True):
+        for (case, label), colour in zip(shown.items(), _COLOURS, strict=False):
+            if case in CASES:
+                axes.semilogy(study.errors(case), color=colour, lw=1.1, label=label)
+        axes.set_xlabel("iteration")
+        axes.set_title(study.name, fontsize=_FONT)
+        _label_decades(axes)
+    row[0].set_ylabel("|P̂ − P| / |P|")
+    _legend(figure, row[0])
+    return figure
+
+
+def trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
+    """Return how many iterations the random motions took.
+
+    Args:
+        runs: Random motions of each model.
+
+    Returns:
+        A figure of Matplotlib.
+    """
+    figure, row = _figure(len(runs), height=2.8, share=True)
+    for axes, (name, found), colour in zip(row, runs.items(), _COLOURS, strict=False):
+        most, count = len(found.errors) - 1, len(found.guess)
+        axes.hist(found.iterations, bins=np.linspace(0, most, 31), color=colour)
+        left = count - len(found.iterations)
+        axes.set_xlabel("iterations to 10⁻³")
+        axes.set_title(f"{name}: {count - left} of {count} converged", fontsize=_FONT)
+    row[0].set_ylabel("random motions")
+    return figure
+
+
+def energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
+    """Return the energy that each model gains in free motion.
+
+    Args:
+        drift: Energies over time.
+
+    Returns:
+        A figure of Matplotlib.
+    """
+    figure, (axes,) = _figure(1, height=2.8)
+    for name, colour in zip(drift.energy, _COLOURS, strict=False):
+        axes.plot(drift.t, 100 * drift.relative(name), color=colour, lw=1.2, label=name)
+    axes.set(xlabel="time [s]", ylabel="energy gained [%]")
+    _legend(figure, axes)
+    return figure
+
+
+def _control(study: ModelStudy, joint: int) -> tuple[Any, Any]:
+    t, u = study.program_control(201)
+    return t, u[:, joint]
+
+
+def _figure(columns: int, *, height: float, share: bool = False) -> tuple[Any, Any]:
+    """Return a figure and its axes side by side."""
+    figure, rows = _grid(1, columns, height=height, share=share)
+    return figure, rows[0]
+
+
+def _grid(lines: int, columns: int, *, height: float, share: bool = False) -> tuple[Any, Any]:
+    """Return a figure and its axes, line by line; the axes of a line may share their scale."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        sharey: Any = "row" if share else False
+        rows = figure.subplots(lines, columns, squeeze=False, sharey=sharey)
+        for axes in rows.flat:
+            axes.grid(visible=True)
+        return figure, rows
+
+
+def _legend(figure: Any, axes: Any) -> None:  # noqa: ANN401
+    handles, labels = axes.get_legend_handles_labels()
+    place = {"loc": "outside upper left", "ncols": len(labels)}
+    figure.legend(handles, labels, frameon=False, fontsize=_FONT, labelcolor=INK, **place)
+
+
+def _label_decades(axes: Any) -> None:  # noqa: ANN401
+    """Write the decades as 10⁻³: Matplotlib's own labels need its mathematics, which is off."""
+    axes.yaxis.set_major_formatter(_power)
+    axes.yaxis.set_minor_formatter(_nothing)
+
+
+def _power(value: float, _: int) -> str:
+    return "10" + str(round(np.log10(value))).translate(_RAISED)
+
+
+def _nothing(_value: float, _position: int) -> str:
+    return ""

@@ -1,0 +1,3 @@
+"""Torque linear in the parameters: rows of W theta = tau, base parameters, factors, prediction."""
+
+__all__: list[str] = []

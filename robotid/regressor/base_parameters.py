@@ -1,0 +1,228 @@
+"""Base parameters: which combinations of the standard parameters any motion can show.
+
+QR with column pivoting of the regressor at random states: W P = Q [R1 R2], so the columns that
+stay behind are combinations of the chosen ones, W_2 = W_1 R1^-1 R2, and W pi = W_1 beta with
+beta = K pi = pi_1 + R1^-1 R2 pi_2 (Gautier 1991).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.regressor.problem import Problem
+
+__all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping"]
+
+#: Pivots below this share of the largest are no structure. Over example-robot-data, every pivot
+#: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
+RANK_TOLERANCE = 1e-4
+_TIE = 1e-6  # share by which each column is shortened against the one before it
+_CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
+_SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
+
+
+@dataclass(frozen=True, eq=False)
+class BaseMapping:
+    """The linear map from standard to base parameters and back.
+
+    Attributes:
+        K: Map with beta = K pi and W pi = W[:, independent] beta, shape (b, p).
+        independent: Columns of W that are kept, shape (b,), ascending.
+        names: Names of the p standard parameters.
+        pivots: Sizes of all p pivots in order of choice, relative to the first, shape (p,).
+    """
+
+    K: Array
+    independent: Array
+    names: tuple[str, ...]
+    pivots: Array
+
+    @property
+    def base_names(self) -> tuple[str, ...]:
+        """Name of each base parameter: that of the column kept for it."""
+        return tuple(self.names[i] for i in self.independent)
+
+    @cached_property
+    def expressions(self) -> tuple[str, ...]:
+        """Each base parameter in words, as ``link_2.Izz + 0.5 link_3.m``."""
+        return tuple(
+            _expression(row, self.names, int(first))
+            for row, first in zip(self.K, self.independent, strict=True)
+        )
+
+    @cached_property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Names of the standard parameters that load no joint in any motion."""
+        return tuple(self.names[i] for i in np.flatnonzero(~self.K.any(axis=0)))
+
+    def in_words(self, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+        """Return how far each of some standard parameters can be known from any motion.
+
+        Args:
+            names: Standard parameters.
+
+        Returns:
+            The names by what holds of them: "alone", a base parameter of its own; "in sums", only
+            its sum with others loads a joint; "never", no motion shows it.
+        """
+        terms = np.abs(self.K) > 0
+        kinds: dict[str, tuple[str, ...]] = {"alone": (), "in sums": (), "never": ()}
+        for name in names:
+            rows = np.flatnonzero(terms[:, self.names.index(name)])
+            is_alone = len(rows) == 1 and terms[rows[0]].sum() == 1
+            kind = "never" if not len(rows) else "alone" if is_alone else "in sums"
+            kinds[kind] += (name,)
+        return kinds
+
+    def to_base(self, pi: Array) -> Array:
+        """Return the base parameters beta = K pi.
+
+        Args:
+            pi: Standard parameters, shape (p,), SI units, in ``names`` order.
+
+        Returns:
+            Base parameters, shape (b,).
+
+        Raises:
+            DataError: If pi does not have p entries.
+        """
+        if pi.shape != (self.K.shape[1],):
+            raise DataError(f"pi has shape {pi.shape}, wanted ({self.K.shape[1]},)")
+        beta: Array = self.K @ pi
+        return beta
+
+    def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
+        """Return the standard parameters nearest to a prior that have these base parameters.
+
+        Nearest in units of the spread: pi = prior + G (beta - K prior) with
+        G = S^2 K^T (K S^2 K^T)^-1, S = diag(spread).
+
+        Args:
+            beta: Base parameters, shape (b,).
+            prior: Standard parameters to stay near, shape (p,).
+            spread: How far each may lie from its prior, shape (p,); 1 if None.
+
+        Returns:
+            Standard parameters, shape (p,), with K pi = beta. They need not be physically
+            consistent.
+
+        Raises:
+            DataError: If a shape does not fit.
+        """
+        if beta.shape != (len(self.K),):
+            raise DataError(f"beta has shape {beta.shape}, wanted ({len(self.K)},)")
+        pi: Array = prior + self.gain(spread) @ (beta - self.to_base(prior))
+        return pi
+
+    def gain(self, spread: Array | None = None) -> Array:
+        """Return G = S^2 K^T (K S^2 K^T)^-1, how a change of beta spreads over pi.
+
+        Args:
+            spread: How far each standard parameter may lie from its prior, shape (p,); 1 if None.
+
+        Returns:
+            Gain, shape (p, b), with K G = 1.
+        """
+        s = np.ones(self.K.shape[1]) if spread is None else spread
+        # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T keeps all digits
+        Q, R = scipy.linalg.qr((self.K * s).T, mode="economic")
+        gain: Array = s[:, None] * scipy.linalg.solve_triangular(R, Q.T).T
+        return gain
+
+    def reduce(self, problem: Problem) -> Problem:
+        """Return the problem in base parameters, W_b beta = tau.
+
+        Args:
+            problem: A problem over the standard parameters.
+
+        Returns:
+            The same rows with the b columns kept.
+
+        Raises:
+            DataError: If the columns of the problem are not those of this mapping.
+        """
+        if problem.names != self.names:
+            raise DataError(
+                f"the problem has {len(problem.names)} columns that are not the "
+                f"{len(self.names)} of the mapping; build both from one model"
+            )
+        return problem.select(self.independent)
+
+
+def base_mapping(
+    W: Array,
+    names: tuple[str, ...],
+    *,
+    scales: Array | None = None,
+    preference: Array | None = None,
+    rtol: float = RANK_TOLERANCE,
+) -> BaseMapping:
+    """Return the base parameters of a regressor taken at random states.
+
+    The columns are compared after multiplication by ``scales``, physical magnitudes, and never
+    divided by their own norm: that would turn a column of rounding noise into a parameter.
+
+    Args:
+        W: Regressor at enough random states, shape (m, p), m >= p.
+        names: Names of the columns.
+        scales: Magnitude of each parameter, shape (p,); 1 if None. See
+            :meth:`robotid.robot.parameters.ParameterLayout.scales`.
+        preference: Factor by which each column is favoured when the columns to keep are chosen,
+            shape (p,); 1 if None. It changes which groups are formed, not how many. See
+            :meth:`robotid.robot.parameters.ParameterLayout.preference`.
+        rtol: Pivots below this share of the largest count as 0.
+
+    Returns:
+        The mapping.
+
+    Raises:
+        DataError: If a shape does not fit, W is not finite or all zero.
+
+    References:
+        Gautier (1991), Numerical calculation of the base inertial parameters of robots.
+    """
+    if W.ndim != 2 or W.shape[1] != len(names) or len(W) < len(names):
+        raise DataError(f"W has shape {W.shape}, wanted at least {len(names)} rows of {len(names)}")
+    if not np.isfinite(W).all() or not W.any():
+        raise DataError("W must be finite and not all zero")
+    magnitude = np.ones(len(names)) if scales is None else scales
+    R = scipy.linalg.qr(W * magnitude, mode="r", overwrite_a=True, check_finite=False)[0]
+    order, pivots = _pivot(R[: len(names)])
+    rank = int(np.sum(pivots > rtol * pivots[0]))
+    if preference is not None:
+        order, _ = _pivot(R[: len(names)] * preference)
+    independent, dependent = np.sort(order[:rank]), np.sort(order[rank:])
+    Q1, R1 = scipy.linalg.qr(R[:, independent], mode="economic")
+    X = scipy.linalg.solve_triangular(R1, Q1.T @ R[:, dependent])  # (b, p - b), scaled columns
+    X[np.abs(X) < _CLEAN] = 0.0
+    K = np.zeros((rank, len(names)))
+    K[:, independent] = np.eye(rank)
+    K[:, dependent] = X * magnitude[independent][:, None] / magnitude[dependent]
+    return BaseMapping(K, independent, names, pivots / pivots[0])
+
+
+def _pivot(R: Array) -> tuple[Array, Array]:
+    """Return the order in which columns are chosen and the size of each when it was.
+
+    LAPACK's QR with column pivoting takes the longest remaining column; later columns are
+    shortened by a hair, so that among equal ones the first wins and rounding does not choose.
+    """
+    handicap = 1.0 - _TIE * np.arange(R.shape[1])
+    triangle, order = scipy.linalg.qr(R * handicap, mode="r", pivoting=True)
+    return order, np.abs(np.diag(triangle))
+
+
+def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
+    text = names[first]
+    for i in np.flatnonzero(np.abs(row) > _SHOWN):
+        if i == first:
+            continue
+        sign = "-" if row[i] < 0 else "+"
+        size = f"{abs(row[i]):.6g}"
+        text += f" {sign} {names[i]}" if size == "1" else f" {sign} {size} {names[i]}"
+    return text

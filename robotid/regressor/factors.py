@@ -1,0 +1,362 @@
+"""The compressed problem: one triangular factor per joint, by sequential QR.
+
+All that least squares, weighted least squares and convex fits need of W and tau is the
+triangular factor R_j of each joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j].
+Factors of two logs merge into the factor of both.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import pairwise
+
+import numpy as np
+import scipy.linalg.lapack
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.regressor.lapack import Triangle
+from robotid.regressor.problem import Problem, RowSource
+
+__all__ = ["Factors", "available_cores", "compress", "compress_stretches", "gather", "merge"]
+
+_PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """Triangular factors of [W_j tau_j], joint by joint, each with the columns that it has.
+
+    Attributes:
+        triangles: Upper triangular factors, n arrays of shape (c_j + 1, c_j + 1).
+        columns: The columns that joint j has, n arrays of shape (c_j,), ascending.
+        rows: Number of rows folded in per joint, shape (n,), int.
+        names: Names of the c columns.
+    """
+
+    triangles: tuple[Array, ...]
+    columns: tuple[Array, ...]
+    rows: Array
+    names: tuple[str, ...]
+
+    @property
+    def R(self) -> Array:
+        """The factors over all c columns, shape (n, c + 1, c + 1), zeros where a joint has none."""
+        size = len(self.names) + 1
+        dense = np.zeros((len(self.triangles), size, size))
+        for R, triangle, own in zip(dense, self.triangles, self.columns, strict=True):
+            places = np.append(own, size - 1)
+            R[np.ix_(places, places)] = triangle
+        return dense
+
+    def select(self, columns: Array) -> "Factors":
+        """Return the factors of fewer columns.
+
+        Args:
+            columns: Indices of the columns kept, shape (b,).
+
+        Returns:
+            Factors over the same rows.
+        """
+        columns = np.asarray(columns, dtype=int)
+        triangles, kept = [], []
+        for triangle, own in zip(self.triangles, self.columns, strict=True):
+            kept.append(np.flatnonzero(np.isin(columns, own)))
+            places = np.append(np.searchsorted(own, columns[kept[-1]]), len(own))
+            triangles.append(_triangle(triangle[:, places]))
+        names = tuple(self.names[i] for i in columns)
+        return Factors(tuple(triangles), tuple(kept), self.rows, names)
+
+    def weighted(self, sigma: Array) -> Array:
+        """Return one factor of all joints, the rows of joint j divided by sigma_j.
+
+        From the fingers to the base, each factor is folded into the smallest one that has all its
+        columns: a joint's are among those of the joint that carries it.
+
+        Args:
+            sigma: Noise level per joint, shape (n,) [N m or N], positive.
+
+        Returns:
+            Triangular factor of the stacked [W_j tau_j] / sigma_j, shape (c + 1, c + 1).
+        """
+        c = len(self.names)
+        folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
+        for total, own, level in zip(folded, self.triangles, sigma, strict=True):
+            total.R[:] = own / level
+        for j, k in self._carriers:
+            columns = np.append(self.columns[j], c)
+            if k is None:
+                everything.fold_triangle(folded[j].R, columns)
+            else:
+                places = np.searchsorted(self.columns[k], columns)
+                folded[k].fold_triangle(folded[j].R, places)
+        return everything.R
+
+    def residual_squares(self, theta: Array) -> Array:
+        """Return the sum of squared residuals |tau_j - W_j theta|^2 of each joint.
+
+        Args:
+            theta: Parameters, shape (c,).
+
+        Returns:
+            Sums, shape (n,) [(N m)^2 or N^2].
+        """
+        residuals = [
+            R[:, -1] - R[:, :-1] @ theta[own]
+            for R, own in zip(self.triangles, self.columns, strict=True)
+        ]
+        return np.array([residual @ residual for residual in residuals])
+
+    def torque_squares(self) -> Array:
+        """Return the sum of squared torques |tau_j|^2, shape (n,) [(N m)^2 or N^2]."""
+        return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])
+
+    def information(self, weights: Array) -> Array:
+        """Return sum_j weight_j W_j^T W_j.
+
+        Args:
+            weights: Weight per joint, shape (n,).
+
+        Returns:
+            The sum, shape (c, c).
+        """
+        total = np.zeros((len(self.names), len(self.names)))
+        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
+            total[np.ix_(own, own)] += weight * (R[:, :-1].T @ R[:, :-1])
+        return total
+
+    def leverages(self, covariance: Array) -> Array:
+        """Return the trace of W_j C W_j^T for each joint.
+
+        Args:
+            covariance: C, shape (c, c).
+
+        Returns:
+            Traces, shape (n,).
+        """
+        pairs = [
+            (R[:, :-1], covariance[np.ix_(own, own)])
+            for R, own in zip(self.triangles, self.columns, strict=True)
+        ]
+        return np.array([np.vdot(A @ C, A) for A, C in pairs])
+
+    @cached_property
+    def _carriers(self) -> list[tuple[int, int | None]]:
+        """Pairs of a joint and the one with the fewest columns that has all of its, or None.
+
+        Joints with few columns come first, so that a joint is complete before it is folded.
+        """
+        order = sorted(range(len(self.columns)), key=lambda j: (len(self.columns[j]), -j))
+        sets = [set(own.tolist()) for own in self.columns]
+        return [
+            (j, next((k for k in order[position:] if sets[j] <= sets[k]), None))
+            for position, j in enumerate(order, start=1)
+        ]
+
+
+def compress(problem: Problem, *, threads: int | None = None) -> Factors:
+    """Fold a problem into its factors, block by block.
+
+    Long problems are cut into parts of a fixed number of samples, whose factors are merged in
+    order: the result does not depend on the number of threads.
+
+    Args:
+        problem: The rows; each is scaled by the square root of its weight, so that a weight of 0
+            leaves it out.
+        threads: Number of threads, at least 1; None: one per core where the problem's rows come
+            faster that way, otherwise one.
+
+    Returns:
+        The factors.
+
+    Raises:
+        DataError: If a row is not finite.
+
+    References:
+        Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
+    """
+    if problem.sources:
+        return _compress(problem, threads)
+    triangles, active = _empty(problem)
+    rows = _fold_blocks(triangles, active, problem)
+    return _checked(triangles, active, rows, problem.names)
+
+
+def compress_stretches(
+    problem: Problem, length: int, *, threads: int | None = None
+) -> tuple[Factors, ...]:
+    """Fold each stretch of a problem into factors of its own, as for held-out stretches.
+
+    Args:
+        problem: The rows, of one log or several; not one that comes in blocks only.
+        length: Samples per stretch, at least 1; the last stretch of each log may have fewer.
+        threads: As of :func:`compress`.
+
+    Returns:
+        The factors of each stretch, in order; merged they are those of the whole problem.
+
+    Raises:
+        DataError: If a row is not finite, or the problem comes in blocks only.
+    """
+    if not problem.sources:
+        raise DataError("the problem comes in blocks only; it cannot be cut into stretches")
+    parts = [
+        replace(problem, sources=(source.part(start, min(start + length, source.samples)),))
+        for source in problem.sources
+        for start in range(0, source.samples, length)
+    ]
+    is_parallel = all(source.is_parallel for source in problem.sources)
+    workers = (available_cores() if is_parallel else 1) if threads is None else threads
+    if min(workers, len(parts)) <= 1:
+        return tuple(_compress(part, 1) for part in parts)
+    with ThreadPoolExecutor(min(workers, len(parts))) as pool:
+        return tuple(pool.map(partial(_compress, threads=1), parts))
+
+
+def merge(factors: Sequence[Factors]) -> Factors:
+    """Return the factors of all rows of several logs.
+
+    Args:
+        factors: At least one; all with the same columns and joints.
+
+    Returns:
+        Factors as if the rows had been folded in one pass.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not factors:
+        raise DataError("no factors were given; at least one log is needed")
+    first = factors[0]
+    for other in factors[1:]:
+        if other.names != first.names or len(other.rows) != len(first.rows):
+            raise DataError(
+                f"factors differ: {len(first.rows)} joints x {len(first.names)} columns and "
+                f"{len(other.rows)} joints x {len(other.names)} columns"
+            )
+    triangles, columns = [], []
+    for j in range(len(first.rows)):
+        own = np.unique(np.concatenate([f.columns[j] for f in factors]))
+        total = Triangle(len(own) + 1)
+        for f in factors:
+            places = np.append(np.searchsorted(own, f.columns[j]), len(own))
+            total.fold_triangle(f.triangles[j], places)
+        triangles.append(total.R)
+        columns.append(own)
+    rows = np.sum([f.rows for f in factors], axis=0)
+    return Factors(tuple(triangles), tuple(columns), rows, first.names)
+
+
+def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
+    """Return fewer, longer stretches: neighbours merged, as for held-out stretches.
+
+    Args:
+        stretches: Factors of stretches, in order.
+        count: Number wanted, at least 1.
+
+    Returns:
+        At most so many factors of about as many stretches each, in order.
+    """
+    edges = np.linspace(0, len(stretches), min(count, len(stretches)) + 1).round().astype(int)
+    return tuple(merge(stretches[i:j]) for i, j in pairwise(edges))
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _compress(problem: Problem, threads: int | None) -> Factors:
+    """Return the factors of the rows of a problem's sources."""
+    triangles, active = _empty(problem)
+    _fold_sources(triangles, active, problem, threads)
+    rows = np.sum([source.rows for source in problem.sources], axis=0)
+    return _checked(triangles, active, rows, problem.names)
+
+
+def _empty(problem: Problem) -> tuple[list[Triangle], list[Array]]:
+    """Return empty factors and the columns, torque included, that each joint's rows have."""
+    c = len(problem.names)
+    active = [np.append(np.flatnonzero(row), c) for row in problem.support]
+    return [Triangle(len(columns)) for columns in active], active
+
+
+def _checked(
+    triangles: Sequence[Triangle], active: Sequence[Array], rows: Array, names: tuple[str, ...]
+) -> Factors:
+    # what is not finite in a row is not finite in R
+    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
+        raise DataError("the problem holds a row that is not finite; check the trajectory")
+    own = tuple(columns[:-1] for columns in active)
+    return Factors(tuple(triangle.R for triangle in triangles), own, rows, names)
+
+
+def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem) -> Array:
+    """Fold whole blocks into the factors; return the number of rows per joint."""
+    n = problem.n_joints
+    rows = np.zeros(n, dtype=int)
+    for W, tau, weight in problem.blocks():
+        by_joint, torque = W.reshape(-1, n, W.shape[1]), tau.reshape(-1, n)
+        root = np.sqrt(weight).reshape(-1, n)
+        rows += (root > 0).sum(axis=0)
+        for j, columns in enumerate(active):
+            used = np.flatnonzero(root[:, j] != 0)  # not a number counts as used: it shows in R
+            scaled = np.empty((len(used), len(columns)), order="F")
+            scaled[:, :-1] = by_joint[used, j][:, columns[:-1]]
+            scaled[:, -1] = torque[used, j]
+            scaled *= root[used, j, None]
+            triangles[j].fold(scaled)
+    return rows
+
+
+def _fold_sources(
+    triangles: Sequence[Triangle],
+    active: Sequence[Array],
+    problem: Problem,
+    threads: int | None,
+) -> None:
+    """Fold the rows of each source into the factors, part by part."""
+    c = len(problem.names)
+    for source in problem.sources:
+        places = [
+            np.searchsorted(columns, np.append(own, c))
+            for columns, own in zip(active, source.columns, strict=True)
+        ]
+        for part in _parts(source, threads):
+            for triangle, place, R_j in zip(triangles, places, part, strict=True):
+                triangle.fold_triangle(R_j, place)
+
+
+def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
+    """Yield the factors of each part of a source in order."""
+    starts = range(0, source.samples, _PART)
+    workers = (available_cores() if source.is_parallel else 1) if threads is None else threads
+    if min(workers, len(starts)) <= 1:
+        yield from (_fold_part(source, start) for start in starts)
+        return
+    with ThreadPoolExecutor(min(workers, len(starts))) as pool:
+        yield from pool.map(partial(_fold_part, source), starts)
+
+
+def _fold_part(source: RowSource, start: int) -> list[Array]:
+    triangles = [Triangle(len(own) + 1) for own in source.columns]
+    for block in source.blocks(start, min(start + _PART, source.samples)):
+        for triangle, rows in zip(triangles, block, strict=True):
+            triangle.fold(rows)
+    return [triangle.R for triangle in triangles]
+
+
+def _triangle(rows: Array) -> Array:
+    """Return the square upper triangular factor R of rows (m, k), padded with zeros if m < k."""
+    k = rows.shape[1]
+    if len(rows) == 0:
+        return np.zeros((k, k))
+    packed = scipy.linalg.lapack.dgeqrf(np.asfortranarray(rows), overwrite_a=True)[0]
+    R = np.zeros((k, k))
+    filled = min(k, len(rows))
+    R[:filled] = np.triu(packed[:filled])
+    return R

@@ -1,0 +1,97 @@
+"""Torques that parameter vectors predict, without the regressor as a whole."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import drive_columns, friction_directions
+from robotid.regressor.compiled import work_per_sample
+from robotid.regressor.rows import COMPILED, TrajectoryRows, trajectory_rows
+from robotid.robot.model import RobotModel
+
+__all__ = ["predict"]
+
+_START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
+
+
+def predict(
+    model: RobotModel,
+    parameters: Sequence[Array],
+    trajectory: Trajectory,
+    *,
+    compiled: bool | None = None,
+) -> list[Array]:
+    """Return the torque W theta that each of several parameter vectors predicts.
+
+    By the rows of the regressor, times all vectors at once, or, where the rows are not compiled
+    and the vectors are few, by inverse dynamics, once per vector.
+
+    Args:
+        model: The robot.
+        parameters: Vectors of standard parameters, each of shape (p,), possible ones or not.
+        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
+        compiled: As of :func:`robotid.regressor.torque.build_problem`.
+
+    Returns:
+        Torques, one array of shape (N, n_rows) per vector [N m, N].
+
+    Raises:
+        DataError: If the trajectory's joints are not the model's.
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
+
+    References:
+        Luh, Walker, Paul (1980), On-Line Computational Scheme for Mechanical Manipulators.
+    """
+    source = trajectory_rows(model, trajectory, None, compiled)
+    few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
+    if source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
+        return [_inverse_dynamics(model, pi, trajectory) for pi in parameters]
+    return _from_rows(source, np.column_stack(list(parameters)))
+
+
+def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
+    """Return the rows times the columns of (p, k), k arrays of shape (N, n_rows)."""
+    torques = np.empty((stacked.shape[1], source.samples, len(source.columns)))
+    own = [stacked[columns] for columns in source.columns]
+    start = 0
+    for block in source.blocks(0, source.samples):
+        part = slice(start, start + len(block[0]))
+        for j, rows in enumerate(block):
+            torques[:, part, j] = (rows[:, :-1] @ own[j]).T
+        start = part.stop
+    return list(torques)
+
+
+def _has_centres(model: RobotModel, pi: Array) -> bool:
+    """Return whether every body is one that Pinocchio's (m, c, I about c) holds to all digits.
+
+    Base parameters have first moments without a mass; a possible body has |m c|^2 <= m tr I / 2.
+    """
+    bodies = pi[: model.layout.n_inertial].reshape(-1, 10)
+    moments = np.sum(bodies[:, 1:4] ** 2, axis=1)
+    return bool((moments <= bodies[:, 0] * bodies[:, [4, 6, 9]].sum(axis=1)).all())
+
+
+def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return the torque by the recursive Newton-Euler algorithm and the drives' terms."""
+    G, v, a = model.velocity_map, trajectory.v, trajectory.a
+    pin_model, rnea = model.with_parameters(pi).pin_model, pin.rnea
+    data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
+    is_plain = np.array_equal(G, np.eye(len(G)))
+    rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
+    configurations = np.ascontiguousarray(model.configurations(trajectory.q))
+    for torque_k, *motion_k in zip(torque, configurations, rates, changes, strict=True):
+        torque_k[:] = rnea(pin_model, data, *motion_k)
+    if not is_plain:
+        torque = torque @ G  # tau = G^T tau_pinocchio
+    signs = friction_directions(model.layout, v, trajectory.direction)
+    drives = drive_columns(model.layout, model.n_rows)
+    for value, drive in zip(pi[model.layout.n_inertial :], drives, strict=True):
+        if value != 0.0:
+            values = value * drive.values(v, a, signs)
+            for row, ratio in drive.ratios.items():
+                torque[:, row] += ratio * values
+    return torque

@@ -1,0 +1,281 @@
+"""Rows of a trajectory's problem joint by joint: regressor, torque and weight, block by block."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, MissingDependencyError
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import RowPlan, friction_directions, plan_rows
+from robotid.regressor.compiled import (
+    LONG_ENOUGH,
+    CompiledWriter,
+    Tree,
+    flatten,
+    is_installed,
+    why_not,
+    work_per_sample,
+)
+from robotid.regressor.problem import RowSource
+from robotid.robot.model import RobotModel
+
+__all__ = ["BLOCK", "COMPILED", "TrajectoryRows", "choose_engine", "trajectory_rows"]
+
+BLOCK = 512  # samples per block: fits in the cache with 100 columns
+COMPILED = "compiled by Numba"
+
+_LANES = 64  # the compiled path works on whole groups of so many samples
+_BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, if that leaves it a group of samples
+
+_log = logging.getLogger(__name__)
+
+
+def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
+    """Return what computes the rows, in words, and log it.
+
+    Args:
+        model: The robot.
+        samples: Number of samples.
+        compiled: Whether to compile; None: if installed and worth it.
+
+    Returns:
+        ``COMPILED``, or "Pinocchio" with the reason where the compiled path was to be used.
+
+    Raises:
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
+    """
+    if compiled and not is_installed():
+        raise MissingDependencyError("the compiled regressor", "numba", "fast")
+    engine = _engine(model, samples, compiled)
+    _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
+    return engine
+
+
+def _engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
+    if compiled is False:
+        return "Pinocchio"
+    if not is_installed():
+        return "Pinocchio (robotid[fast] is not installed)"
+    enough = -(-LONG_ENOUGH // work_per_sample(model))
+    if compiled is None and samples < enough:
+        return f"Pinocchio (fewer than {enough} samples do not pay the start of the compiled path)"
+    reason = why_not(model)
+    return COMPILED if reason is None else f"Pinocchio ({reason})"
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryRows(RowSource):
+    """Rows of a robot's trajectory; see :class:`robotid.regressor.problem.RowSource`.
+
+    Attributes:
+        model: The robot.
+        trajectory: N samples.
+        weights: Weight of each row, shape (N, n_rows).
+        support: Shape (n_rows, p), bool: False where row j is zero for every motion.
+        kept: Which of the p columns these are, shape (c,).
+        engine: What computes the regressor.
+    """
+
+    model: RobotModel
+    trajectory: Trajectory
+    weights: Array
+    support: Array
+    kept: Array
+    engine: str
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.trajectory.t)
+
+    @property
+    def is_parallel(self) -> bool:
+        """Whether threads help: Pinocchio's Python function holds the interpreter's lock."""
+        return self.engine == COMPILED
+
+    @cached_property
+    def columns(self) -> tuple[Array, ...]:
+        """The columns that row j has, n arrays of shape (c_j,)."""
+        return tuple(np.flatnonzero(row) for row in self.support[:, self.kept])
+
+    @cached_property
+    def rows(self) -> Array:
+        """Number of rows with a positive weight per joint, shape (n,), int."""
+        used: Array = np.count_nonzero(self.weights > 0, axis=0)
+        return used
+
+    def part(self, start: int, stop: int) -> "TrajectoryRows":
+        """Return the rows of samples start to stop only.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+
+        Returns:
+            The rows.
+        """
+        motion = self.trajectory.part(start, stop)
+        return replace(self, trajectory=motion, weights=self.weights[start:stop])
+
+    def select(self, columns: Array) -> "TrajectoryRows":
+        """Return the same rows with fewer columns.
+
+        Args:
+            columns: Indices of the columns kept, shape (b,), of those here.
+
+        Returns:
+            The rows.
+        """
+        return replace(self, kept=self.kept[columns])
+
+    def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
+        """Yield the rows of samples start to stop; see :meth:`RowSource.blocks`.
+
+        Args:
+            start: First sample.
+            stop: Sample after the last one.
+
+        Yields:
+            Per joint the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major.
+        """
+        plan = self._plan
+        length = _block_length(int(plan.first[-1]))
+        out = np.empty((plan.first[-1], length))
+        writer = self._writer(out)
+        motion, part = self.trajectory, slice(start, stop)
+        weights = self.weights[part] if self._is_weighted else None
+        direction = None if motion.direction is None else motion.direction[part]
+        direction = friction_directions(self.model.layout, motion.v[part], direction)
+        writer.load(
+            motion.q[part], motion.v[part], motion.a[part], motion.tau[part], direction, weights
+        )
+        for k in range(0, stop - start, length):
+            end = min(k + length, stop - start)
+            writer.write(k, end)
+            yield [out[i:j, : end - k].T for i, j in pairwise(plan.first)]
+
+    @cached_property
+    def _tree(self) -> Tree:
+        return flatten(self.model)
+
+    @cached_property
+    def _plan(self) -> RowPlan:
+        return plan_rows(self.model.layout, [self.kept[columns] for columns in self.columns])
+
+    @cached_property
+    def _is_weighted(self) -> bool:
+        return bool((self.weights != 1.0).any())
+
+    def _writer(self, out: Array) -> "CompiledWriter | _PinocchioWriter":
+        if self.engine == COMPILED:
+            return CompiledWriter(self.model, self._tree, self._plan, out)
+        return _PinocchioWriter(self.model, self._plan, out)
+
+
+def trajectory_rows(
+    model: RobotModel, trajectory: Trajectory, weight: Array | None, compiled: bool | None
+) -> TrajectoryRows:
+    """Return all rows of a trajectory with all standard parameters.
+
+    Args:
+        model: The robot; the trajectory's joints must be its joints, in its order.
+        trajectory: N samples.
+        weight: Weight of each row, shape (N, n_rows); None: all 1.
+        compiled: As of :func:`choose_engine`.
+
+    Returns:
+        The rows.
+
+    Raises:
+        DataError: If joints or shapes do not fit the model.
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
+    """
+    if trajectory.joints != model.joints:
+        raise DataError(
+            f"the trajectory has the joints {list(trajectory.joints)}, the model has "
+            f"{list(model.joints)}; read the log with joints=model.joints"
+        )
+    shape = (len(trajectory.t), model.n_rows)
+    weights = np.broadcast_to(1.0, shape) if weight is None else weight
+    if weights.shape != shape:
+        raise DataError(f"weight has shape {weights.shape}, wanted {shape}")
+    kept, engine = np.arange(len(model.layout.names)), choose_engine(model, shape[0], compiled)
+    return TrajectoryRows(model, trajectory, weights, model.support(), kept, engine)
+
+
+class _PinocchioWriter:
+    """Writes the inertial columns with Pinocchio's own function, sample by sample."""
+
+    def __init__(self, model: RobotModel, plan: RowPlan, out: Array) -> None:
+        G, nv = model.velocity_map, model.pin_model.nv
+        self._model, self._plan, self._out = model, plan, out
+        self._data = model.pin_model.createData()
+        size = 10 * (model.pin_model.njoints - 1)
+        self._map = None if np.array_equal(G, np.eye(nv)) else G
+        # tau = G^T tau_pinocchio: row j gathers those of Pinocchio's rows that it drives
+        wanted, end = [], 0
+        self._sources: list[tuple[Array | slice, float, slice, bool]] = []
+        for j, (columns, places) in enumerate(zip(plan.inertial, plan.places, strict=True)):
+            for k, r in enumerate(np.flatnonzero(G[:, j])):
+                wanted.append(size * r + columns)
+                part = slice(end, end := end + len(columns))
+                self._sources.append((_as_slice(places), G[r, j], part, k > 0))
+        self._wanted = np.concatenate(wanted)
+        self._raw = np.empty((out.shape[1], end))
+
+    def load(
+        self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
+    ) -> None:
+        """Take the samples of the next blocks; see :meth:`CompiledWriter.load`."""
+        self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
+        self._direction = direction
+
+    def write(self, start: int, stop: int) -> None:
+        """Write the rows of samples start to stop; see :meth:`CompiledWriter.write`."""
+        part = slice(start, stop)
+        self._write_inertial(self._q[part], self._v[part], self._a[part])
+        out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]
+        direction = self._direction[part]
+        for j, drives in enumerate(self._plan.drives):
+            for place, drive in drives:
+                np.multiply(drive.ratios[j], drive.values(v, a, direction), out=out[place])
+        out[list(self._plan.torques)] = self._tau[part].T
+        if self._weights is not None:
+            for root, (i, j) in zip(
+                np.sqrt(self._weights[part]).T, pairwise(self._plan.first), strict=True
+            ):
+                out[i:j] *= root
+
+    def _write_inertial(self, q: Array, v: Array, a: Array) -> None:
+        regressor, model, data = pin.computeJointTorqueRegressor, self._model.pin_model, self._data
+        wanted = self._wanted
+        if self._map is not None:
+            v, a = v @ self._map.T, a @ self._map.T
+        instants = zip(
+            self._raw, np.ascontiguousarray(self._model.configurations(q)), v, a, strict=False
+        )
+        for raw_k, q_k, v_k, a_k in instants:
+            # only what is wanted, before the regressor leaves the cache; no bound is checked
+            regressor(model, data, q_k, v_k, a_k).take(wanted, None, raw_k, "clip")
+        out, raw = self._out[:, : len(q)], self._raw[: len(q)].T
+        for places, ratio, part, is_added in self._sources:
+            values = raw[part] if ratio == 1.0 else ratio * raw[part]
+            out[places] = out[places] + values if is_added else values
+
+
+def _as_slice(places: Array) -> Array | slice:
+    """Return a run of consecutive places as a slice, which is written to faster."""
+    if len(places) and (np.diff(places) == 1).all():
+        return slice(int(places[0]), int(places[-1]) + 1)
+    return places
+
+
+def _block_length(columns: int) -> int:
+    """Return the samples per block, a multiple of 64, such that it stays in the cache."""
+    return max(_LANES, min(BLOCK, _BLOCK_SIZE // columns // _LANES * _LANES))

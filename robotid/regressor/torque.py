@@ -1,0 +1,273 @@
+"""Regressor of joint torques: RobotModel + Trajectory -> Problem.
+
+Pinocchio computes the inertial columns; the drive columns stand beside them.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import drive_columns, friction_directions
+from robotid.regressor.problem import Block, Problem
+from robotid.regressor.rows import BLOCK, trajectory_rows
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "InstantRegressor",
+    "build_problem",
+    "joint_torque_regressor",
+    "mass_regressor",
+    "random_regressor",
+]
+
+_BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
+
+
+def joint_torque_regressor(
+    model: RobotModel, q: Array, v: Array, a: Array, direction: Array | None = None
+) -> Array:
+    """Return the regressor Y with tau = Y pi at each of N instants.
+
+    The columns are the ten inertial parameters of each body, from Pinocchio, and then
+    ``tau_j = Ia a_j + Fv v_j + Fc sign(v_j) + off`` and the like for couplings.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: What stands for the signs in the c Coulomb columns, shape (N, c), as
+            ``Trajectory.direction``; None: the signs.
+
+    Returns:
+        Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
+
+    Raises:
+        DataError: If a shape does not fit the model.
+
+    References:
+        Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
+        Links; Carpentier et al. (2019), The Pinocchio C++ library.
+    """
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted:
+        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+    Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
+    _write_inertial(model, q, v, a, Y[:, :, : model.layout.n_inertial])
+    _write_drives(model, v, a, direction, Y[:, :, model.layout.n_inertial :])
+    return Y.reshape(len(q) * model.n_rows, -1)
+
+
+def mass_regressor(model: RobotModel, q: Array) -> Array:
+    """Return the regressor of the mass matrix: D(q, pi) = mass_regressor @ pi, drives included.
+
+    Its column j is W(q, 0, e_j) - W(q, 0, 0), in which gravity and offsets cancel.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+
+    Returns:
+        Regressors, shape (N, n_rows, n_rows, p).
+
+    Raises:
+        DataError: If q does not fit the model.
+
+    References:
+        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (11), (13).
+    """
+    N, n = len(q), model.n_rows
+    still = np.zeros((N, n))
+    at_rest = joint_torque_regressor(model, q, still, still).reshape(N, n, -1)
+    D = np.empty((N, n, n, at_rest.shape[2]))
+    for j in range(n):
+        unit = still + np.eye(n)[j]
+        D[:, :, j] = joint_torque_regressor(model, q, still, unit).reshape(N, n, -1) - at_rest
+    return D
+
+
+class InstantRegressor:
+    """The regressor of one instant at a time, without setting anything up anew.
+
+    Args:
+        model: The robot, with a fixed base.
+        columns: Indices of the standard parameters wanted, shape (c,).
+
+    Raises:
+        DataError: If the base floats.
+    """
+
+    def __init__(self, model: RobotModel, columns: Array) -> None:
+        if model.free_flyer:
+            raise DataError("a robot with a floating base has no row regressor of joints alone")
+        self._model, self._data = model, model.pin_model.createData()
+        self._columns = np.asarray(columns)
+        G = model.velocity_map
+        self._map = None if np.array_equal(G, np.eye(len(G))) else G
+        self._is_plain = self._map is None and not model.position_offset.any()
+        self._is_plain &= model.pin_model.nq == model.pin_model.nv
+        layout = model.layout
+        self._Y = np.zeros((model.n_rows, len(layout.names)))
+        # place of each drive term of each joint, couplings aside: they follow behind
+        count = len(layout.terms)
+        joints = np.arange(len(layout.joints))
+        self._places = [layout.n_inertial + joints * count + k for k in range(count)]
+
+    def __call__(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the regressor of one instant.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+            v: Velocities, shape (n,) [rad/s, m/s].
+            a: Accelerations, shape (n,) [rad/s^2, m/s^2].
+
+        Returns:
+            Regressor, shape (n, c); the same as that of :func:`joint_torque_regressor`.
+        """
+        model, layout, Y = self._model, self._model.layout, self._Y
+        x = q if self._is_plain else model.configurations(q[None])[0]
+        if self._map is None:
+            inertial = pin.computeJointTorqueRegressor(model.pin_model, self._data, x, v, a)
+        else:
+            G = self._map
+            inertial = G.T @ pin.computeJointTorqueRegressor(
+                model.pin_model, self._data, x, G @ v, G @ a
+            )
+        Y[:, : layout.n_inertial] = inertial
+        rows, value = np.arange(len(v)), {"armature": a, "viscous": v, "offset": np.ones(1)}
+        for term, place in zip(layout.terms, self._places, strict=True):
+            Y[rows, place] = np.sign(v) if term == "coulomb" else value[term]
+        if layout.couplings:
+            _write_drives(model, v[None], a[None], None, Y[None, :, layout.n_inertial :])
+        return Y[:, self._columns]
+
+    def mass(self, q: Array) -> Array:
+        """Return the regressor of the mass matrix; see :func:`mass_regressor`.
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad, m].
+
+        Returns:
+            Regressor, shape (n, n, c).
+        """
+        still, unit = np.zeros(len(q)), np.eye(len(q))
+        at_rest = self(q, still, still)
+        return np.stack([self(q, still, a) - at_rest for a in unit], axis=1)
+
+
+def build_problem(
+    model: RobotModel,
+    trajectory: Trajectory,
+    weight: Array | None = None,
+    *,
+    with_mass: bool = False,
+    compiled: bool | None = None,
+) -> Problem:
+    """Return the identification problem W pi = tau of a trajectory.
+
+    Its blocks come from Pinocchio. Its rows joint by joint, which the factors are made of, come
+    from Pinocchio too, or from the compiled path, equal to 1e-12;
+    ``problem.sources[0].engine`` and the log "robotid" say from which, and why.
+
+    Args:
+        model: The robot; the trajectory's joints must be its joints, in its order.
+        trajectory: N samples of q, v, a, tau.
+        weight: Weight of each row, shape (N, n_rows), 0 to leave it out; all 1 if None.
+        with_mass: Whether each sample also carries the regressor of its mass matrix.
+        compiled: Whether to use the compiled path where it supports the robot; None: where it is
+            installed and the trajectory is long enough to pay its start.
+
+    Returns:
+        A stream of row blocks with p columns.
+
+    Raises:
+        DataError: If joints or shapes do not fit the model.
+        MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.
+    """
+    source = trajectory_rows(model, trajectory, weight, compiled)
+    shape, weights = source.weights.shape, source.weights
+    length = max(1, min(BLOCK, _BLOCK_SIZE // (model.n_rows * len(model.layout.names))))
+
+    def stream() -> Iterator[Block]:
+        for start in range(0, shape[0], length):
+            part = slice(start, start + length)
+            W = joint_torque_regressor(
+                model,
+                trajectory.q[part],
+                trajectory.v[part],
+                trajectory.a[part],
+                None if trajectory.direction is None else trajectory.direction[part],
+            )
+            yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
+
+    def mass_stream() -> Iterator[Array]:
+        for start in range(0, shape[0], length):
+            yield mass_regressor(model, trajectory.q[start : start + length])
+
+    masses = mass_stream if with_mass else None
+    return Problem(stream, model.layout.names, model.n_rows, source.support, masses, (source,))
+
+
+def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
+    """Return the regressor at random states, which shows what any motion can excite.
+
+    The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
+    gravity and inertia weigh alike on a finger and on a crane.
+
+    Args:
+        model: The robot.
+        samples: Number N of states.
+        rng: Source of the random states.
+
+    Returns:
+        Regressors, shape (N n_rows, p).
+    """
+    n = len(model.joints)
+    rate = np.sqrt(9.81 / model.length)  # [1/s]
+    reach = np.array([model.length if j.type == "prismatic" else np.pi for j in model.limits])
+    q = rng.uniform(-1, 1, (samples, n)) * reach
+    unit = np.minimum(reach, 1.0)  # [rad or m]
+    v = rng.uniform(-1, 1, (samples, n)) * unit * rate
+    a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
+    if model.free_flyer:
+        linear = np.array([model.length] * 3 + [1.0] * 3)
+        pose = np.column_stack([np.zeros((samples, 3)), _random_quaternions(samples, rng)])
+        q = np.hstack([pose, q])
+        v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
+        a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
+    return joint_torque_regressor(model, q, v, a)
+
+
+def _write_drives(
+    model: RobotModel, v: Array, a: Array, direction: Array | None, out: Array
+) -> None:
+    """Write the columns of armature, viscous, coulomb, offset, shape (N, n_rows, drive)."""
+    out[:] = 0.0
+    signs = friction_directions(model.layout, v, direction)
+    for k, drive in enumerate(drive_columns(model.layout, model.n_rows)):
+        values = drive.values(v, a, signs)
+        for row, ratio in drive.ratios.items():
+            out[:, row, k] = ratio * values
+
+
+def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array) -> None:
+    """Write Pinocchio's joint-torque regressor at each instant, shape (N, n_rows, 10 bodies)."""
+    pin_model, G = model.pin_model, model.velocity_map
+    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
+    is_plain = np.array_equal(G, np.eye(len(G)))
+    if not is_plain:
+        v, a = v @ G.T, a @ G.T  # (N, nv)
+    instants = zip(out, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
+    for Y, q_k, v_k, a_k in instants:
+        Y_k = regressor(pin_model, data, q_k, v_k, a_k)
+        Y[:] = Y_k if is_plain else G.T @ Y_k  # tau = G^T tau_pinocchio
+
+
+def _random_quaternions(samples: int, rng: np.random.Generator) -> Array:
+    quaternions = rng.standard_normal((samples, 4))
+    unit: Array = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return unit

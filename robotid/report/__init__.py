@@ -1,0 +1,3 @@
+"""What people read: the report and comparisons."""
+
+__all__: list[str] = []

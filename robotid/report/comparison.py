@@ -1,0 +1,248 @@
+"""Several results side by side, from their result.json files only."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from robotid.exceptions import DataError
+from robotid.export.result import read_result
+
+__all__ = ["compare_results"]
+
+_FILES = ("urdf", "identification", "validation")  # settings that stand among the inputs
+
+
+def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
+    """Compare results of the same robot and the same base parameters.
+
+    Args:
+        paths: At least two result.json files.
+
+    Returns:
+        Plain values: "results" (label, path, robot, estimator, verdict), "validation" and "fitted"
+        (errors by joint, one column per result), "fitted_alike" and "remarks" (what may
+        not be compared, and why), "base_parameters" (values, standard errors, and the difference to
+        the first result over the combined standard error), "settings", "inputs" and "versions"
+        that differ.
+
+    Raises:
+        DataError: If there are fewer than two results, one cannot be read, or their base
+            parameters are not the same; the message names what differs.
+    """
+    if len(paths) < 2:
+        raise DataError(f"compare takes at least two results, found {len(paths)}")
+    results = [read_result(path) for path in paths]
+    for path, result in zip(paths[1:], results[1:], strict=True):
+        _require_same_mapping(str(paths[0]), results[0], str(path), result)
+    common, remarks = _common_recordings(results)
+    return {
+        "results": [
+            {
+                "label": _label(k),
+                "path": str(path),
+                "robot": result["robot"],
+                "estimator": result["settings"].get("estimator", {}).get("name", ""),
+                "verdict": result["verdict"],
+            }
+            for k, (path, result) in enumerate(zip(paths, results, strict=True))
+        ],
+        "validation": [
+            {
+                "log": result_log["log"],
+                "start": key[1],
+                "end": key[2],
+                "per_joint": _errors([by_key[key] for by_key in map(_by_recording, results)]),
+            }
+            for key, result_log in common.items()
+        ],
+        "fitted": _errors([result["identification"] for result in results]),
+        "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
+        "remarks": remarks,
+        "base_parameters": _base_parameters(results),
+        "settings": _differences([_settings(result) for result in results]),
+        "inputs": _inputs(results),
+        "versions": _differences([_versions(result) for result in results]),
+    }
+
+
+def _label(k: int) -> str:
+    """Return A to Z, then A2 and so on."""
+    return chr(ord("A") + k % 26) + (str(k // 26 + 1) if k >= 26 else "")
+
+
+def _require_same_mapping(
+    first: str, one: Mapping[str, Any], second: str, other: Mapping[str, Any]
+) -> None:
+    """Refuse results whose base parameters stand for other things."""
+    ours, theirs = (
+        {entry["name"]: entry["expression"] for entry in result["base_parameters"]}
+        for result in (one, other)
+    )
+    what = "compare results of one URDF, with the same joints and drive terms"
+    for has, lacks, names in (
+        (first, second, [name for name in ours if name not in theirs]),
+        (second, first, [name for name in theirs if name not in ours]),
+    ):
+        if names:
+            raise DataError(
+                f"{has} has {len(names)} base parameters that {lacks} has not: "
+                f"{_some(names)}; {what}"
+            )
+    changed = [name for name in ours if ours[name] != theirs[name]]
+    if changed:
+        name = changed[0]
+        raise DataError(
+            f"{len(changed)} base parameters stand for other sums in {first} and {second}: "
+            f"{_some(changed)}; {name} is {ours[name]} and {theirs[name]}; {what}"
+        )
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return ", ".join(names[:5]) + more
+
+
+def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:
+    """Return what was read in a role: the file's hash, or its path without one, and the window."""
+    return tuple(
+        (entry["sha256"] or entry["path"], round(entry["start"], 6), round(entry["end"], 6))
+        for entry in result["inputs"]
+        if entry.get("role") == role
+    )
+
+
+def _by_recording(result: Mapping[str, Any]) -> dict[tuple[Any, ...], dict[str, Any]]:
+    return dict(zip(_recordings(result, "validation"), result["validation"], strict=True))
+
+
+def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
+    """Return how a validation recording was prepared, and how many rows of it are used."""
+    entries = [entry for entry in result["inputs"] if entry.get("role") == "validation"]
+    entry = entries[_recordings(result, "validation").index(key)]
+    return {**entry["signals"], "rows": entry["rows_used"]}
+
+
+def _common_recordings(
+    results: Sequence[Mapping[str, Any]],
+) -> tuple[dict[tuple[Any, ...], dict[str, Any]], list[str]]:
+    """Return the validation recordings that every result has, and what is not comparable."""
+    each = [_by_recording(result) for result in results]
+    common = {k: v for k, v in each[0].items() if all(k in other for other in each[1:])}
+    remarks = []
+    for k, by_recording in enumerate(each):
+        left = [Path(v["log"]).name for key, v in by_recording.items() if key not in common]
+        if left:
+            remarks.append(
+                f"{_label(k)} was validated on {', '.join(left)}, which not every result was: "
+                "these errors are not compared"
+            )
+    if not common:
+        remarks.append(
+            "no validation recording is common to all results: their errors of prediction cannot "
+            "be compared; run 'robotid validate' on one log with each"
+        )
+    for key, entry in common.items():
+        prepared = [_flat(_signals(result, key)) for result in results]
+        if other := [f"{d['name']} {' | '.join(d['values'])}" for d in _differences(prepared)]:
+            remarks.append(
+                f"{Path(entry['log']).name} was prepared in other ways ({'; '.join(other)}): a "
+                "smoother torque, and fewer rows, are easier to predict"
+            )
+    return common, remarks
+
+
+def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return error and RMSE of each joint, one entry per result; None where a joint has no rows."""
+    joints = dict.fromkeys(joint for m in metrics for joint in m["per_joint"])
+    table = []
+    for joint in joints:
+        cells = [m["per_joint"].get(joint, {}) for m in metrics]
+        table.append(
+            {
+                "joint": joint,
+                "unit": next(cell["unit"] for cell in cells if cell),
+                "relative_error_pct": [cell.get("relative_error_pct") for cell in cells],
+                "rmse": [cell.get("rmse") for cell in cells],
+            }
+        )
+    return table
+
+
+def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return values beside each other, with (b_k - b_1) / sqrt(s_k^2 + s_1^2)."""
+    each = [{e["name"]: e for e in result["base_parameters"]} for result in results]
+    return [
+        {
+            "name": name,
+            "unit": first["unit"],
+            "expression": first["expression"],
+            "values": [by_name[name]["value"] for by_name in each],
+            "std_errors": [by_name[name]["std_error"] for by_name in each],
+            "differences": [_difference(first, by_name[name]) for by_name in each[1:]],
+        }
+        for name, first in each[0].items()
+    ]
+
+
+def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | None:
+    if one["std_error"] is None or other["std_error"] is None:
+        return None
+    combined = math.hypot(one["std_error"], other["std_error"])
+    return (other["value"] - one["value"]) / combined if combined > 0 else None
+
+
+def _settings(result: Mapping[str, Any]) -> dict[str, str]:
+    """Return the settings of a job, flat; recordings stand among the inputs."""
+    chosen = {k: v for k, v in result["settings"].items() if k not in _FILES}
+    return _flat(chosen)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    found: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = _plain(value)
+    return found
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list):
+        return ", ".join(_plain(v) for v in value) or "none"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _versions(result: Mapping[str, Any]) -> dict[str, str]:
+    return dict(result.get("versions", {"robotid": result["robotid"]}))
+
+
+def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+    """Return the keys whose values are not the same everywhere; "" where a key is missing."""
+    keys = dict.fromkeys(key for values in each for key in values)
+    rows = [{"name": key, "values": [values.get(key, "") for values in each]} for key in keys]
+    return [row for row in rows if len(set(row["values"])) > 1]
+
+
+def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return every file and window with who read it, those that all have last."""
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for k, result in enumerate(results):
+        for entry in result["inputs"]:
+            role, window = entry.get("role", ""), (entry.get("start"), entry.get("end"))
+            row = found.setdefault(
+                (role, entry["sha256"] or entry["path"], *window),
+                {
+                    "role": role,
+                    "path": entry["path"],
+                    "sha256": entry["sha256"],
+                    "start": window[0],
+                    "end": window[1],
+                    "in": [False] * len(results),
+                },
+            )
+            row["in"][k] = True
+    return sorted(found.values(), key=lambda row: all(row["in"]))

@@ -1,0 +1,316 @@
+"""The report: one HTML file that reads without a network, on a screen, a phone or paper."""
+
+import os
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from robotid import __version__
+from robotid.exceptions import DataError
+from robotid.identification.bands import TorqueBand
+from robotid.identification.evaluation import Evaluation
+from robotid.identification.metrics import JointMetrics, Metrics
+from robotid.identification.pipeline import Identification
+from robotid.identification.verdict import Finding
+from robotid.logs.signals import SignalSettings
+from robotid.report.consistency import consistency_notes
+from robotid.report.diagnosis import (
+    drive_figures,
+    information_section,
+    residual_section,
+    version_table,
+)
+from robotid.report.page import code, figure, number, page, percent, table, text
+from robotid.report.plots import plot_body, plot_torque
+from robotid.report.tables import (
+    base_table,
+    consistency_table,
+    drive_table,
+    input_table,
+    open_section,
+    settings_tables,
+    standard_table,
+)
+from robotid.robot.parameters import INERTIAL_TERMS
+
+__all__ = ["write_report"]
+
+_POINTS = 120_000  # points of all lines together: about 2 MB
+_LONGEST = 2000  # points of one line
+_MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
+_SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
+_SECTIONS = {
+    "errors": "Prediction errors",
+    "torques": "Torques over time",
+    "residuals": "What the residuals hold",
+    "drives": "Drive parameters",
+    "base": "Base parameters",
+    "standard": "Standard parameters",
+    "consistency": "Physical consistency",
+    "information": "Excitation and correlation",
+    "open": "What the data do not determine",
+    "warnings": "Warnings and notes",
+    "settings": "Settings",
+    "inputs": "Inputs",
+    "versions": "Versions",
+}
+_ESTIMATORS = {
+    "ols": "ordinary least squares (ols)",
+    "wls": "weighted least squares, rows weighted by the noise of their joint (wls)",
+    "tls": "total least squares, which allows for noise of the regressor, too (tls)",
+    "rls": "recursive least squares, sample by sample (rls)",
+    "kalman": "a Kalman filter over the samples (kalman)",
+    "prx": "steps along the gradient PRX, sample by sample (prx)",
+    "gradient": "normalised gradient steps, sample by sample (gradient)",
+    "consistent": "weighted least squares that keeps every body physically possible and leaves "
+    "the URDF's value where the data say nothing (consistent)",
+    "log_cholesky": "the consistent fit without a cone, in log-Cholesky parameters (log_cholesky)",
+}
+
+
+def write_report(
+    identification: Identification, target: str | Path, *, findings: Sequence[Finding] = ()
+) -> Path:
+    """Write what an identification found, and how far to trust it, as one HTML file.
+
+    The file fetches nothing. It is made beside its target and then put in place.
+
+    Args:
+        identification: What was found.
+        target: The file to write.
+        findings: Warnings to show; notes of the logs that are not among them are added.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        DataError: If the folder of the target does not exist.
+    """
+    path = Path(target)
+    if not path.parent.is_dir():
+        raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
+    contents = {
+        "errors": _errors(identification),
+        "torques": _torques(identification),
+        "residuals": residual_section(identification),
+        "drives": drive_figures(identification) + drive_table(identification),
+        "base": base_table(identification),
+        "standard": _standard(identification),
+        "consistency": consistency_table(identification) + consistency_notes(identification),
+        "information": information_section(identification),
+        "open": open_section(identification),
+        "warnings": _warnings(identification, findings),
+        "settings": settings_tables(identification),
+        "inputs": input_table(identification),
+        "versions": version_table(),
+    }
+    links = "".join(f'<a href="#{key}">{title}</a> ' for key, title in _SECTIONS.items())
+    nav = f'<nav aria-label="Sections">{links}</nav>'
+    sections = "".join(
+        f'<section aria-labelledby="{key}">\n<h2 id="{key}">{title}</h2>\n'
+        f"{contents[key]}</section>\n"
+        for key, title in _SECTIONS.items()
+    )
+    title = f"{identification.model.name}: identified parameters"
+    html = page(title, f"{_summary(identification)}{nav}\n{sections}")
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(html, encoding="utf-8")
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+    return path
+
+
+def _summary(found: Identification) -> str:
+    verdict, fitted, kept = found.verdict, found.identification, found.validation
+    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
+    samples = sum(e.recording.extent.smooth for e in fitted)
+    rows = sum(e.recording.extent.rows_used for e in fitted)
+    chains = sorted({_chain(e.recording.signals) for e in (*fitted, *kept)})
+    said = (
+        f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
+        f"{_names(fitted)} ({samples} samples after filtering, {rows} torque rows used) by "
+        f"{_ESTIMATORS[found.estimator.name]}. "
+        + (f"Kept apart for validation: {_names(kept)}. " if kept else "No log was kept apart. ")
+        + f"Signals: {'; or '.join(chains)}."
+    )
+    return (
+        f"<header>\n<h1>{escape(found.model.name)}</h1>\n"
+        f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
+        f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n"
+        f'<p class="note">Written by robotid {__version__}. SI units throughout; inertial '
+        "parameters in Pinocchio's order, inertias about the joint frame.</p>\n</header>\n"
+    )
+
+
+def _chain(signals: SignalSettings) -> str:
+    cutoff = "no filter"
+    if signals.cutoff is not None:
+        cutoff = (
+            f"zero-phase Butterworth low-pass, cut-off {signals.cutoff:g} Hz, order "
+            f"{signals.order} run forward and backward"
+        )
+    rate = f"grid of {signals.rate:.6g} Hz" if signals.rate else "rows as they were recorded"
+    return f"{cutoff}, {rate}, velocity {signals.velocity}"
+
+
+def _names(evaluations: Sequence[Evaluation]) -> str:
+    return ", ".join(e.recording.name for e in evaluations)
+
+
+def _errors(found: Identification) -> str:
+    tables = [
+        _error_table(
+            f"{e.recording.name}: not fitted", found, e.metrics["estimate"], e.metrics["wls"]
+        )
+        for e in found.validation
+    ]
+    count = len(found.identification)
+    fitted = "All fitted rows together" if count > 1 else f"{_names(found.identification)}: fitted"
+    tables.append(_error_table(fitted, found, found.metrics(), found.metrics("wls")))
+    return (
+        "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
+        "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
+        "without drive parameters, of its gravity torque alone, and of predicting zero.</p>\n"
+        + "".join(tables)
+    )
+
+
+def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metrics) -> str:
+    headers = ["joint", "error %", "RMSE", "unit", "R²", "rows", "WLS %", "URDF %"]
+    headers += ["gravity only %", "zero %", "verdict", "remark"]
+    rows, verdicts = [], found.verdict.joints
+    for name in found.model.row_names:
+        m, status = ours.per_joint.get(name), verdicts[name].status if name in verdicts else "–"
+        if m is None:
+            dash = number(None)
+            nothing = text("does not move: no rows used")
+            rows.append([code(name), dash, dash, text(""), *[dash] * 6, text(status), nothing])
+            continue
+        rows.append(
+            [
+                code(name),
+                percent(m.relative_error_pct),
+                number(m.rmse, ".3g"),
+                text(m.unit),
+                number(m.r2, ".3f"),
+                number(m.rows, "d"),
+                percent(wls.per_joint[name].relative_error_pct),
+                percent(m.baselines["urdf"]),
+                percent(m.baselines["gravity_only"]),
+                percent(None if m.relative_error_pct is None else 100.0),
+                text(status, flag=status == "poor"),
+                text(_remark(m), flag=True),
+            ]
+        )
+    return table(caption, headers, rows)
+
+
+def _remark(measured: JointMetrics) -> str:
+    remarks = []
+    if not measured.better_than_constant:
+        remarks.append("worse than a constant")
+    error, urdf = measured.relative_error_pct, measured.baselines["urdf"]
+    if error is not None and urdf is not None and error > urdf:
+        remarks.append("worse than the URDF")
+    return ", ".join(remarks)
+
+
+def _torques(found: Identification) -> str:
+    model, evaluations = found.model, found.validation or found.identification
+    shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
+    points = min(_LONGEST, max(200, _POINTS // (3 * model.n_rows * len(shown))))
+    parts = [
+        "<p>Measured and predicted torque; below, the residual (measured − predicted) with its "
+        "95 % band, from the uncertainty of the parameters and the noise of the fit. Shaded: "
+        "rows not used, because the joint stands still and the sign of its friction is unknown. "
+        f"Lines end at gaps of the recording. At most about {points} points per line, extremes "
+        "kept.</p>\n"
+    ]
+    if not found.validation:
+        parts.append("<p>No log was kept apart: these are the fitted logs.</p>\n")
+    for k, evaluation in enumerate(shown):
+        kind = "not fitted" if found.validation else "fitted"
+        parts.append(f"<h3>{escape(evaluation.recording.name)}: {kind}</h3>\n")
+        if evaluation.recording.is_partial:
+            seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth
+            parts.append(
+                f"<p>A long log: {seen} of its {whole} samples are drawn, from its beginning, "
+                "middle and end; errors are of all.</p>\n"
+            )
+        band = found.band(evaluation)
+        figures = "".join(
+            _torque_figure(evaluation, band, row, name, unit, f"tau{k}-{row}", points)
+            for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True))
+        )
+        parts.append(f'<div class="plots">\n{figures}</div>\n')
+    if left := evaluations[len(shown) :]:
+        parts.append(f"<p>Not drawn, to keep the file small: {escape(_names(left))}.</p>\n")
+    return "".join(parts)
+
+
+def _torque_figure(
+    e: Evaluation, band: TorqueBand, row: int, name: str, unit: str, key: str, points: int
+) -> str:
+    measured = e.metrics["estimate"].per_joint.get(name)
+    said = "no rows used"
+    if measured is not None:
+        error = percent(measured.relative_error_pct).html
+        recording = e.recording
+        held = band.held(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
+        said = (
+            f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band holds {100 * held:.0f} %"
+        )
+    title = f"Measured and predicted torque and residual of {name} over time; {said}"
+    svg = plot_torque(e, row, band, unit=unit, title=title, key=key, points=points)
+    return figure(f"<strong>{escape(name)}</strong>: {said}", svg)
+
+
+def _standard(found: Identification) -> str:
+    figures = "".join(
+        figure(f"<strong>{escape(body)}</strong>", _body_plot(found, i))
+        for i, body in enumerate(found.model.layout.bodies)
+    )
+    return (
+        "<p>One of many sets with the same torque: the data fix the base parameters only, the "
+        "rest follows the URDF. Source: data, where the standard error is below 30 % of the "
+        "spread assumed before the fit; prior, above 90 %; mixed between.</p>\n"
+        f'<div class="plots">\n{figures}</div>\n{standard_table(found)}'
+    )
+
+
+def _body_plot(found: Identification, i: int) -> str:
+    part = slice(10 * i, 10 * i + 10)
+    return plot_body(
+        INERTIAL_TERMS,
+        found.prior[part],
+        found.standard[part],
+        found.standard_error[part],
+        found.prior_std[part],
+        title=f"Parameters of {found.model.layout.bodies[i]} with error bars, beside the URDF's",
+        key=f"body{i}",
+    )
+
+
+def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
+    known = [finding.message for finding in findings]
+    notes = [
+        Finding("log_note", "note", str(e.recording.log.path), note)
+        for e in (*found.identification, *found.validation)
+        for note in e.recording.log.notes
+        if not any(message.endswith(note) for message in known)
+    ]
+    if not findings and not notes:
+        return "<p>None.</p>\n"
+    every = [*findings, *notes]
+    tables = ""
+    for severity, title in _SEVERITIES.items():
+        rows = [
+            [code(f.code), text(f.message, flag=severity == "error"), code(f.where)]
+            for f in every
+            if f.severity == severity
+        ]
+        if rows:
+            tables += table(f"{title}: {len(rows)}", ["code", "message", "about"], rows)
+    return tables

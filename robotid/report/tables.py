@@ -1,0 +1,290 @@
+"""The report's tables of parameters, settings and inputs."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from robotid.export.result import file_sha256
+from robotid.identification.evaluation import Recording
+from robotid.identification.pipeline import Identification
+from robotid.identification.settings import KEYS
+from robotid.report.page import Cell, code, number, percent, table, text
+from robotid.robot.parameters import pseudo_inertia
+
+__all__ = [
+    "base_table",
+    "consistency_table",
+    "drive_table",
+    "input_table",
+    "open_section",
+    "settings_tables",
+    "standard_table",
+]
+
+
+def drive_table(found: Identification) -> str:
+    """Return the table of the drive parameters.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    first = found.model.layout.n_inertial
+    names = found.model.layout.drive_names
+    if not names:
+        return "<p>None was identified.</p>\n"
+    sources = found.sources
+    rows = [
+        [
+            code(name),
+            *_value(found.standard[i], found.standard_error[i]),
+            text(unit),
+            text(sources[i]),
+        ]
+        for i, (name, unit) in enumerate(
+            zip(names, found.model.layout.units[first:], strict=True), start=first
+        )
+    ]
+    headers = ["parameter", "value", "standard error", "relative %", "unit", "from"]
+    return table("Armature, friction and torque offset", headers, rows)
+
+
+def base_table(found: Identification) -> str:
+    """Return the table of the base parameters.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    mapping, units = found.mapping, found.model.layout.units
+    rows = [
+        [code(name), *_value(found.base[k], found.base_error[k]), text(units[i]), code(expression)]
+        for k, (name, i, expression) in enumerate(
+            zip(mapping.base_names, mapping.independent, mapping.expressions, strict=True)
+        )
+    ]
+    headers = ["parameter", "value", "standard error", "relative %", "unit", "stands for"]
+    return (
+        "<p>The combinations of parameters that torque depends on. Each is named after one of "
+        "its terms; a dash as standard error: not determined by the data. Standard errors rest "
+        f"on {escape(found.errors.method)}.</p>\n" + table("Base parameters", headers, rows)
+    )
+
+
+def standard_table(found: Identification) -> str:
+    """Return the table of the inertial parameters of the bodies.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    layout = found.model.layout
+    rows = [
+        [
+            code(name),
+            number(found.prior[i]),
+            number(found.standard[i]),
+            number(found.standard_error[i], ".2g"),
+            text(layout.units[i]),
+            text(found.sources[i]),
+        ]
+        for i, name in enumerate(layout.inertial_names)
+    ]
+    headers = ["parameter", "URDF", "identified", "standard error", "unit", "source"]
+    return table("Standard parameters of the bodies", headers, rows)
+
+
+def consistency_table(found: Identification) -> str:
+    """Return masses and pseudo-inertias, before and after, and their totals.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    layout = found.model.layout
+    before, after = (
+        pseudo_inertia(pi[: layout.n_inertial]) for pi in (found.prior, found.standard)
+    )
+    low_before, low_after = (np.linalg.eigvalsh(J)[:, 0] for J in (before, after))
+    rows = [
+        [
+            code(body),
+            number(before[i, 3, 3]),
+            number(after[i, 3, 3]),
+            number(low_before[i], ".3g"),
+            number(low_after[i], ".3g"),
+            text("" if low_after[i] > 0 else "not possible", flag=True),
+        ]
+        for i, body in enumerate(layout.bodies)
+    ]
+    totals = [number(float(J[:, 3, 3].sum())) for J in (before, after)]
+    foot = [text("total"), *totals, text(""), text(""), text("")]
+    headers = ["body", "mass, URDF [kg]", "mass [kg]", "smallest eigenvalue, URDF"]
+    headers += ["smallest eigenvalue", "remark"]
+    said = "Every body and drive is" if found.is_consistent else "Not every body and drive is"
+    return (
+        f"<p>{said} physically possible. A body is possible when the smallest eigenvalue of its "
+        "pseudo-inertia is positive; a drive, when armature and friction are not negative.</p>\n"
+        + table("Mass and pseudo-inertia of each body", headers, rows, foot)
+    )
+
+
+def open_section(found: Identification) -> str:
+    """Return what the data do not determine.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    wls, layout = found.wls, found.model.layout
+    kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
+    return (
+        f"<p>The data determine {found.determination.rank} of {len(found.base)} base parameters; "
+        f"condition number {wls.condition:.3g} (columns scaled to unit norm).</p>\n"
+        + _not_told_apart(found)
+        + _listed("Parameters that no motion can show", found.mapping.unidentifiable)
+        + _combinations(found)
+        + _listed("Standard parameters that remain as the URDF has them, or nearly", kept)
+    )
+
+
+def _not_told_apart(found: Identification) -> str:
+    """Return which base parameters the data do not tell apart, and what of them they determine."""
+    groups = found.determination.merged
+    title = "Base parameters that the data do not determine by themselves"
+    if not groups:
+        return _listed(title, ())
+    parts = [
+        f"<h3>{title}</h3>\n<p>A direction counts as determined if the data shrink its plausible "
+        "spread by a tenth or more. Factors are in SI units; terms of less than 5 % of the largest "
+        "one, each times its spread, are left out. result.json has all.</p>\n"
+    ]
+    for group in groups:
+        names = ", ".join(code(name).html for name in group.names)
+        sums = "<br>".join(code(str(combination)).html for combination in group.combinations)
+        parts.append(
+            f'<p>Of</p>\n<p class="code">{names}</p>\n<p>only this is determined:</p>\n'
+            f'<p class="code">{sums}</p>\n'
+            if sums
+            else f'<p>Nothing is determined of</p>\n<p class="code">{names}</p>\n'
+        )
+    return "".join(parts)
+
+
+def _combinations(found: Identification) -> str:
+    """Return per body which parameters motion shows one by one, in sums only, or never."""
+    layout = found.model.layout
+    rows = []
+    for i, body in enumerate(layout.bodies):
+        names = layout.names[10 * i : 10 * i + 10]
+        kinds = found.mapping.in_words(names)
+        short = {key: ", ".join(n.rsplit(".", 1)[1] for n in kinds[key]) or "–" for key in kinds}
+        rows.append([code(body), *[text(short[key]) for key in ("alone", "in sums", "never")]])
+    return table(
+        "What any motion can show of each body",
+        ["body", "by itself", "only in sums with others (see base parameters)", "never"],
+        rows,
+    )
+
+
+def settings_tables(found: Identification) -> str:
+    """Return the tables of the settings, as used.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    model = found.model
+    gravity = ", ".join(f"{g:g}" for g in np.asarray(model.pin_model.gravity.linear).tolist())
+    pairs = {"estimator": found.estimator.name}
+    for key in KEYS[found.estimator.name]:
+        pairs[key.replace("_", " ")] = str(getattr(found.estimator, key))
+    pairs["solver"] = f"{found.estimate.message} ({found.estimate.n_iter} iterations)"
+    pairs["drive terms"] = ", ".join(model.layout.terms) or "none"
+    pairs["gravity [m/s²]"] = gravity
+    pairs["base"] = "floating" if model.free_flyer else "fixed"
+    pairs["joints"] = ", ".join(model.joints)
+    pairs["locked joints"] = ", ".join(f"{k} = {v:g}" for k, v in model.locked.items()) or "none"
+    for coupling in model.layout.couplings:
+        ratios = ", ".join(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
+        pairs[f"coupling {coupling.name}"] = ratios
+    rows = [[text(key), text(value)] for key, value in pairs.items()]
+    headers = ["log", "filter", "rate Hz", "velocity", "trim s", "least speed", "gap s"]
+    signals = [_signal_row(e.recording) for e in (*found.identification, *found.validation)]
+    return table("Model and estimator", ["setting", "value"], rows) + table(
+        "Signals, as used for each log; least speed in rad/s or m/s", headers, signals
+    )
+
+
+def input_table(found: Identification) -> str:
+    """Return the table of the files that were read.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        HTML.
+    """
+    urdf = found.model.tree.path
+    rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
+    for role, evaluations in (("fitted", found.identification), ("validation", found.validation)):
+        rows += [[text(role), *_input_row(e.recording)] for e in evaluations]
+    headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "stretches", "SHA-256"]
+    return table("Files read", headers, rows)
+
+
+def _value(value: float, error: float) -> list[Cell]:
+    relative = 100 * error / abs(value) if value else None
+    share = percent(relative) if relative is None or relative < 1000 else Cell("&gt; 999", "number")
+    return [number(value), number(error, ".2g"), share]
+
+
+def _listed(title: str, names: Sequence[str]) -> str:
+    listed = ", ".join(code(name).html for name in names) or "none"
+    return f'<h3>{title}</h3>\n<p class="code">{listed}</p>\n'
+
+
+def _signal_row(recording: Recording) -> list[Cell]:
+    s = recording.signals
+    return [
+        code(recording.name),
+        text("none" if s.cutoff is None else f"{s.cutoff:g} Hz, order {s.order}"),
+        number(s.rate, ".6g"),
+        text(s.velocity),
+        number(s.trim, ".3g"),
+        number(s.min_velocity, ".3g"),
+        number(s.max_gap, ".3g"),
+    ]
+
+
+def _input_row(recording: Recording) -> list[Cell]:
+    extent = recording.extent
+    return [
+        code(str(recording.log.path)),
+        number(extent.samples, "d"),
+        number(extent.rate, ".5g"),
+        number(extent.start, ".6g"),
+        number(extent.end, ".6g"),
+        number(extent.segments, "d"),
+        code(_sha256(str(recording.log.path))),
+    ]
+
+
+def _sha256(path: str) -> str:
+    if not path or not Path(path).exists():
+        return "not read from a file"
+    return file_sha256(path)

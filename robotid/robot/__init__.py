@@ -1,0 +1,3 @@
+"""What the robot is: its URDF, parameters, drives, dynamics and geometry."""
+
+__all__: list[str] = []

@@ -1,0 +1,95 @@
+"""Which link's mass is in which body: links joined by fixed or locked joints are one body."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.robot.tree import Inertial
+
+__all__ = ["LinkPlace", "held_parameters", "link_places"]
+
+
+@dataclass(frozen=True)
+class LinkPlace:
+    """Where a link sits in the model.
+
+    Attributes:
+        link: Name of the link.
+        body: Index of its body in ``layout.bodies``; -1 if it is fixed to the world.
+        role: "moved": the link that the body's joint moves; "fixed": joined to it by fixed joints
+            alone; "held": behind a locked joint.
+        parameters: Its inertial parameters in the body's frame, shape (10,); 0 without inertial.
+    """
+
+    link: str
+    body: int
+    role: str
+    parameters: Array
+
+    @property
+    def is_lumped(self) -> bool:
+        """Whether its mass counts as that of the moved link of its body."""
+        return self.body >= 0 and self.role == "fixed"
+
+
+def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
+    """Return where each link of the URDF sits in the model, in the order of the file.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        One place per link.
+    """
+    arriving = {joint.child: joint for joint in model.tree.joints}
+    places = []
+    for link in model.tree.links:
+        frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
+        body = frame.parentJoint - 1
+        role, at = "moved", link
+        while at in arriving and (body < 0 or at != model.layout.bodies[body]):
+            joint = arriving[at]
+            role = "held" if joint.is_movable or role == "held" else "fixed"
+            at = joint.parent
+        inertial = model.tree.inertials.get(link)
+        parameters = np.zeros(10)
+        if inertial is not None:
+            # a pseudo-inertia moves with a homogeneous matrix H as H J H^T, massless links too
+            (J,) = pseudo_inertia(_inertial_parameters(inertial))
+            H = frame.placement.homogeneous
+            parameters = inertial_from_pseudo_inertia(H @ J @ H.T)
+        places.append(LinkPlace(link, body, role, parameters))
+    return tuple(places)
+
+
+def held_parameters(model: RobotModel) -> Array:
+    """Return the share of each body that belongs to links on locked joints.
+
+    They keep the inertials the URDF gives them, so the rest of the body must be possible alone.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Inertial parameters, shape (10 bodies,).
+    """
+    held = np.zeros((len(model.layout.bodies), 10))
+    for place in link_places(model):
+        if place.body >= 0 and place.role == "held":
+            held[place.body] += place.parameters
+    return held.reshape(-1)
+
+
+def _inertial_parameters(inertial: Inertial) -> Array:
+    """Return the ten inertial parameters of a link about its own frame."""
+    ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
+    moments = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    R = pin.rpy.rpyToMatrix(*inertial.rpy)
+    m, c = inertial.mass, np.array(inertial.com)
+    about_origin = R @ moments @ R.T + m * (c @ c * np.eye(3) - np.outer(c, c))
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_origin.tolist()
+    return np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])

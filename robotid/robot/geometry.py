@@ -1,0 +1,170 @@
+"""The extent of each body by the URDF's collision or visual geometry, for bounds on its mass."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.robot.bodies import link_places
+from robotid.robot.meshes import find_mesh
+from robotid.robot.model import RobotModel
+
+__all__ = ["body_points", "box_half_spaces", "geometry_half_spaces", "hull_half_spaces"]
+
+_SIDES = 16  # of the prism around a cylinder
+_MOST_FACES = 100  # a hull with more is replaced by a polytope of this many faces around it
+
+
+def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
+    """Return where the URDF's geometry allows the centres of mass to be.
+
+    Args:
+        model: The robot.
+        shape: "box" or "hull" of each body's geometry, or "none".
+
+    Returns:
+        Half-spaces A c <= b in the frame of each body's moved link, by its name; see
+        :func:`body_points` for the bodies that have none.
+
+    Raises:
+        SettingsError: If geometry is asked for and no body has any that can be read.
+    """
+    if shape == "none":
+        return {}
+    points = body_points(model)
+    if not points:
+        raise SettingsError(
+            f"com_within is {shape!r}, but no link has geometry in {Path(model.tree.path).name} "
+            "whose meshes are found; state boxes with 'com', or leave it out"
+        )
+    around = box_half_spaces if shape == "box" else hull_half_spaces
+    return {body: around(cloud) for body, cloud in points.items()}
+
+
+def body_points(model: RobotModel) -> dict[str, Array]:
+    """Return points whose convex hull holds each body, in the frame of its moved link.
+
+    A link's collision geometry counts, or its visual one if it has none. Curved shapes are
+    replaced by polyhedra around them. A body of which a link with mass has no geometry, or a mesh
+    that is not found, is left out: nothing bounds its mass.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Points by name of the body, shape (k, 3) [m].
+    """
+    source = Path(model.tree.path)
+    links = {element.get("name"): element for element in ET.parse(source).getroot().iter("link")}
+    found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
+    open_bodies = set()
+    for place in link_places(model):
+        if place.body < 0:
+            continue
+        body = model.layout.bodies[place.body]
+        points = _link_points(links[place.link], source)
+        if points is None or (not len(points) and place.parameters.any()):
+            open_bodies.add(body)
+        elif len(points):
+            index = model.pin_model.getFrameId(place.link, pin.FrameType.BODY)
+            found[body].append(_moved(points, model.pin_model.frames[index].placement.homogeneous))
+    return {
+        body: np.vstack(parts) for body, parts in found.items() if parts and body not in open_bodies
+    }
+
+
+def box_half_spaces(points: Array) -> tuple[Array, Array]:
+    """Return the axis-parallel box around points as half-spaces A c <= b.
+
+    Args:
+        points: Shape (k, 3) [m].
+
+    Returns:
+        A, shape (6, 3), and b, shape (6,) [m].
+    """
+    A = np.vstack([np.eye(3), -np.eye(3)])
+    return A, (A @ points.T).max(axis=1)
+
+
+def hull_half_spaces(points: Array) -> tuple[Array, Array]:
+    """Return the convex hull of points as half-spaces A c <= b.
+
+    Args:
+        points: Shape (k, 3) [m].
+
+    Returns:
+        A, unit rows, shape (f, 3), and b, shape (f,) [m]. Beyond 100 faces it is the polytope of
+        100 directions spread over the sphere that touches the hull from outside; flat points give
+        their box.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        planes = ConvexHull(points).equations  # n^T x + o <= 0
+    except QhullError:  # all points in one plane
+        return box_half_spaces(points)
+    planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
+    if len(planes) <= _MOST_FACES:
+        return planes[:, :3], -planes[:, 3]
+    k = np.arange(_MOST_FACES) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
+    A = np.column_stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
+    return A, (A @ points.T).max(axis=1)
+
+
+def _link_points(link: ET.Element, source: Path) -> Array | None:
+    """Return points of a link's geometry in its frame; None if a mesh is not found."""
+    elements = link.findall("collision") or link.findall("visual")
+    parts = [np.zeros((0, 3))]
+    for element in elements:
+        shape = element.find("geometry/*")
+        points = None if shape is None else _shape_points(shape, source)
+        if points is None:
+            return None
+        parts.append(_moved(points, _origin(element)))
+    return np.vstack(parts)
+
+
+def _shape_points(shape: ET.Element, source: Path) -> Array | None:
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    if shape.tag == "box":
+        return 0.5 * corners * _three(shape.get("size", ""))
+    if shape.tag == "sphere":
+        return corners * float(shape.get("radius", "nan"))
+    if shape.tag == "cylinder":
+        turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
+        radius = float(shape.get("radius", "nan")) / np.cos(np.pi / _SIDES)
+        ring = radius * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+        half = 0.5 * float(shape.get("length", "nan")) * np.array([0.0, 0.0, 1.0])
+        return np.vstack([ring - half, ring + half])
+    if shape.tag != "mesh":
+        return None
+    path = find_mesh(shape.get("filename", ""), source)
+    if path is None:
+        return None
+    import trimesh
+
+    vertices: Array = np.array(trimesh.load_mesh(path).vertices)
+    scaled: Array = vertices * _three(shape.get("scale", "1 1 1"))
+    return scaled
+
+
+def _origin(element: ET.Element) -> Array:
+    origin = element.find("origin")
+    H = np.eye(4)
+    if origin is not None:
+        H[:3, :3] = pin.rpy.rpyToMatrix(*_three(origin.get("rpy", "0 0 0")))
+        H[:3, 3] = _three(origin.get("xyz", "0 0 0"))
+    return H
+
+
+def _moved(points: Array, H: Array) -> Array:
+    moved: Array = points @ H[:3, :3].T + H[:3, 3]
+    return moved
+
+
+def _three(text: str) -> Array:
+    return np.array([float(word) for word in text.split()]).reshape(3)

@@ -1,0 +1,288 @@
+"""What a robot looks like: the ``<visual>`` shapes of its URDF, meshes found, read and thinned."""
+
+import os
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import MissingDependencyError
+from robotid.robot.examples import example_urdfs
+
+__all__ = ["Surface", "Visual", "find_mesh", "read_surfaces", "read_visuals", "thin"]
+
+GREY = (0.6, 0.65, 0.7, 1.0)  # what has no colour
+_CREASE = np.radians(30.0)  # faces that meet at a sharper angle than this show an edge
+_FIRST_CELL = 1 / 4000  # size of the first cells over that of the largest surface
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of one colour.
+
+    Attributes:
+        vertices: Corners, shape (V, 3) [m].
+        faces: Triangles as indices of corners, shape (F, 3).
+        rgba: Colour, shape (4,), 0 to 1; None if the file states none.
+    """
+
+    vertices: Array
+    faces: Array
+    rgba: tuple[float, ...] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """One ``<visual>`` of a link.
+
+    Attributes:
+        link: Name of the link.
+        placement: Pose in the link's frame, shape (4, 4).
+        shape: "mesh", "box", "cylinder" or "sphere".
+        size: Scale of a mesh [-]; edges of a box, radius and length of a cylinder, radius of a
+            sphere [m].
+        file: What the URDF calls the mesh; empty if it is none.
+        rgba: Colour that the URDF states, shape (4,), 0 to 1; None if it states none.
+    """
+
+    link: str
+    placement: Array
+    shape: str
+    size: tuple[float, ...]
+    file: str
+    rgba: tuple[float, ...] | None
+
+
+def read_visuals(path: str | Path) -> tuple[Visual, ...]:
+    """Return the visual shapes of a URDF; one that is not understood is left out.
+
+    Args:
+        path: The URDF file, which a model was built from.
+
+    Returns:
+        The shapes, in the order of the file.
+    """
+    root = ET.fromstring(Path(path).read_bytes())
+    colours = {m.get("name"): _colour(m) for m in root.findall("material")}
+    found = []
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            shape = _shape(visual)
+            if shape is None:
+                continue
+            material = visual.find("material")
+            rgba = None
+            if material is not None:
+                rgba = _colour(material) or colours.get(material.get("name"))
+            placement = _placement(visual.find("origin"))
+            found.append(Visual(link.get("name", ""), placement, *shape, rgba))
+    return tuple(found)
+
+
+def find_mesh(name: str, urdf: str | Path) -> Path | None:
+    """Return the file of a mesh.
+
+    A path with ``package://`` or none is looked for in ROS_PACKAGE_PATH, in the URDF's folder and
+    those above it, and in example-robot-data, with the name of its package and without it.
+
+    Args:
+        name: What the URDF calls it.
+        urdf: The URDF file.
+
+    Returns:
+        Path of the file; None if there is none.
+    """
+    if name.startswith("file://"):
+        path = Path(name.removeprefix("file://"))
+        return path if path.is_file() else None
+    is_package = re.match(r"(package|model)://", name) is not None
+    inside = re.sub(r"^(package|model)://", "", name).lstrip("/")
+    whole = Path(name)
+    if not is_package and whole.is_absolute():
+        return whole if whole.is_file() else None
+    _, _, without = inside.partition("/")
+    for folder in _folders(Path(urdf)):
+        if (folder / inside).is_file():
+            return folder / inside
+        # the folder may be that of the package, whatever it is called here
+        if is_package and without and (folder / without).is_file():
+            return folder / without
+    return None
+
+
+def read_surfaces(path: Path) -> tuple[Surface, ...]:
+    """Read a mesh: STL, DAE, OBJ, PLY or what else trimesh reads.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its surfaces [m], none if it holds no triangles.
+
+    Raises:
+        ValueError: If the file cannot be read.
+    """
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path)
+    # the readers of the formats raise errors of every kind; the mesh is decoration
+    except Exception as error:
+        raise ValueError(f"{path.name} cannot be read: {error}") from error
+    metres = 1.0
+    if path.suffix.lower() == ".dae":  # the one format that states its unit
+        metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+    by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
+    for mesh in scene.dump():
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            rgba = _mesh_colour(mesh)
+            surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
+            by_colour.setdefault(rgba, []).append(surface)
+    return tuple(_joined(surfaces) for surfaces in by_colour.values())
+
+
+def thin(surfaces: Sequence[Surface], most: int) -> list[Surface]:
+    """Return surfaces with so few triangles together, edges kept sharp.
+
+    Corners within a cell of a cube grid become one, at their mean; the cells grow until few
+    enough triangles are left, so no corner moves farther than the diagonal of a cell.
+
+    Args:
+        surfaces: The surfaces of a robot, all in one scale.
+        most: Triangles that may be left of all of them.
+
+    Returns:
+        The surfaces, in order, with a corner for each side of a sharp edge.
+    """
+    extents = [float(np.ptp(s.vertices, axis=0).max()) for s in surfaces if len(s.faces)]
+    cell = _FIRST_CELL * max(extents, default=1.0)
+    left = [_clustered(surface, 1e-3 * cell) for surface in surfaces]  # joins equal corners
+    while sum(len(s.faces) for s in left) > most:
+        left = [_clustered(surface, cell) for surface in surfaces]
+        # at most as many triangles as go with the square of the cell
+        cell *= min(max(np.sqrt(sum(len(s.faces) for s in left) / most), 1.2), 2.0)
+    return [_creased(surface) for surface in left]
+
+
+def _folders(urdf: Path) -> Iterator[Path]:
+    yield from (Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p)
+    yield from urdf.resolve().parents
+    try:
+        urdfs = example_urdfs()
+    except MissingDependencyError:
+        return
+    roots = {folder for path in urdfs for folder in path.parents if folder.name == "robots"}
+    for root in sorted(roots):
+        yield root.parent.parent
+        yield root
+
+
+def _shape(visual: ET.Element) -> tuple[str, tuple[float, ...], str] | None:
+    for element in visual.iterfind("geometry/*"):
+        get = element.get
+        match element.tag:
+            case "mesh":
+                size, count = _numbers(get("scale", "1 1 1")), 3
+            case "box":
+                size, count = _numbers(get("size", "")), 3
+            case "cylinder":
+                size, count = _numbers(f"{get('radius', '')} {get('length', '')}"), 2
+            case "sphere":
+                size, count = _numbers(get("radius", "")), 1
+            case _:
+                continue
+        if len(size) == count and (element.tag != "mesh" or get("filename")):
+            return element.tag, size, get("filename", "")
+    return None
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(word) for word in text.split())
+    except ValueError:
+        return ()
+    return numbers if np.isfinite(numbers).all() else ()
+
+
+def _colour(material: ET.Element) -> tuple[float, ...] | None:
+    colour = material.find("color")
+    rgba = () if colour is None else _numbers(colour.get("rgba", ""))
+    return tuple(min(max(x, 0.0), 1.0) for x in rgba) if len(rgba) == 4 else None
+
+
+def _placement(origin: ET.Element | None) -> Array:
+    M = np.eye(4)
+    if origin is None:
+        return M
+    roll, pitch, yaw = _numbers(origin.get("rpy", "0 0 0")) or (0.0, 0.0, 0.0)
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(x), np.sin(x)) for x in (roll, pitch, yaw))
+    M[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    M[:3, 3] = _numbers(origin.get("xyz", "0 0 0")) or (0.0, 0.0, 0.0)
+    return M
+
+
+def _mesh_colour(mesh: "object") -> tuple[float, ...] | None:
+    """Return the colour of a mesh of trimesh: of its material, or the mean of its corners."""
+    visual = mesh.visual  # type: ignore[attr-defined]
+    if visual.kind == "texture":
+        colour = visual.material.main_color
+    elif visual.kind in ("face", "vertex"):
+        colour = getattr(visual, f"{visual.kind}_colors").mean(axis=0)
+    else:
+        return None
+    return tuple(round(float(x) / 255.0, 3) for x in colour)
+
+
+def _joined(surfaces: Sequence[Surface]) -> Surface:
+    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces[:-1])])
+    faces = [s.faces + start for s, start in zip(surfaces, starts, strict=True)]
+    vertices = np.vstack([s.vertices for s in surfaces])
+    return Surface(vertices, np.vstack(faces), surfaces[0].rgba)
+
+
+def _clustered(surface: Surface, cell: float) -> Surface:
+    """Return a surface whose corners within a cell are one; triangles without area are dropped."""
+    corner = np.floor((surface.vertices - surface.vertices.min(axis=0)) / cell).astype(np.int64)
+    sides = corner.max(axis=0) + 1
+    key = (corner[:, 0] * sides[1] + corner[:, 1]) * sides[2] + corner[:, 2]
+    _, which, count = np.unique(key, return_inverse=True, return_counts=True)
+    sums = [np.bincount(which, surface.vertices[:, k]) for k in range(3)]
+    faces = which[surface.faces]
+    flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    faces = faces[~flat]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return replace(surface, vertices=np.column_stack(sums) / count[:, None], faces=faces[first])
+
+
+def _creased(surface: Surface) -> Surface:
+    """Return a surface that has a corner for each side of a sharp edge, so that it shows."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    V, F = surface.vertices, surface.faces
+    normal = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    corner = np.arange(3 * len(F)).reshape(-1, 3)  # corner k of face f is 3 f + k
+    ends = np.stack([np.roll(F, -k, axis=1) for k in (0, 1)], axis=2).reshape(-1, 2)
+    pairs = np.stack([np.roll(corner, -k, axis=1) for k in (0, 1)], axis=2).reshape(-1, 2)
+    turned = ends[:, 0] > ends[:, 1]
+    ends[turned], pairs[turned] = ends[turned, ::-1], pairs[turned, ::-1]
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    ends, pairs = ends[order], pairs[order]
+    meets = (ends[1:] == ends[:-1]).all(axis=1)  # two faces on one edge
+    one, other = pairs[:-1][meets], pairs[1:][meets]
+    smooth = (normal[one[:, 0] // 3] * normal[other[:, 0] // 3]).sum(axis=1) > np.cos(_CREASE)
+    rows, columns = one[smooth].ravel(), other[smooth].ravel()
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(3 * len(F), 3 * len(F)))
+    count, which = connected_components(graph, directed=False)
+    vertices = np.empty((count, 3))
+    vertices[which] = V[F.ravel()]
+    return replace(surface, vertices=vertices, faces=which.reshape(-1, 3))

@@ -1,0 +1,367 @@
+"""The robot: a kinematic tree with Pinocchio's dynamics and named standard parameters."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, ModelError
+from robotid.robot.parameters import DRIVE_TERMS, Coupling, ParameterLayout
+from robotid.robot.tree import Joint, Tree, read_tree
+
+__all__ = ["GRAVITY", "RobotModel"]
+
+GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotModel:
+    """A robot to identify.
+
+    Joint coordinates q are one angle or length per joint, in the order of ``joints``; for a
+    floating base they start with its pose [x y z qx qy qz qw], and v with its twist in the base
+    frame. Continuous joints are angles here too; :meth:`configuration` gives Pinocchio's form.
+
+    Attributes:
+        tree: The URDF it was built from.
+        pin_model: Pinocchio's model, locked joints lumped.
+        layout: Names and order of the standard parameters.
+        velocity_map: Matrix G with v_pinocchio = G v, shape (nv, n_rows): order of joints, mimic.
+        position_offset: Constant part of the joint coordinates of mimic joints, shape (nv,).
+        free_flyer: Whether the base floats.
+        locked: Positions of the joints held still [rad or m].
+        mimic: How mimic joints are treated: "independent" or "coupled".
+    """
+
+    tree: Tree
+    pin_model: pin.Model
+    layout: ParameterLayout
+    velocity_map: Array
+    position_offset: Array
+    free_flyer: bool
+    locked: Mapping[str, float]
+    mimic: str
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | Path,
+        *,
+        joints: Sequence[str] | None = None,
+        locked: Mapping[str, float] | None = None,
+        free_flyer: bool = False,
+        mimic: str = "independent",
+        gravity: Sequence[float] = GRAVITY,
+        terms: Sequence[str] = DRIVE_TERMS,
+        couplings: Sequence[Coupling] = (),
+    ) -> "RobotModel":
+        """Read a robot from a URDF. Meshes are not needed.
+
+        Args:
+            path: The URDF file.
+            joints: Names of the joints that move, in the order wanted; all movable ones, in
+                Pinocchio's order, if None.
+            locked: Positions of joints held still [rad or m]; a joint that is neither in
+                ``joints`` nor here is held at 0.
+            free_flyer: Whether the base floats; its six rows then come first.
+            mimic: "independent" treats a mimic joint as a joint of its own with its own torque;
+                "coupled" moves it with the joint it mimics, whose torque then carries both.
+            gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
+            terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
+            couplings: Drives that turn with several joints.
+
+        Returns:
+            The model.
+
+        Raises:
+            ModelError: If the URDF cannot be used, or a joint is not in it.
+            SettingsError: If a term or a coupling is unknown.
+        """
+        tree = read_tree(path)
+        if mimic not in ("independent", "coupled"):
+            raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
+        followers = _followers(tree) if mimic == "coupled" else {}
+        full = _build(tree, free_flyer, gravity)
+        first = 2 if free_flyer else 1  # Pinocchio's joint 0 is the world, 1 may be the base
+        free = [name for name in list(full.names)[first:] if name not in followers]
+        moving, positions = _choose_joints(tree, free, joints, locked or {}, followers)
+        reduced = _reduce(full, positions)
+        G, shift = _velocity_map(reduced, moving, followers, free_flyer)
+        child = {joint.name: joint.child for joint in tree.movable}
+        layout = ParameterLayout(
+            bodies=((tree.root,) if free_flyer else ())
+            + tuple(child[name] for name in list(reduced.names)[first:]),
+            joints=moving,
+            terms=tuple(terms),
+            couplings=tuple(couplings),
+            prismatic=frozenset(j.name for j in tree.movable if j.type == "prismatic"),
+        )
+        return cls(tree, reduced, layout, G, shift, free_flyer, MappingProxyType(positions), mimic)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "locked": dict(self.locked)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, locked=MappingProxyType(state["locked"]))
+
+    @property
+    def name(self) -> str:
+        """Name of the robot, as the URDF says."""
+        return self.tree.name
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints that move, in the order of q."""
+        return self.layout.joints
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the regressor per sample: one per joint, and six of a floating base."""
+        return int(self.velocity_map.shape[1])
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Names of the rows: base force and moment if the base floats, then the joints."""
+        base = ("base.fx", "base.fy", "base.fz", "base.mx", "base.my", "base.mz")
+        return (base if self.free_flyer else ()) + self.joints
+
+    @property
+    def row_units(self) -> tuple[str, ...]:
+        """Unit of the torque in each row: N m, or N for forces and joints that slide."""
+        is_force = [n in self.layout.prismatic or n.startswith("base.f") for n in self.row_names]
+        return tuple("N" if force else "N m" for force in is_force)
+
+    @property
+    def limits(self) -> tuple[Joint, ...]:
+        """The moving joints as the URDF describes them, limits included, in the order of q."""
+        by_name = {joint.name: joint for joint in self.tree.movable}
+        return tuple(by_name[name] for name in self.joints)
+
+    @property
+    def length(self) -> float:
+        """The longest distance between neighbouring joints [m], a scale of the robot; 1 if 0."""
+        placements = self.pin_model.jointPlacements[1:]
+        longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
+        return longest if longest > 1e-6 else 1.0
+
+    def standard_parameters(self) -> Array:
+        """Return the standard parameters as the URDF states them.
+
+        Returns:
+            Parameters, shape (p,), SI units, in ``layout.names`` order; the drive terms are 0,
+            since what a URDF says of them is not used.
+        """
+        inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
+        drive = np.zeros(len(self.layout.drive_names))
+        return np.concatenate([*inertial, drive])
+
+    def with_parameters(self, pi: Array) -> "RobotModel":
+        """Return the same robot with other inertial parameters.
+
+        Args:
+            pi: Standard parameters, shape (p,) or only the inertial ones, shape (10 bodies,).
+
+        Returns:
+            A new model; the drive terms have no place in it.
+
+        Raises:
+            DataError: If pi has another length.
+        """
+        size = self.layout.n_inertial
+        if pi.shape not in ((size,), (len(self.layout.names),)):
+            raise DataError(f"pi has shape {pi.shape}, wanted ({len(self.layout.names)},)")
+        copy = pin.Model(self.pin_model)
+        for i, values in enumerate(pi[:size].reshape(-1, 10)):
+            copy.inertias[i + 1] = _inertia(values)
+        return replace(self, pin_model=copy)
+
+    def configurations(self, q: Array) -> Array:
+        """Return Pinocchio's configurations of joint coordinates.
+
+        Args:
+            q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
+
+        Returns:
+            Configurations, shape (N, nq): a continuous joint as cosine and sine.
+
+        Raises:
+            DataError: If q has another width.
+        """
+        base = 7 if self.free_flyer else 0
+        wanted = base + len(self.joints)
+        if q.ndim != 2 or q.shape[1] != wanted:
+            raise DataError(f"q has shape {q.shape}, wanted (N, {wanted})")
+        first = 6 if self.free_flyer else 0
+        angles = q[:, base:] @ self.velocity_map[first:, first:].T + self.position_offset[first:]
+        if self.pin_model.nq == self.pin_model.nv:
+            return angles
+        configuration = np.empty((len(q), self.pin_model.nq))
+        configuration[:, :base] = q[:, :base]
+        for joint in list(self.pin_model.joints)[2 if self.free_flyer else 1 :]:
+            angle = angles[:, joint.idx_v - first]
+            if joint.nq == 2:
+                configuration[:, joint.idx_q] = np.cos(angle)
+                configuration[:, joint.idx_q + 1] = np.sin(angle)
+            else:
+                configuration[:, joint.idx_q] = angle
+        return configuration
+
+    def support(self) -> Array:
+        """Return which parameters can load which row.
+
+        Returns:
+            Shape (n_rows, p), bool: False where the regressor is 0 for every motion.
+        """
+        nv = self.pin_model.nv
+        carried = np.zeros((nv, self.layout.n_inertial), dtype=bool)
+        for body in range(1, self.pin_model.njoints):
+            for ancestor in list(self.pin_model.supports[body])[1:]:
+                joint = self.pin_model.joints[ancestor]
+                carried[joint.idx_v : joint.idx_v + joint.nv, 10 * (body - 1) : 10 * body] = True
+        inertial = (np.abs(self.velocity_map.T) > 0).astype(float) @ carried > 0
+        drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
+        first = self.n_rows - len(self.joints)
+        for k, name in enumerate(self.layout.drive_names):
+            owner = name.rsplit(".", 1)[0]
+            coupled = {c.name: [j for j, _ in c.ratios] for c in self.layout.couplings}
+            for joint_name in coupled.get(owner, [owner]):
+                drive[first + self.joints.index(joint_name), k] = True
+        return np.hstack([inertial, drive])
+
+
+def _inertia(values: Array) -> pin.Inertia:
+    """Return Pinocchio's inertia of ten parameters; without mass it has no centre of mass."""
+    if values[0] != 0.0:
+        return pin.Inertia.FromDynamicParameters(values)
+    xx, xy, yy, xz, yz, zz = values[4:]
+    return pin.Inertia(0.0, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+
+
+def _choose_joints(
+    tree: Tree,
+    free: Sequence[str],
+    joints: Sequence[str] | None,
+    locked: Mapping[str, float],
+    followers: Mapping[str, tuple[str, float, float]],
+) -> tuple[tuple[str, ...], dict[str, float]]:
+    """Return the joints that move, in order, and the positions of those that do not."""
+    _check_joints(tree, [*(joints or ()), *locked], followers)
+    moving = tuple(name for name in free if name not in locked) if joints is None else tuple(joints)
+    both = [name for name in moving if name in locked]
+    if both:
+        raise ModelError(f"joints {both} are both identified and locked; choose one")
+    if len(set(moving)) != len(moving) or not moving:
+        raise ModelError(f"joints to identify must be named once each, got {list(moving)}")
+    positions = {name: float(locked.get(name, 0.0)) for name in free if name not in moving}
+    _check_mimic(tree, moving, positions, followers)
+    for name, (leader, ratio, offset) in followers.items():
+        if leader in positions:
+            positions[name] = ratio * positions[leader] + offset
+    return moving, positions
+
+
+def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, object]) -> None:
+    known = [joint.name for joint in tree.movable]
+    for name in names:
+        if name in followers:
+            raise ModelError(
+                f"joint {name!r} mimics another one and moves with it (mimic = 'coupled'); leave "
+                "it out, or use mimic = 'independent'"
+            )
+        if name not in known:
+            fixed = [joint.name for joint in tree.joints if joint.name == name]
+            if fixed:
+                raise ModelError(
+                    f"joint {name!r} is fixed in {Path(tree.path).name}: it cannot move"
+                )
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise ModelError(
+                f"joint {name!r} is not in {Path(tree.path).name}; joints: {known}.{hint}"
+            )
+
+
+def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
+    """Return each mimic joint with the joint that leads it in the end, ratio and offset."""
+    by_name = {joint.name: joint for joint in tree.movable}
+    resolved = {}
+    for joint in tree.movable:
+        if joint.mimic is None:
+            continue
+        leader, ratio, offset = joint.mimic
+        seen = {joint.name}
+        while True:
+            if leader not in by_name or leader in seen:
+                raise ModelError(
+                    f"joint {joint.name!r} mimics {leader!r}, which is not a movable joint that "
+                    "leads it; mend the <mimic>, or use mimic = 'independent'"
+                )
+            up = by_name[leader].mimic
+            if up is None:
+                break
+            seen.add(leader)
+            leader, ratio, offset = up[0], ratio * up[1], ratio * up[2] + offset
+        resolved[joint.name] = (leader, ratio, offset)
+    return resolved
+
+
+def _check_mimic(
+    tree: Tree, moving: Sequence[str], locked: Mapping[str, float], followers: Mapping[str, object]
+) -> None:
+    for joint in tree.movable:
+        if joint.mimic is None or joint.name in followers:
+            continue
+        leader = joint.mimic[0]
+        if (joint.name in locked) != (leader in locked) and leader in (*moving, *locked):
+            raise ModelError(
+                f"joint {joint.name!r} mimics {leader!r}: one cannot be locked while the other "
+                "moves; name both in joints, or lock both, or use mimic = 'coupled'"
+            )
+
+
+def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
+    root = (pin.JointModelFreeFlyer(),) if free_flyer else ()
+    try:
+        model = pin.buildModelFromXML(tree.xml, *root)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"{Path(tree.path).name}: Pinocchio refuses it: {error}") from error
+    acceleration = np.asarray(gravity, dtype=float)
+    if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
+        raise ModelError(f"gravity is {list(gravity)}, wanted three finite numbers [m/s^2]")
+    model.gravity.linear = acceleration
+    return model
+
+
+def _reduce(model: pin.Model, positions: Mapping[str, float]) -> pin.Model:
+    reference = pin.neutral(model)
+    ids = []
+    for name, position in positions.items():
+        joint_id = model.getJointId(name)
+        joint = model.joints[joint_id]
+        value = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
+        reference[joint.idx_q : joint.idx_q + joint.nq] = value
+        ids.append(joint_id)
+    return pin.buildReducedModel(model, sorted(ids), reference) if ids else model
+
+
+def _velocity_map(
+    model: pin.Model,
+    moving: Sequence[str],
+    followers: Mapping[str, tuple[str, float, float]],
+    free_flyer: bool,
+) -> tuple[Array, Array]:
+    base = 6 if free_flyer else 0
+    G = np.zeros((model.nv, base + len(moving)))
+    G[:base, :base] = np.eye(base)
+    shift = np.zeros(model.nv)
+    for name, joint in list(zip(model.names, model.joints, strict=True))[2 if free_flyer else 1 :]:
+        leader, ratio, offset = followers.get(name, (name, 1.0, 0.0))
+        G[joint.idx_v, base + moving.index(leader)] = ratio
+        shift[joint.idx_v] = offset
+    return G, shift

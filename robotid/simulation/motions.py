@@ -1,0 +1,105 @@
+"""Motions that excite the parameters: Fourier series within a robot's limits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.robot.model import RobotModel
+
+__all__ = ["FourierTrajectory", "random_fourier"]
+
+_ROTARY_REACH = 1.2  # [rad] amplitude of a joint whose limits are wider or unknown
+_LINEAR_REACH = 0.15  # [m]
+_ROTARY_SPEED = 1.5  # [rad/s] peak speed where the limit is higher or unknown
+_LINEAR_SPEED = 0.3  # [m/s]
+
+
+@dataclass(frozen=True, eq=False)
+class FourierTrajectory:
+    """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
+
+    Attributes:
+        q0: Mean position, shape (n,) [rad or m].
+        sine: Coefficients s_k, shape (h, n) [rad or m].
+        cosine: Coefficients c_k, shape (h, n) [rad or m].
+        period: Period [s].
+
+    References:
+        Swevers et al. (1997), Optimal robot excitation and identification.
+    """
+
+    q0: Array
+    sine: Array
+    cosine: Array
+    period: float
+
+    def __post_init__(self) -> None:
+        if self.sine.shape != self.cosine.shape or self.sine.shape[1:] != self.q0.shape:
+            raise DataError(
+                f"sine {self.sine.shape} and cosine {self.cosine.shape} must have one shape "
+                f"(h, {len(self.q0)})"
+            )
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return position, velocity and acceleration.
+
+        Args:
+            t: Times, shape (N,) [s].
+
+        Returns:
+            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
+        """
+        w = 2 * np.pi / self.period * np.arange(1, len(self.sine) + 1)  # (h,)
+        sin, cos = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))  # (N, h)
+        q = self.q0 + sin @ self.sine + cos @ self.cosine
+        v = (cos * w) @ self.sine - (sin * w) @ self.cosine
+        a = -(sin * w**2) @ self.sine - (cos * w**2) @ self.cosine
+        return q, v, a
+
+
+def random_fourier(
+    model: RobotModel,
+    rng: np.random.Generator,
+    *,
+    harmonics: int = 5,
+    period: float = 10.0,
+    centre: Array | None = None,
+) -> FourierTrajectory:
+    """Return a random motion within the limits of a robot.
+
+    Args:
+        model: The robot; position and speed limits of its URDF are kept where it states them.
+        rng: Source of the coefficients.
+        harmonics: Number h of harmonics.
+        period: Period [s].
+        centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
+
+    Returns:
+        The motion.
+
+    Raises:
+        DataError: If the centre lies outside the limits.
+    """
+    n = len(model.joints)
+    sine, cosine = rng.standard_normal((2, harmonics, n)) / np.arange(1, harmonics + 1)[:, None]
+    middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
+    mean = np.array(middle) if centre is None else centre
+    reach, speed = np.empty(n), np.empty(n)
+    for j, joint in enumerate(model.limits):
+        slides = joint.type == "prismatic"
+        reach[j] = _LINEAR_REACH if slides else _ROTARY_REACH
+        if joint.has_limits:
+            reach[j] = min(reach[j], 0.9 * min(joint.upper - mean[j], mean[j] - joint.lower))
+            if reach[j] <= 0:
+                raise DataError(
+                    f"the centre {mean[j]:g} of joint {joint.name!r} is not inside its limits "
+                    f"{joint.lower:g} to {joint.upper:g}"
+                )
+        usual = _LINEAR_SPEED if slides else _ROTARY_SPEED
+        speed[j] = min(usual, 0.9 * joint.velocity) if joint.velocity > 0 else usual
+    unit = FourierTrajectory(np.zeros(n), sine, cosine, period)
+    q, v, _ = unit.evaluate(np.linspace(0.0, period, 1000))
+    scale = np.minimum(reach / np.abs(q).max(axis=0), speed / np.abs(v).max(axis=0))
+    return FourierTrajectory(mean, sine * scale, cosine * scale, period)

@@ -1,0 +1,372 @@
+"""Replay of a motion: the robot in Meshcat's viewer, torques and parameters beside it, one page.
+
+Meshcat's own export asks a server process for the page. Here its viewer is written into the page
+with what it shows, so that no process, no socket and no port is opened.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+from robotid.robot.model import RobotModel
+from robotid.viewer.page import frame, page
+from robotid.viewer.scene import coordinates, mass_marks, packed, robot_scene
+
+__all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay", "write_replay"]
+
+_KEYS = 500_000  # numbers of a motion: about 3 MB
+_POINTS = 1_000_000  # numbers of all plots: about 6 MB
+_PLOT_RATE = 50.0  # [Hz] points of a plot per second
+_SEEN = 100  # poses that the camera is aimed by
+_CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
+_GAP = 0.25  # [s] a longer time without samples is a gap ...
+_TIMES = 5.0  # ... if it is so many times the usual one
+
+
+@dataclass(frozen=True, eq=False)
+class Torques:
+    """Torques to plot beside a motion.
+
+    Attributes:
+        t: Times on the clock of the motion, shape (N,) [s].
+        measured: Measured torques, shape (N, n) [N m or N].
+        predicted: Predicted ones by the name of who predicts, shape (N, n) each, NaN where there
+            is no prediction; arcs are coloured by the residual of the first.
+    """
+
+    t: Array
+    measured: Array
+    predicted: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Parameters over time, as a recursive estimator saw them.
+
+    Attributes:
+        t: Times on the clock of the motion, shape (K,) [s].
+        names: Names of the b parameters, as ``forearm.mcx``.
+        units: Their units.
+        theta: Their values, shape (K, b).
+        std_error: Their standard errors, shape (K, b).
+    """
+
+    t: Array
+    names: Sequence[str]
+    units: Sequence[str]
+    theta: Array
+    std_error: Array
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A moment worth a mark on the time line.
+
+    Attributes:
+        t: When, on the clock of the motion [s].
+        label: What happened.
+        kind: "payload", "contact", "gap" or "note".
+    """
+
+    t: float
+    label: str
+    kind: str = "note"
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A page that plays a motion; a notebook shows it as the value of a cell.
+
+    Attributes:
+        data: What the page shows, in plain values.
+    """
+
+    data: Mapping[str, Any]
+
+    @cached_property
+    def html(self) -> str:
+        """The page."""
+        return page(self.data)
+
+    def write(self, target: str | Path) -> Path:
+        """Write the page.
+
+        Args:
+            target: The HTML file.
+
+        Returns:
+            Path of the file.
+
+        Raises:
+            DataError: If its folder does not exist.
+        """
+        path = Path(target)
+        if not path.parent.is_dir():
+            raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
+        beside = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            beside.write_text(self.html, encoding="utf-8")
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
+        return path
+
+    def _repr_html_(self) -> str:
+        return frame(self.html, f"{self.data['title']}: replay", 620)
+
+
+def replay(
+    model: RobotModel,
+    t: Array,
+    q: Array,
+    *,
+    torques: Torques | None = None,
+    masses: Mapping[str, Array] | None = None,
+    ghost: tuple[str, Array, Array] | None = None,
+    bands: Bands | None = None,
+    marks: Sequence[Mark] = (),
+    notes: Sequence[str] = (),
+    rate: float = 30.0,
+) -> Replay:
+    """Return a page that plays a motion at its true speed, in three dimensions.
+
+    Args:
+        model: The robot; its URDF's meshes are shown where they are found.
+        t: Times, shape (N,), strictly increasing [s].
+        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
+        torques: Torques to plot, and to draw as arcs around the joints.
+        masses: Standard parameters by label, shape (p,) each: centres of mass and equimomental
+            ellipsoids of the links, as ``{"URDF": prior, "identified": pi}``.
+        ghost: Label, times and joint coordinates of a second motion, shown as a ghost that starts
+            when the first does.
+        bands: Parameters over time to plot.
+        marks: Moments to mark.
+        notes: Sentences for the head of the page.
+        rate: Keyframes per second at most [Hz]; fewer for motions so long that the page would
+            grow too large.
+
+    Returns:
+        The page.
+
+    Raises:
+        DataError: If times and values do not fit each other or the model.
+        SettingsError: If the rate is not positive.
+    """
+    _check(t, q, rate)
+    moved = _moved(model, t, q, rate)
+    second = None
+    if ghost is not None:
+        _check(ghost[1], ghost[2], rate)
+        second = _moved(model, ghost[1], ghost[2], rate)
+    scene = robot_scene(model)
+    gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
+    start = float(t[0])
+    lead = [f"0 s is {start:.3f} s of the log."] if abs(start) > 1e-9 else []
+    data = _data(
+        model,
+        scene.content,
+        motion=_packed_motion(*moved),
+        ghost=None if second is None else {"label": ghost[0], **_packed_motion(*second)},  # type: ignore[index]
+        masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
+        torques=None if torques is None else _torque_data(model, torques, start),
+        bands=None if bands is None else _band_data(bands, start),
+        marks=[
+            {"t": mark.t - start, "label": mark.label, "kind": mark.kind}
+            for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
+        ],
+        notes=[*notes, *lead, *(f"{note}." for note in scene.notes)],
+        view=_view(model, scene.corners, [q] if ghost is None else [q, ghost[2]]),
+    )
+    return Replay(data)
+
+
+def write_replay(
+    model: RobotModel,
+    t: Array,
+    q: Array,
+    target: str | Path,
+    **options: Any,  # noqa: ANN401
+) -> Path:
+    """Write a page that plays a motion.
+
+    Args:
+        model: The robot.
+        t: Times, shape (N,), strictly increasing [s].
+        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
+        target: The HTML file to write.
+        options: Those of :func:`replay`.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        DataError: If times and positions do not fit each other or the model, or if the folder of
+            the target does not exist.
+        SettingsError: If the rate is not positive.
+    """
+    return replay(model, t, q, **options).write(target)
+
+
+def live_page(
+    model: RobotModel, names: Sequence[str], units: Sequence[str], q: Array, masses: Array
+) -> str:
+    """Return a page that listens to the address ``events`` beside it, and draws what it hears.
+
+    Args:
+        model: The robot, with a fixed base.
+        names: Names of the parameters that are estimated.
+        units: Their units.
+        q: Joint coordinates that the camera is aimed by, shape (N, n) [rad or m].
+        masses: Standard parameters of the URDF, shape (p,).
+
+    Returns:
+        The HTML. An event is a JSON list of objects with ``t``, ``q`` as :func:`coordinates`
+        gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
+    """
+    empty = np.zeros((0, 0))
+    scene = robot_scene(model)
+    torques = Torques(np.zeros(0), np.zeros((0, model.n_rows)), {"predicted": empty})
+    return page(
+        _data(
+            model,
+            scene.content,
+            motion=_packed_motion(np.zeros(0), empty),
+            ghost=None,
+            masses=[mass_marks(model, masses, "URDF")],
+            torques=_torque_rows(model, torques),
+            bands={"names": list(names), "units": list(units), "t": None, "values": None},
+            marks=[],
+            notes=[],
+            view=_view(model, scene.corners, [q]),
+            live=True,
+        )
+    )
+
+
+def _data(
+    model: RobotModel,
+    scene: Mapping[str, Any],
+    *,
+    live: bool = False,
+    **content: Any,  # noqa: ANN401
+) -> dict[str, Any]:
+    return {"title": model.name, "live": live, "scene": scene, **content}
+
+
+def _check(t: Array, q: Array, rate: float) -> None:
+    if not rate > 0 or not np.isfinite(rate):
+        raise SettingsError(f"rate is {rate}, wanted a positive number of keyframes per second")
+    if t.ndim != 1 or q.ndim != 2 or len(t) != len(q):
+        raise DataError(f"t has shape {t.shape} and q {q.shape}, wanted (N,) and (N, n)")
+    if len(t) < 2:
+        raise DataError(f"the motion has {len(t)} samples, wanted at least 2 to play")
+    if not (np.isfinite(t).all() and np.isfinite(q).all()):
+        raise DataError("t or q holds values that are not finite; leave those samples out")
+    late = np.flatnonzero(np.diff(t) <= 0)
+    if len(late):
+        k = int(late[0])
+        raise DataError(
+            f"t must increase, but t[{k + 1}] = {t[k + 1]:.6g} s follows t[{k}] = {t[k]:.6g} s"
+        )
+
+
+def _keyframes(t: Array, rate: float, most: int) -> Array:
+    """Return the rows to show: the last sample before each tick of the rate, and the last row."""
+    count = min(int((t[-1] - t[0]) * rate) + 2, max(most, 2))
+    ticks = np.linspace(t[0], t[-1], count)
+    rows: Array = np.unique(np.searchsorted(t, ticks, side="right") - 1)
+    return rows
+
+
+def _gaps(t: Array) -> list[int]:
+    """Return the rows after which nothing was recorded for a while."""
+    steps = np.diff(t)
+    return np.flatnonzero((steps > _GAP) & (steps > _TIMES * np.median(steps))).tolist()
+
+
+def _moved(model: RobotModel, t: Array, q: Array, rate: float) -> tuple[Array, Array]:
+    """Return times from 0 and how far each joint has moved, at the keyframes."""
+    model.configurations(q)  # says what width q should have
+    q = q.copy()
+    base = 7 if model.free_flyer else 0
+    free = [base + j for j, joint in enumerate(model.limits) if joint.turns_freely]
+    q[:, free] = np.unwrap(q[:, free], axis=0)
+    if base:  # a quaternion and its negative are one pose, but not between keyframes
+        turn = (q[1:, 3:7] * q[:-1, 3:7]).sum(axis=1) < 0
+        q[1:, 3:7] *= np.where(np.cumsum(turn) % 2, -1.0, 1.0)[:, None]
+    rows = _keyframes(t, rate, _KEYS // q.shape[1])
+    return t[rows] - t[0], coordinates(model, q[rows])
+
+
+def _packed_motion(t: Array, q: Array) -> dict[str, Any]:
+    return {"t": packed(t), "q": packed(q)}
+
+
+def _torque_data(model: RobotModel, torques: Torques, start: float) -> dict[str, Any]:
+    series = [torques.measured, *torques.predicted.values()]
+    wanted = (len(torques.t), model.n_rows)
+    for label, values in zip(["measured", *torques.predicted], series, strict=True):
+        if values.shape != wanted:
+            raise DataError(f"torques {label!r} have shape {values.shape}, wanted {wanted}")
+    t, values = _plotted(torques.t - start, np.hstack(series))
+    return {**_torque_rows(model, torques), "t": packed(t), "values": packed(values)}
+
+
+def _torque_rows(model: RobotModel, torques: Torques) -> dict[str, Any]:
+    """Return who is plotted, without times and values: joints, not the rows of a free base."""
+    first = model.n_rows - len(model.joints)
+    if first:
+        raise DataError("the base floats; torques are shown of robots with a fixed base")
+    tree = model.pin_model
+    return {
+        "joints": [
+            {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
+            for name, unit in zip(model.joints, model.row_units, strict=True)
+        ],
+        "labels": ["measured", *torques.predicted],
+        "t": None,
+        "values": None,
+    }
+
+
+def _band_data(bands: Bands, start: float) -> dict[str, Any]:
+    t, values = _plotted(bands.t - start, np.hstack([bands.theta, bands.std_error]))
+    names = {"names": list(bands.names), "units": list(bands.units)}
+    return {**names, "t": packed(t), "values": packed(values)}
+
+
+def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
+    """Return the rows of a plot, with one of NaN in each gap."""
+    rows = _keyframes(t, _PLOT_RATE, _POINTS // max(values.shape[1], 1))
+    holes = np.array(_gaps(t), dtype=int)
+    rows = np.unique(np.r_[rows, holes, holes + 1])
+    after = np.searchsorted(rows, holes) + 1
+    times = np.insert(t[rows], after, (t[holes] + t[holes + 1]) / 2)
+    return times, np.insert(values[rows], after, np.nan, axis=0)
+
+
+def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array]) -> dict[str, Any]:
+    """Return a camera that sees the whole motion, and a grid below it."""
+    data = model.pin_model.createData()
+    points = []
+    for q in motions:
+        rows = np.unique(np.linspace(0, len(q) - 1, _SEEN).astype(int))
+        for configuration in model.configurations(q[rows]):
+            pin.forwardKinematics(model.pin_model, data, configuration)
+            for M, own in zip(list(data.oMi), corners, strict=True):
+                points.append(own @ M.rotation.T + M.translation)
+    places = np.vstack(points)
+    centre = (places.min(axis=0) + places.max(axis=0)) / 2
+    radius = float(np.linalg.norm(places - centre, axis=1).max())
+    # the camera stands 2.8 radii off; a grid that ends before it has no line behind it
+    cell = max((c for c in _CELLS if 20 * c <= 2.5 * radius), default=_CELLS[0])
+    ground = np.r_[cell * np.round(centre[:2] / cell), 0.0]
+    return {"centre": centre.tolist(), "radius": radius, "grid": ground.tolist(), "cell": cell}

@@ -1,0 +1,312 @@
+"""The robot as a viewer draws it: joints as nodes, meshes or a skeleton as the parts they carry."""
+
+import base64
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from robotid._typing import Array
+from robotid.robot.meshes import Surface, Visual, find_mesh, read_surfaces, read_visuals, thin
+from robotid.robot.model import RobotModel
+from robotid.viewer.ellipsoids import ellipsoids
+
+__all__ = ["Scene", "coordinates", "mass_marks", "packed", "robot_scene"]
+
+_TRIANGLES = 24_000  # of all meshes together: about 1 MB in the page
+_LINK, _JOINT, _BASE = "#9aa7b4", "#e07b1f", "#4a5560"
+_THICKNESS = 0.035  # radius of a link over the robot's reach
+_SHORT = 1e-4  # [m] joints closer than this are one point
+_UP = np.array([0.0, 1.0, 0.0])  # the viewer's axis of a cylinder
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is drawn, in plain values for JSON, lengths in m.
+
+    Attributes:
+        content: ``nodes``: one per joint, the first fixed to the world, each with its parent, its
+            pose at 0 and how it moves; ``parts``: shapes on nodes; ``meshes``: triangles that
+            parts share; ``reach``: the size of the robot.
+        notes: What could not be drawn, in words.
+        corners: Points on each node whose hull holds its parts, shape (k, 3) each [m].
+    """
+
+    content: dict[str, Any]
+    notes: tuple[str, ...]
+    corners: tuple[Array, ...]
+
+
+def robot_scene(model: RobotModel) -> Scene:
+    """Return the nodes and the parts of a robot.
+
+    A body is drawn with the visual shapes of its links if they are found, and otherwise as a
+    skeleton: capsules from its joint to the next ones, and a drum along the joint's axis.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        The scene.
+    """
+    tree = model.pin_model
+    library, notes = _Library(model), []
+    parts = list(library.parts)
+    drawn = {part["node"] for part in parts}
+    if library.missing:
+        count, first = len(library.missing), library.missing[0]
+        notes.append(f"{count} meshes not found or not readable, among them {first}")
+    for i in range(tree.njoints):
+        if i not in drawn:
+            parts += _skeleton(model, i)
+    content = {
+        "nodes": [_node(model, i) for i in range(tree.njoints)],
+        "parts": parts,
+        "meshes": library.meshes,
+        "reach": _reach(model),
+    }
+    corners = [[np.zeros((1, 3))] for _ in range(tree.njoints)]
+    for part in parts:
+        corners[part["node"]].append(_corners(part, library.boxes))
+    return Scene(content, tuple(notes), tuple(map(np.vstack, corners)))
+
+
+def coordinates(model: RobotModel, q: Array) -> Array:
+    """Return how far each node of a scene has moved.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
+
+    Returns:
+        Angles and lengths in Pinocchio's order, shape (N, nv), or (N, 7 + nv - 6) with a
+        floating base [rad, m]; ``column`` of a node says which are its own.
+    """
+    base, first = (7, 6) if model.free_flyer else (0, 0)
+    G = model.velocity_map[first:, first:]
+    moved: Array = np.hstack([q[:, :base], q[:, base:] @ G.T + model.position_offset[first:]])
+    return moved
+
+
+def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
+    """Return the centre of mass and the equimomental ellipsoid of each body, for the viewer.
+
+    Args:
+        model: The robot.
+        pi: Its standard parameters, shape (p,), or the inertial ones alone.
+        label: Whose they are.
+
+    Returns:
+        Plain values: the label, and per body its node, name, mass [kg], centre of mass [m],
+        semi-axes [m] and their direction, or why there is no ellipsoid.
+    """
+    found = ellipsoids(pi[: model.layout.n_inertial])
+    return {
+        "label": label,
+        "bodies": [
+            {
+                "node": i + 1,
+                "name": body,
+                "mass": mark.mass,
+                "com": None if mark.com is None else mark.com.tolist(),
+                "semi_axes": None if mark.semi_axes is None else mark.semi_axes.tolist(),
+                "quaternion": pin.Quaternion(mark.rotation).coeffs().tolist(),
+                "fault": mark.fault,
+            }
+            for i, (body, mark) in enumerate(zip(model.layout.bodies, found, strict=True))
+        ],
+    }
+
+
+def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
+    """Return an array for the page: base64 of little-endian numbers, 32 bits each.
+
+    Args:
+        values: The array.
+        kind: "<f4" or "<u4".
+
+    Returns:
+        {"kind", "shape", "data"}.
+    """
+    array = np.ascontiguousarray(values, dtype=kind)
+    data = base64.b64encode(array.tobytes()).decode("ascii")
+    return {"kind": kind, "shape": list(array.shape), "data": data}
+
+
+class _Library:
+    """The meshes of a robot, each once, and the parts that show them."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self.missing: list[str] = []
+        self.meshes: list[dict[str, Any]] = []
+        self.parts: list[dict[str, Any]] = []
+        self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
+        surfaces: list[Surface] = []
+        ranges: dict[tuple[str, tuple[float, ...]], range] = {}
+        visuals = [v for v in read_visuals(model.tree.path) if v.link in model.tree.links]
+        for visual in visuals:
+            key = (visual.file, visual.size)
+            if visual.shape == "mesh" and key not in ranges:
+                new = self._read(model, visual)
+                ranges[key] = range(len(surfaces), len(surfaces) + len(new))
+                surfaces += new
+        for surface in thin(surfaces, _TRIANGLES):
+            mesh = {"vertices": packed(surface.vertices), "faces": packed(surface.faces, "<u4")}
+            self.meshes.append(mesh)
+            points = surface.vertices if len(surface.vertices) else np.zeros((1, 3))
+            self.boxes.append(np.array([points.min(axis=0), points.max(axis=0)]))
+        for visual in visuals:
+            which = ranges.get((visual.file, visual.size), range(0))
+            self.parts += _visual_parts(model, visual, which, surfaces)
+
+    def _read(self, model: RobotModel, visual: Visual) -> list[Surface]:
+        path = find_mesh(visual.file, model.tree.path)
+        try:
+            found = () if path is None else read_surfaces(path)
+        except ValueError:
+            found = ()
+        if not found:
+            self.missing.append(visual.file)
+        return [replace(s, vertices=s.vertices * np.array(visual.size)) for s in found]
+
+
+def _visual_parts(
+    model: RobotModel, visual: Visual, which: range, surfaces: Sequence[Surface]
+) -> Iterator[dict[str, Any]]:
+    tree = model.pin_model
+    frame = tree.frames[tree.getFrameId(visual.link, pin.FrameType.BODY)]
+    M = frame.placement.homogeneous @ visual.placement
+    if visual.shape == "cylinder":  # of a URDF: along z
+        M = M @ _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    if visual.shape == "mesh":
+        for k in which:
+            colour = _hex(surfaces[k].rgba or visual.rgba)
+            yield _part(frame.parentJoint, "mesh", [k], colour, M)
+    else:
+        yield _part(frame.parentJoint, visual.shape, visual.size, _hex(visual.rgba), M)
+
+
+def _corners(part: Mapping[str, Any], boxes: Sequence[Array]) -> Array:
+    """Return the corners of the box about a part, in the frame of its node, shape (8, 3)."""
+    size = part["size"]
+    match part["shape"]:
+        case "mesh":
+            low, high = boxes[size[0]]
+        case "sphere":
+            low, high = np.full(3, -size[0]), np.full(3, size[0])
+        case "cylinder":
+            high = np.array([size[0], size[1] / 2, size[0]])
+            low = -high
+        case _:
+            high = np.array(size) / 2
+            low = -high
+    box = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    M = np.array(part["matrix"]).reshape(4, 4).T
+    moved: Array = box @ M[:3, :3].T + M[:3, 3]
+    return moved
+
+
+def _part(
+    node: int, shape: str, size: Sequence[float], colour: str, placement: Array
+) -> dict[str, Any]:
+    return {
+        "node": node,
+        "shape": shape,
+        "size": list(size),
+        "colour": colour,
+        "matrix": placement.T.ravel().tolist(),  # by columns
+    }
+
+
+def _hex(rgba: Sequence[float] | None) -> str:
+    if rgba is None:
+        return _LINK
+    return "#" + "".join(f"{round(255 * x):02x}" for x in rgba[:3])
+
+
+def _node(model: RobotModel, i: int) -> dict[str, Any]:
+    tree = model.pin_model
+    M = tree.jointPlacements[i]
+    base = 1 if model.free_flyer else 0
+    kind, axis = _movement(model, i)
+    column = tree.joints[i].idx_v + base if kind != "fixed" else -1
+    return {
+        "name": tree.names[i],
+        "parent": int(tree.parents[i]) if i else -1,
+        "position": np.array(M.translation).tolist(),
+        "quaternion": pin.Quaternion(M.rotation).coeffs().tolist(),
+        "kind": kind,
+        "axis": axis,
+        "column": 0 if kind == "free" else column,
+    }
+
+
+def _movement(model: RobotModel, i: int) -> tuple[str, list[float]]:
+    """Return how a joint moves: fixed, free, turn or slide; and the axis in its own frame."""
+    if i == 0:
+        return "fixed", []
+    kind = model.pin_model.joints[i]
+    if kind.nv != 1:
+        return "free", []
+    data = kind.createData()
+    kind.calc(data, pin.neutral(model.pin_model), np.zeros(model.pin_model.nv))
+    S = np.array(data.S).reshape(6)
+    turns = bool(S[3:].any())
+    return ("turn", S[3:].tolist()) if turns else ("slide", S[:3].tolist())
+
+
+def _skeleton(model: RobotModel, joint: int) -> Iterator[dict[str, Any]]:
+    """Return the drum of a joint and the links from it to whatever it carries."""
+    radius = _THICKNESS * _reach(model)
+    skin = _LINK if joint else _BASE
+    for end in _ends(model, joint):
+        length = float(np.linalg.norm(end))
+        if length > _SHORT:
+            along = _from_y_axis(end / length, end / 2)
+            yield _part(joint, "cylinder", [0.7 * radius, length], skin, along)
+        yield _part(joint, "sphere", [0.7 * radius], skin, _from_y_axis(_UP, end))
+    kind, axis = _movement(model, joint)
+    if kind in ("turn", "slide"):
+        drum = _from_y_axis(np.array(axis), np.zeros(3))
+        yield _part(joint, "cylinder", [radius, 2.6 * radius], _JOINT, drum)
+    elif joint == 0 and not model.free_flyer:
+        foot = _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+        yield _part(joint, "cylinder", [2 * radius, 0.6 * radius], skin, foot)
+
+
+def _ends(model: RobotModel, joint: int) -> list[Array]:
+    """Return the points that a joint carries: its children, or else its farthest fixed frame."""
+    tree = model.pin_model
+    children = [
+        np.array(tree.jointPlacements[i].translation)
+        for i in range(1, tree.njoints)
+        if tree.parents[i] == joint
+    ]
+    if joint == 0 and model.free_flyer:
+        return []
+    frames = [np.array(f.placement.translation) for f in tree.frames if f.parentJoint == joint]
+    if children or not frames:
+        return children or [np.array(tree.inertias[joint].lever)]
+    farthest = max(frames, key=lambda point: float(np.linalg.norm(point)))
+    is_point = np.linalg.norm(farthest) < _SHORT
+    return [np.array(tree.inertias[joint].lever) if is_point else farthest]
+
+
+def _reach(model: RobotModel) -> float:
+    """Return the longest way from the root along the joints [m]; 0.1 at least."""
+    tree = model.pin_model
+    ways = [0.0] * tree.njoints
+    for i in range(1, tree.njoints):
+        ways[i] = ways[tree.parents[i]] + float(np.linalg.norm(tree.jointPlacements[i].translation))
+    return max(0.1, *ways)
+
+
+def _from_y_axis(axis: Array, position: Array) -> Array:
+    """Return the pose that turns the y axis, the viewer's axis of a cylinder, into an axis."""
+    M = np.eye(4)
+    M[:3, :3] = pin.Quaternion.FromTwoVectors(_UP, axis).toRotationMatrix()
+    M[:3, 3] = position
+    return M

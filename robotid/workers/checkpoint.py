@@ -1,0 +1,172 @@
+"""Finished pieces of a long reduction, kept beside its results until it is complete."""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid.exceptions import DataError
+from robotid.workers.pieces import Piece, Reduction
+
+__all__ = ["FOLDER", "Checkpoint"]
+
+FOLDER = ".robotid-checkpoint"
+
+_SHOWN = 5  # differences that a message names
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A folder with a file per finished piece, each for one set of inputs only.
+
+    Attributes:
+        folder: Where the files are.
+        key: SHA-256 of all that determines the reductions, in hexadecimal.
+    """
+
+    folder: Path
+    key: str
+
+    @classmethod
+    def open(
+        cls,
+        parent: str | Path,
+        inputs: Mapping[str, Any],
+        pieces: Sequence[Piece],
+        *,
+        resume: bool = False,
+    ) -> "Checkpoint":
+        """Open the checkpoint of a reduction; an old one is replaced unless it is resumed.
+
+        Args:
+            parent: Folder of the results; made if it is missing.
+            inputs: All that determines the reductions, as values that JSON can hold.
+            pieces: The pieces.
+            resume: Whether finished pieces of an interrupted run are used.
+
+        Returns:
+            The checkpoint.
+
+        Raises:
+            DataError: If the one to resume is of other inputs or cannot be read.
+        """
+        folder = Path(parent) / FOLDER
+        stated = {**inputs, "pieces": [piece.name for piece in pieces]}
+        text = json.dumps(stated, sort_keys=True, indent=1)
+        found = cls(folder, hashlib.sha256(text.encode()).hexdigest())
+        if (folder / "inputs.json").is_file():
+            if resume:
+                found._require_same(json.loads(text))
+                return found
+            _log.warning("%s holds an unfinished run, which is replaced (no --resume)", folder)
+        elif resume:
+            _log.warning("%s does not exist: nothing to resume, starting anew", folder)
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+        _write(folder / "inputs.json", text.encode())
+        return found
+
+    def finished(self) -> frozenset[int]:
+        """Return the indices of the pieces whose reductions are kept."""
+        return frozenset(int(path.stem.split("-")[1]) for path in self.folder.glob("piece-*.npz"))
+
+    def load(self, index: int) -> Reduction:
+        """Return a reduction that is kept.
+
+        Args:
+            index: Which piece.
+
+        Returns:
+            The reduction, to the same bits.
+
+        Raises:
+            DataError: If the file cannot be read or belongs to other inputs.
+        """
+        path = self._path(index)
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                content = dict(arrays)
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise DataError(
+                f"{path} cannot be read ({error}); delete it, its piece is reduced again",
+                "checkpoint",
+            ) from error
+        if str(content.pop("key")) != self.key:
+            raise DataError(f"{path} belongs to other inputs; delete it", "checkpoint")
+        return Reduction.from_arrays(content)
+
+    def save(self, index: int, name: str, reduction: Reduction) -> None:
+        """Keep the reduction of a piece; the file is there as a whole or not at all.
+
+        Args:
+            index: Which piece.
+            name: Name of the piece.
+            reduction: What it came down to.
+        """
+        path = self._path(index)
+        beside = path.with_suffix(".partial")
+        content: dict[str, Any] = reduction.to_arrays()
+        content |= {"key": self.key, "piece": name}
+        with beside.open("wb") as file:
+            np.savez(file, **content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+
+    def remove(self) -> None:
+        """Remove the folder, as when the run is complete."""
+        shutil.rmtree(self.folder)
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"piece-{index:06d}.npz"
+
+    def _require_same(self, stated: Mapping[str, Any]) -> None:
+        path = self.folder / "inputs.json"
+        try:
+            kept = json.loads(path.read_text())
+        except ValueError as error:
+            raise DataError(f"{path} is no JSON: {error}; run without --resume") from error
+        differences = list(_differences(kept, stated))
+        if differences:
+            more = len(differences) - _SHOWN
+            tail = f", and {more} more" if more > 0 else ""
+            raise DataError(
+                f"{self.folder} is the checkpoint of other inputs: "
+                f"{'; '.join(differences[:_SHOWN])}{tail}. Restore them, or run without --resume "
+                "to start anew",
+                "checkpoint",
+            )
+
+
+def _differences(kept: object, now: object, name: str = "") -> Iterator[str]:
+    """Yield in words where two trees of plain values differ."""
+    if isinstance(kept, dict) and isinstance(now, dict):
+        for key in sorted(kept.keys() | now.keys()):
+            yield from _differences(kept.get(key), now.get(key), f"{name}.{key}" if name else key)
+    elif isinstance(kept, list) and isinstance(now, list) and len(kept) == len(now):
+        for k, (one, other) in enumerate(zip(kept, now, strict=True)):
+            yield from _differences(one, other, f"{name}[{k}]")
+    elif kept != now:
+        yield f"{name} was {_short(kept)}, is {_short(now)}"
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _write(path: Path, content: bytes) -> None:
+    beside = path.with_suffix(".partial")
+    beside.write_bytes(content)
+    os.replace(beside, path)

@@ -1,0 +1,191 @@
+"""Work on pieces by the workers of a Dask cluster."""
+
+import logging
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from robotid import __version__
+from robotid.exceptions import MissingDependencyError, WorkerError
+from robotid.workers.processes import Backend
+from robotid.workers.task import Outcome, Work, Workload, run_task, versions
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+__all__ = ["ClusterBackend"]
+
+_log = logging.getLogger(__name__)
+
+
+class ClusterBackend(Backend):
+    """Works on pieces on a Dask cluster; results come home as they are finished.
+
+    Logs must be reachable from every worker under the same path. A piece whose worker is lost is
+    done again by another one; a result counts once, by the index of its piece.
+
+    Args:
+        address: Address of the scheduler, as ``tcp://host:8786``.
+        patience: How long to wait for the scheduler and its first worker [s].
+    """
+
+    def __init__(self, address: str, *, patience: float = 30.0) -> None:
+        self.address, self.patience = address, patience
+        self._client: Client | None = None
+
+    @property
+    def description(self) -> str:
+        """What messages call it."""
+        return f"the Dask cluster {self.address}, one BLAS thread per piece"
+
+    def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
+        """Work on pieces, at most two per thread of the cluster under way.
+
+        Args:
+            work: What to do with a piece.
+            pieces: Index and piece.
+
+        Yields:
+            Index and result of each piece once, as they come.
+
+        Raises:
+            DataError: If a row cannot be used.
+            MissingDependencyError: If Dask is not installed.
+            WorkerError: If the cluster cannot be reached, its robotid is of another version, or it
+                loses the workers that try the same piece over and over.
+        """
+        try:
+            if self._client is None:
+                self._client = self._connect()
+                _require_same_version(self.address, self._client)
+            yield from self._collect(self._client, work, pieces)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the cluster; the next work comes back to it."""
+        if self._client is not None:
+            self._client.close(timeout=5)
+            self._client = None
+
+    def _connect(self) -> "Client":
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise MissingDependencyError("--scheduler", "distributed", "cluster") from error
+        try:
+            client = Client(self.address, timeout=self.patience, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise WorkerError(
+                f"no Dask scheduler answers at {self.address!r} ({error}); start one with "
+                "'dask scheduler' and give its address"
+            ) from error
+        try:
+            client.wait_for_workers(1, timeout=self.patience)
+        except TimeoutError as error:
+            client.close()
+            raise WorkerError(
+                f"the Dask scheduler {self.address} has no workers; start some with "
+                f"'dask worker {self.address}'"
+            ) from error
+        return client
+
+    def _collect(
+        self, client: "Client", work: Work, pieces: Sequence[tuple[int, Workload]]
+    ) -> Iterator[tuple[int, Any]]:
+        from distributed import CancelledError, KilledWorker, as_completed
+
+        waiting, level = iter(pieces), _log.getEffectiveLevel()
+        run = uuid4().hex
+        running: dict[object, tuple[int, Workload, Future[Any]]] = {}
+        results = as_completed(loop=client.loop)
+        try:
+            while True:
+                most = 2 * max(1, sum(client.nthreads().values()))
+                for index, piece in islice(waiting, max(0, most - len(running))):
+                    key = f"robotid-{run}-{index}"
+                    future = client.submit(
+                        _run, work, piece, level, __version__, key=key, pure=False
+                    )
+                    running[future.key] = index, piece, future
+                    results.add(future)
+                if not running:
+                    return
+                future = next(results)
+                index, piece, _ = running[future.key]
+                try:
+                    outcome: Outcome = future.result()
+                except KilledWorker as error:
+                    raise WorkerError(
+                        f"the cluster lost every worker that worked on {piece.name} (killed, or "
+                        "short of memory)"
+                    ) from error
+                except CancelledError as error:
+                    raise WorkerError(
+                        f"the cluster {self.address} was lost while it worked on {piece.name}"
+                    ) from error
+                except Exception as error:
+                    error.add_note(f"while working on {piece.name}")
+                    raise
+                del running[future.key]
+                future.release()
+                outcome.log()
+                yield index, outcome.result
+        finally:
+            if running and client.status == "running":
+                client.cancel([future for _, _, future in running.values()])
+
+
+def _run(work: Work, piece: Workload, level: int, wanted: str) -> Outcome:
+    """Work on a piece on a worker, and say on an error which host met it."""
+    if __version__ != wanted:  # a worker that joined after the start
+        raise WorkerError(_wrong_version({socket.gethostname(): __version__}, wanted))
+    try:
+        return run_task(work, piece, level)
+    except Exception as error:
+        error.add_note(
+            f"on the worker's host {socket.gethostname()!r}; logs must be readable there under the "
+            "same path"
+        )
+        raise
+
+
+def _about() -> dict[str, str]:
+    return {"host": socket.gethostname(), **versions()}
+
+
+def _require_same_version(address: str, client: "Client") -> None:
+    """Refuse workers with another robotid; warn of those whose last bits may differ."""
+    here = versions()
+    workers: Mapping[str, Any] = client.run(_about, on_error="return")
+    broken = {name: about for name, about in workers.items() if isinstance(about, BaseException)}
+    if broken:
+        name, error = next(iter(broken.items()))
+        raise WorkerError(
+            f"the worker {name} of {address} cannot run robotid {__version__} ({error}); install "
+            "the same version there"
+        )
+    others = {
+        f"{about['host']} ({name})": about["robotid"]
+        for name, about in workers.items()
+        if about["robotid"] != __version__
+    }
+    if others:
+        raise WorkerError(_wrong_version(others, __version__))
+    for name, about in workers.items():
+        differs = [key for key in here if about[key] != here[key]]
+        if differs:
+            found = ", ".join(f"{key} {about[key]} (here {here[key]})" for key in differs)
+            _log.warning(
+                "worker %s on %s has %s: last bits may differ from a run here",
+                name, about["host"], found,
+            )  # fmt: skip
+    _log.info("%d workers on %s", len(workers), sorted({a["host"] for a in workers.values()}))
+
+
+def _wrong_version(found: Mapping[str, str], wanted: str) -> str:
+    listed = ", ".join(f"{name} has {other}" for name, other in found.items())
+    return f"workers must run robotid {wanted}, but {listed}; install the same version everywhere"

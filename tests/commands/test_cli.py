@@ -1,0 +1,350 @@
+"""The command line as a user meets it: files in, files out, exit codes and messages."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.export.sidecar import load_identified
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+URDF = str(example_urdf("ur5_robot.urdf"))
+NOISE = np.array([0.5, 0.5, 0.25, 0.1, 0.1, 0.05])  # [N m]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """A folder with two motions of a UR5 that its URDF does not describe."""
+    folder = tmp_path_factory.mktemp("logs")
+    model = RobotModel.from_urdf(URDF)
+    rng = np.random.default_rng(0)
+    for name in ("fit", "keep"):
+        log = exact_log(model, truth(model), rng, samples=1500, rate=100.0, noise=NOISE)
+        write_log(log, folder / f"{name}.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def identified(logs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("identified")
+    words = ["identify", URDF, str(logs / "fit.csv"), "--validate", str(logs / "keep.csv")]
+    assert main([*words, "--out", str(out)]) == 0
+    return out
+
+
+def test_identify_writes_everything_it_names(identified, capsys):
+    names = sorted(path.name for path in identified.iterdir())
+    assert names == [
+        "report.html",
+        "result.json",
+        "ur5_robot.identified.drive.json",
+        "ur5_robot.identified.urdf",
+    ]
+    result = json.loads((identified / "result.json").read_text())
+    assert all((identified / name).is_file() for name in result["outputs"].values())
+
+
+def test_result_json_has_the_promised_shape(identified, logs):
+    result = json.loads((identified / "result.json").read_text())
+    assert result["schema_version"] == 1
+    assert result["robot"] == "ur5"
+    assert result["structure"] == {
+        "standard": 60,
+        "base_inertial": 36,
+        "base": 58,
+        "rank": 58,
+        "condition": pytest.approx(result["structure"]["condition"]),
+        "undetermined": [],
+        "not_told_apart": [],
+    }
+    assert len(result["base_parameters"]) == 58
+    assert set(result["base_parameters"][0]) == {
+        "name", "expression", "value", "std_error", "interval_95", "unit",
+    }  # fmt: skip
+    assert len(result["standard_parameters"]) == 60
+    assert {p["source"] for p in result["standard_parameters"]} <= {"data", "mixed", "prior"}
+    assert len(result["drive_parameters"]) == 24
+    assert {p["source"] for p in result["drive_parameters"]} <= {"data", "mixed"}
+    assert {p["prior"] for p in result["drive_parameters"]} == {0.0}
+    assert result["consistency"]["is_consistent"] is True
+    assert result["consistency"]["links"][0]["min_eigenvalue"] > 0
+    joint = result["identification"]["per_joint"]["elbow_joint"]
+    assert joint["unit"] == "N m"
+    # 0.25 N m of noise behind 8 Hz of 50, and a little where friction changes sign
+    assert 0.1 < joint["rmse"] < 0.15
+    kept = result["validation"][0]
+    assert kept["log"] == str(logs / "keep.csv")
+    assert set(kept["per_joint"]["elbow_joint"]) == {
+        "rmse", "unit", "relative_error_pct", "r2", "rows", "urdf_relative_error_pct",
+        "gravity_only_relative_error_pct", "better_than_constant",
+    }  # fmt: skip
+    assert len(result["wls"]["base_values"]) == 58
+    assert result["verdict"]["status"] == "good"
+    roles = [entry["role"] for entry in result["inputs"]]
+    assert roles == ["urdf", "identification", "validation"]
+    assert len(result["inputs"][1]["sha256"]) == 64
+    assert result["inputs"][1]["signals"]["velocity"] == "measured"
+
+
+def test_the_written_urdf_predicts_what_the_fit_predicts(identified, logs, capsys):
+    result = json.loads((identified / "result.json").read_text())
+    assert (
+        main(["validate", str(identified / "result.json"), str(logs / "keep.csv"), "--json"]) == 0
+    )
+    again = json.loads(capsys.readouterr().out)
+    assert again["predicted_with"] == "ur5_robot.identified.urdf"
+    for joint, before in result["validation"][0]["per_joint"].items():
+        after = again["validation"][0]["per_joint"][joint]
+        assert after["rmse"] == pytest.approx(before["rmse"], rel=1e-6)
+        assert after["urdf_relative_error_pct"] == pytest.approx(before["urdf_relative_error_pct"])
+
+
+def test_the_written_urdf_holds_the_identified_masses(identified):
+    result = json.loads((identified / "result.json").read_text())
+    outputs = result["outputs"]
+    model, pi = load_identified(identified / outputs["urdf"], identified / outputs["sidecar"])
+    stated = {p["name"]: p["value"] for p in result["standard_parameters"]}
+    stated |= {p["name"]: p["value"] for p in result["drive_parameters"]}
+    np.testing.assert_allclose(
+        pi, [stated[name] for name in model.layout.names], rtol=1e-9, atol=1e-12
+    )
+
+
+def test_friction_goes_into_the_urdf_where_asked(logs, tmp_path, capsys):
+    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path), "--json"]
+    assert main([*words, "--dynamics"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    value = {p["name"]: p["value"] for p in result["drive_parameters"]}
+    text = (tmp_path / result["outputs"]["urdf"]).read_text()
+    assert f'damping="{value["elbow_joint.viscous"]!r}"' in text
+    assert f'friction="{value["elbow_joint.coulomb"]!r}"' in text
+
+
+def test_wls_result_without_a_urdf_can_be_validated(logs, tmp_path, capsys):
+    # ten times the noise on a tenth of the rows: unconstrained parameters that cannot be
+    out = tmp_path / "out"
+    model = RobotModel.from_urdf(URDF)
+    noisy = exact_log(model, truth(model), np.random.default_rng(1), noise=80 * NOISE)
+    write_log(noisy, tmp_path / "noisy.csv")
+    words = ["identify", URDF, str(tmp_path / "noisy.csv"), "--estimator", "wls"]
+    assert main([*words, "--out", str(out), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert "urdf" not in result["outputs"]
+    assert "urdf_not_written" in [warning["code"] for warning in result["warnings"]]
+    assert main(["validate", str(out / "result.json"), str(logs / "keep.csv"), "--json"]) == 0
+    assert "result.json" in json.loads(capsys.readouterr().out)["predicted_with"]
+
+
+def test_json_prints_one_object_and_nothing_else(logs, tmp_path, capsys):
+    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path / "out"), "--json"]
+    assert main(words) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == json.loads((tmp_path / "out" / "result.json").read_text())
+    assert printed.err == ""
+
+
+def test_without_validation_the_verdict_is_not_good(logs, tmp_path, capsys):
+    assert main(["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "verdict: usable" in out
+    assert "no validation log given" in out
+
+
+def test_a_log_validated_on_itself_is_named(logs, tmp_path, capsys):
+    log = str(logs / "fit.csv")
+    assert main(["identify", URDF, log, "--validate", log, "--out", str(tmp_path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert "validation_was_fitted" in [warning["code"] for warning in result["warnings"]]
+    assert result["verdict"]["status"] != "good"
+
+
+def test_joints_left_to_stand_at_zero_are_named(logs, tmp_path, capsys):
+    arm = [f"panda_joint{i}" for i in range(1, 8)]
+    urdf = str(example_urdf("panda.urdf"))
+    model = RobotModel.from_urdf(urdf, joints=arm)
+    log = exact_log(model, truth(model), np.random.default_rng(0), samples=800)
+    write_log(log, tmp_path / "panda.csv")
+    words = ["identify", urdf, str(tmp_path / "panda.csv"), "--joints", ",".join(arm)]
+    assert main([*words, "--out", str(tmp_path / "out"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    (warning,) = [w for w in result["warnings"] if w["code"] == "locked_at_zero"]
+    assert "panda_finger_joint1" in warning["message"]
+    stated = ["--lock", "panda_finger_joint1=0.0", "--lock", "panda_finger_joint2=0.0"]
+    assert main([*words, *stated, "--out", str(tmp_path / "out"), "--json"]) == 0
+    codes = [w["code"] for w in json.loads(capsys.readouterr().out)["warnings"]]
+    assert "locked_at_zero" not in codes
+
+
+def spoil(logs, tmp_path, change):
+    """Write fit.csv with one thing wrong and return its path."""
+    model = RobotModel.from_urdf(URDF)
+    from robotid.logs.read import read_log
+
+    log = read_log(logs / "fit.csv", model.joints)
+    lines = (logs / "fit.csv").read_text().splitlines()
+    path = tmp_path / "bad.csv"
+    path.write_text("\n".join(change(lines, log)) + "\n")
+    return path
+
+
+def cell(lines, row, name, value):
+    column = lines[0].split(",").index(name)
+    words = lines[row].split(",")
+    words[column] = value
+    return [*lines[:row], ",".join(words), *lines[row + 1 :]]
+
+
+def scaled(lines, prefix, factor):
+    head = lines[0].split(",")
+    columns = [i for i, name in enumerate(head) if name.startswith(prefix)]
+    body = []
+    for line in lines[1:]:
+        words = line.split(",")
+        for i in columns:
+            words[i] = repr(float(words[i]) * factor)
+        body.append(",".join(words))
+    return [lines[0], *body]
+
+
+def without(lines, name):
+    column = lines[0].split(",").index(name)
+    return [",".join(w for i, w in enumerate(line.split(",")) if i != column) for line in lines]
+
+
+def degrees(lines):
+    factor = 180 / np.pi
+    return scaled(scaled(scaled(lines, "q_", factor), "dq_", factor), "ddq_", factor)
+
+
+TAU, Q = "tau_elbow_joint", "q_elbow_joint"
+# fmt: off
+BAD_LOGS = {
+    "NaN torque": (lambda x, _: cell(x, 18, TAU, "nan"), "tau_elbow_joint is NaN at row 17"),
+    "NaN position": (lambda x, _: cell(x, 5, Q, "nan"), "q_elbow_joint is NaN at row 4"),
+    "text": (lambda x, _: cell(x, 5, Q, "off"), Q),
+    "degrees": (lambda x, _: degrees(x), "degrees"),
+    "milliseconds": (lambda x, _: scaled(x, "time", 1000), "milliseconds"),
+    "two stamps swapped": (lambda x, _: [*x[:9], x[10], x[9], *x[11:]], "t must increase"),
+    "duplicate stamp": (lambda x, _: [*x[:9], x[8], *x[9:]], "duplicate time stamp"),
+    "too few rows": (lambda x, _: x[:49], "too few rows"),
+    "missing torque column": (lambda x, _: without(x, TAU), "elbow_joint"),
+    "header only": (lambda x, _: x[:1], "row"),
+    "velocity of opposite sign": (lambda x, _: scaled(x, "dq_", -1), "sign"),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_LOGS.values(), ids=BAD_LOGS)
+def test_a_bad_log_is_refused_by_name_and_nothing_is_written(
+    logs, tmp_path, capsys, change, message
+):
+    path = spoil(logs, tmp_path, change)
+    out = tmp_path / "out"
+    assert main(["identify", URDF, str(path), "--out", str(out)]) == 1
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert printed.out == ""
+    assert not out.exists()
+
+
+def test_a_stated_unit_overrides_the_suspicion(logs, tmp_path, capsys):
+    path = spoil(logs, tmp_path, lambda lines, _: degrees(lines))
+    words = ["identify", URDF, str(path), "--out", str(tmp_path / "out"), "--json"]
+    assert main([*words, "--angle-unit", "deg"]) == 0
+    base = json.loads(capsys.readouterr().out)["base_parameters"]
+    assert main(["identify", URDF, str(logs / "fit.csv"), *words[3:]]) == 0
+    expected = json.loads(capsys.readouterr().out)["base_parameters"]
+    values = ([p["value"] for p in base], [p["value"] for p in expected])
+    np.testing.assert_allclose(*values, rtol=0, atol=1e-6)
+
+
+WRONG_USE = {
+    "unknown estimator": (["--estimator", "magic"], 2, "estimator is 'magic'"),
+    "bad gain": (["--gain", "elbow"], 2, "wanted JOINT=NUMBER"),
+    "bad cutoff": (["--cutoff", "no"], 2, "wanted a frequency [Hz] or false"),
+    "unknown joint": (["--joints", "elbow"], 1, "joint 'elbow' is not in ur5_robot.urdf"),
+    "cutoff beyond half the rate": (["--cutoff", "80"], 2, "not below half the rate"),
+    "unknown unit": (["--time-unit", "min"], 2, "time is 'min', wanted one of"),
+}
+
+
+@pytest.mark.parametrize(("flags", "code", "message"), WRONG_USE.values(), ids=WRONG_USE)
+def test_wrong_use_has_its_exit_code_and_message(logs, tmp_path, capsys, flags, code, message):
+    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path / "out"), *flags]
+    assert main(words) == code
+    assert message in capsys.readouterr().err
+
+
+def test_a_job_file_states_its_logs_itself(logs, tmp_path, capsys):
+    job = tmp_path / "job.toml"
+    job.write_text(
+        f'urdf = "{URDF}"\n[[identification]]\nlog = "{logs / "fit.csv"}"\n'
+        f'[[validation]]\nlog = "{logs / "keep.csv"}"\n'
+    )
+    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
+    assert "verdict: good" in capsys.readouterr().out
+    assert main(["identify", str(job), "--cutoff", "5"]) == 2
+    assert "is a job file, which states its logs and settings itself" in capsys.readouterr().err
+
+
+def test_no_log_is_wrong_usage(capsys):
+    assert main(["identify", URDF]) == 2
+    assert "no log was given" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["identfy"])
+
+
+def test_inspect_prints_what_a_urdf_holds(capsys):
+    assert main(["inspect", URDF, "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["robot"] == "ur5"
+    assert content["structure"]["base_inertial"] == 36
+    assert len(content["base_groups"]) == 36
+    assert main(["inspect", URDF]) == 0
+    assert "36 base" in capsys.readouterr().out
+    assert main(["inspect", str(example_urdf("solo12.urdf")), "--free-flyer", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["structure"]["base_inertial"] == 94
+
+
+def test_inspect_of_an_unusable_urdf_says_why(capsys, tmp_path):
+    assert main(["inspect", str(example_urdf("ur3.urdf")), "--json"]) == 1
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["structure"] is None
+    assert "no model can be built" in printed.err
+
+
+def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys):
+    out = tmp_path / "demo"
+    assert main(["demo", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "verdict: good" in printed
+    assert "of 58 base parameters lie within 3 standard errors of the truth" in printed
+    count = int(printed.split(" of 58 base")[0].split()[-1])
+    assert count >= 55  # 58 intervals of 99.7 % and a little model error of the friction's edge
+    assert (out / "replay.html").stat().st_size > 100_000
+    assert str(out / "report.html") in printed
+
+
+def test_nothing_stays_behind_when_a_run_fails_late(logs, tmp_path, monkeypatch):
+    import robotid.commands.identify
+
+    def broken(*_args, **_options):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(robotid.commands.identify, "write_json", broken)
+    out = tmp_path / "out"
+    assert main(["identify", URDF, str(logs / "fit.csv"), "--out", str(out)]) == 1
+    assert list(out.iterdir()) == []
+
+
+def test_a_result_can_be_validated_from_any_folder(logs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(logs)
+    out = tmp_path / "out"
+    assert main(["identify", URDF, "fit.csv", "--out", str(out), "--estimator", "wls"]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["validate", "out/result.json", str(logs / "keep.csv")]) == 0
+    assert "predicted with" in capsys.readouterr().out

@@ -1,0 +1,159 @@
+"""`convert` writes what a robot recorded under standard names, or nothing."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.recorders import JOINT_STATE, messages_of, wide, write_bag2, write_mcap
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.commands.convert import convert
+from robotid.commands.job import job_from_settings
+from robotid.exceptions import DataError
+from robotid.logs.data import Log
+from robotid.logs.read import read_log
+from robotid.logs.table import LogSource
+from robotid.robot.examples import example_urdf
+
+JOINTS = ("shoulder", "elbow")
+
+
+@pytest.fixture
+def log():
+    t = np.arange(60) / 50
+    phase = t[:, None] * [2.0, 3.0]
+    velocity = np.cos(phase) * [2.0, 3.0]
+    return Log(t=t, q=np.sin(phase), v=velocity, tau=10 * np.cos(phase), joints=JOINTS)
+
+
+@pytest.fixture
+def bag(tmp_path, log):
+    """A bag whose second topic is another arm's."""
+    other = replace(log, joints=("left", "right"))
+    topics = {"/arm": messages_of(log), "/other": messages_of(other)}
+    return write_bag2(tmp_path / "bag", topics)
+
+
+def assert_same(back, log):
+    for name in ("t", "q", "v", "tau"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), name)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".npz", ".h5", ".hdf5", ".mat"])
+def test_a_bag_becomes_a_table_of_standard_names(tmp_path, log, bag, suffix):
+    target = tmp_path / f"run{suffix}"
+    done = convert(bag, target, source=LogSource(topic="/arm"))
+    standard = [f"{kind}_{joint}" for kind in ("q", "dq", "tau") for joint in JOINTS]
+    assert (done.columns, done.joints) == (("time", *standard), JOINTS)
+    assert (done.path, done.samples, done.ignored) == (str(target), 60, ())
+    assert_same(read_log(target, JOINTS), log)
+
+
+def test_joints_without_torque_are_converted_too(tmp_path, log):
+    messages = [(*message[:4], []) for message in messages_of(log)]
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    done = convert(path, tmp_path / "run.csv")
+    assert done.columns == ("time", "q_shoulder", "q_elbow", "dq_shoulder", "dq_elbow")
+
+
+def test_joints_are_chosen_renamed_and_effort_may_be_current(tmp_path, log, bag):
+    source = LogSource(topic="/arm", joints={"joint_2": "elbow"}, effort="current")
+    done = convert(bag, tmp_path / "run.csv", joints=["joint_2"], source=source)
+    assert done.columns == ("time", "q_joint_2", "dq_joint_2", "current_joint_2")
+    back = read_log(tmp_path / "run.csv", ["joint_2"], gains={"joint_2": 2.0})
+    np.testing.assert_array_equal(back.tau[:, 0], 2 * log.tau[:, 1])
+    assert done.ignored == ()
+
+
+def test_columns_of_no_joint_are_left_out_and_named(tmp_path, log, capsys):
+    np.savez(tmp_path / "run.npz", **wide(log), temperature=np.zeros(60))
+    done = convert(tmp_path / "run.npz", tmp_path / "run.csv")
+    assert done.ignored == ("temperature",)
+    assert_same(read_log(tmp_path / "run.csv", JOINTS), log)
+    assert main(["convert", str(tmp_path / "run.npz"), str(tmp_path / "run.csv")]) == 0
+    assert capsys.readouterr().out.endswith("\n  not of a joint, left out: temperature\n")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"time": [0.0, 1.0], "x": [0.0, 1.0]}, "has no column of a joint, as 'q_<joint>'; "),
+        ({"q_a": [0.0, 1.0]}, "has no column 'time'; columns found: ['q_a']. Rename it"),
+        (
+            {"t": [0.0, 1.0], "q_a": [0.0, 1.0], "position_a": [0.0, 1.0]},
+            "has ['q_a', 'position_a'], several names of 'q_a'; remove all but one",
+        ),
+    ],
+)
+def test_what_cannot_be_named_is_refused_and_nothing_is_written(tmp_path, arrays, message):
+    np.savez(tmp_path / "run.npz", **arrays)
+    with pytest.raises(DataError) as caught:
+        convert(tmp_path / "run.npz", tmp_path / "out.csv")
+    assert str(caught.value).startswith(f"run.npz {message}")
+    with pytest.raises(DataError, match=r"has no joint 'b'|has no column|several names"):
+        convert(tmp_path / "run.npz", tmp_path / "out.csv", joints=["b"])
+    assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
+
+
+def test_the_command_converts_and_names_what_it_wrote(tmp_path, log, bag, capsys):
+    target = str(tmp_path / "run.csv")
+    assert main(["convert", str(bag), target, "--topic", "/arm", "--joints", "elbow"]) == 0
+    assert capsys.readouterr().out == (
+        f"{target}: 60 samples of 1 joints\n  columns time, q_elbow, dq_elbow, tau_elbow\n"
+    )
+    assert main(["convert", str(bag), target, "--topic", "/arm", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["joints"] == list(JOINTS)
+    assert_same(read_log(target, JOINTS), log)
+
+
+def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, capsys):
+    target = tmp_path / "run.csv"
+    target.write_text("precious")
+    assert main(["convert", str(bag), str(target)]) == 1
+    assert f"bag holds 2 topics of {JOINT_STATE}: ['/arm', '/other']" in capsys.readouterr().err
+    assert main(["convert", str(bag), str(target), "--topic", "/arm", "--effort", "x"]) == 2
+    assert "log: effort is 'x', wanted one of" in capsys.readouterr().err
+    assert main(["convert", str(bag), str(tmp_path / "run.mcap"), "--topic", "/arm"]) == 1
+    assert "run.mcap: logs are written as .csv, " in capsys.readouterr().err
+    assert target.read_text() == "precious"
+    assert {path.name for path in tmp_path.iterdir()} == {"bag", "run.csv"}
+
+
+def test_a_job_reads_a_bag_and_its_result_validates_on_it(tmp_path, ur5, rng, capsys):
+    made = exact_log(ur5, truth(ur5), rng, noise=0.1)
+    names = tuple(f"M{j}" for j in range(6))
+    renamed = list(messages_of(replace(made, joints=names)))
+    still = messages_of(replace(made, joints=names, q=0 * made.q))
+    write_bag2(tmp_path / "bag", {"/arm": renamed, "/command": still})
+    mapping = ", ".join(f'{j} = "{m}"' for j, m in zip(ur5.joints, names, strict=True))
+    (tmp_path / "job.toml").write_text(
+        f'urdf = "{example_urdf("ur5_robot.urdf")}"\n'
+        f'[log]\ntopic = "/arm"\njoints = {{ {mapping} }}\nstamp = "header"\neffort = "torque"\n'
+        '[estimator]\nname = "wls"\n'
+        '[[identification]]\nlog = "bag"\n'
+    )
+    out = tmp_path / "out"
+    assert main(["identify", str(tmp_path / "job.toml"), "--out", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["settings"]["log"]["topic"] == "/arm"
+    assert len(result["inputs"][1]["sha256"]) == 64  # of the folder
+    assert main(["validate", str(out / "result.json"), str(tmp_path / "bag")]) == 0
+    again = job_from_settings(result["settings"], "result.json", tmp_path)
+    assert again.source.joints == dict(zip(ur5.joints, names, strict=True))
+    capsys.readouterr()
+
+
+def test_the_flags_of_identify_say_where_the_signals_are(tmp_path, ur5, rng, capsys):
+    made = exact_log(ur5, truth(ur5), rng, noise=0.1)
+    path = write_mcap(tmp_path / "run.mcap", messages_of(made), topic="/arm")
+    urdf = str(example_urdf("ur5_robot.urdf"))
+    words = ["identify", urdf, str(path), "--out", str(tmp_path / "out")]
+    assert main([*words, "--topic", "/leg"]) == 1
+    assert f"run.mcap has no topic '/leg'; topics: {{'/arm': '{JOINT_STATE}'}}" in (
+        capsys.readouterr().err
+    )
+    assert main([*words, "--stamp", "wall"]) == 2
+    assert main([*words, "--topic", "/arm", "--effort", "current"]) == 1
+    assert "has the current 'effort_shoulder_pan_joint' but no gain" in capsys.readouterr().err

@@ -1,0 +1,88 @@
+"""From job to result where the URDF or the logs are at fault: what is said of them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.commands.identify import run_job
+from robotid.commands.job import Job, LogEntry
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.read import write_log
+
+
+def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(ur5, rng, tmp_path, capsys):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0)
+    still = np.zeros_like(log.q)
+    write_log(replace(log, q=still, v=still, a=still), tmp_path / "rest.csv")
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "rest.csv"),))
+    with pytest.raises(DataError, match="0 torque rows") as caught:
+        run_job(job, tmp_path / "out")
+    notes = caught.value.__notes__
+    assert any("static_joint" in note and "elbow_joint stands still" in note for note in notes)
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["identify", ur5.tree.path, str(tmp_path / "rest.csv"), *out]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("robotid: 0 torque rows")
+    assert lines[1].startswith("  doctor: warning: ")
+
+
+def test_an_earlier_urdf_does_not_stay_beside_a_result_that_has_none(ur5, rng, tmp_path, caplog):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=1.0)
+    write_log(log, tmp_path / "run.csv")
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "run.csv"),))
+    out = tmp_path / "out"
+    _, result = run_job(replace(job, estimator=EstimatorSettings(draws=0)), out)
+    written = [out / result["outputs"][key] for key in ("urdf", "sidecar")]
+    assert all(path.exists() for path in written)
+    noisy = replace(log, tau=log.tau + 30.0 * rng.standard_normal(log.tau.shape))
+    write_log(noisy, tmp_path / "run.csv")
+    _, result = run_job(replace(job, estimator=EstimatorSettings(name="wls")), out)
+    assert set(result["outputs"]) == {"report"}
+    assert not any(path.exists() for path in written)
+    assert "is of an earlier run and was removed" in caplog.text
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(ur5, tmp_path):
+    (tmp_path / "out").write_text("")
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "none.csv"),))
+    with pytest.raises(SettingsError, match="out' is a file, wanted a folder for the results"):
+        run_job(job, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b'{"schema_version":1,"verdict":{}}', "has no ['settings', 'inputs', "),
+        (b"\xff\xfe", "is not JSON"),
+    ],
+)
+def test_a_result_that_is_none_is_refused(tmp_path, capsys, content, said):
+    (tmp_path / "result.json").write_bytes(content)
+    assert main(["validate", str(tmp_path / "result.json"), "run.csv"]) == 1
+    assert f"robotid: result.json {said}" in capsys.readouterr().err
+
+
+def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refused(
+    ur5, rng, tmp_path, capsys
+):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0)
+    write_log(log, tmp_path / "log.csv")
+    text, urdf = Path(ur5.tree.path).read_text(), tmp_path / "robot.urdf"
+    command = ["identify", str(urdf), str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]
+    urdf.write_text(text.replace('mass value="2.275"', 'mass value="-2.275"', 1))
+    assert main(command) == 1
+    assert "link 'forearm_link': inertial mass is -2.275 kg" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    urdf.write_text(text.replace('izz="0.004095"', 'izz="-0.004095"', 1))
+    assert main(command) == 0
+    warnings = json.loads((tmp_path / "out" / "result.json").read_text())["warnings"]
+    (finding,) = [w for w in warnings if w["code"] == "not_positive_definite"]
+    assert finding["where"] == "link forearm_link"
+    assert "are not all positive" in finding["message"]
+    assert "takes the nearest possible body" in finding["message"]

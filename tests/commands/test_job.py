@@ -1,0 +1,141 @@
+from pathlib import Path
+
+import pytest
+
+from robotid.commands.job import job_from_settings, read_job
+from robotid.exceptions import SettingsError
+from robotid.logs.table import LogSource
+from robotid.robot.parameters import Coupling
+
+FULL = """
+urdf = "robot.urdf"
+joints = ["a", "b"]
+locked = { c = 0.8 }
+gravity = [0.0, -9.81, 0.0]
+
+[signals]
+rate = 200.0
+cutoff = 8.0
+order = 4
+velocity = "auto"
+acceleration = "differentiated"
+trim = 0.2
+min_velocity = 0.02
+max_gap = 0.1
+
+[model]
+armature = true
+friction = "viscous"
+offset = false
+
+[torque]
+gains = { a = 14.87 }
+
+[log]
+topic = "/arm"
+joints = { a = "M1" }
+effort = "current"
+stamp = "log"
+
+[units]
+time = "ms"
+
+[[coupling]]
+name = "motor"
+ratios = { a = 1, b = -1.0 }
+
+[estimator]
+name = "wls"
+
+[output]
+dynamics = true
+
+[[identification]]
+log = "ident.parquet"
+start = 0.3
+end = 13.5
+[[validation]]
+log = "val.parquet"
+"""
+
+
+def write(tmp_path, text):
+    path = tmp_path / "job.toml"
+    path.write_text(text)
+    return path
+
+
+def test_every_key_of_a_job_arrives(tmp_path):
+    job = read_job(write(tmp_path, FULL))
+    assert job.urdf == tmp_path / "robot.urdf"
+    assert job.joints == ("a", "b")
+    assert job.locked == {"c": 0.8}
+    assert job.gravity == (0.0, -9.81, 0.0)
+    assert job.signals.rate == 200.0
+    assert job.signals.acceleration == "differentiated"
+    assert job.terms == ("armature", "viscous")
+    assert job.gains == {"a": 14.87}
+    assert job.units.time == "ms"
+    assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
+    assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
+    assert job.estimator.name == "wls"
+    assert job.dynamics is True
+    (entry,) = job.identification
+    assert (entry.path, entry.start, entry.end) == (tmp_path / "ident.parquet", 0.3, 13.5)
+    assert job.validation[0].end is None
+
+
+def test_settings_written_into_a_result_are_the_same_job(tmp_path):
+    job = read_job(write(tmp_path, FULL))
+    again = job_from_settings(job.to_settings(), "result.json", Path())
+    assert again == job
+    off = read_job(write(tmp_path, FULL.replace("cutoff = 8.0", "cutoff = false")))
+    assert off.signals.cutoff is None
+    assert job_from_settings(off.to_settings(), "result.json", Path()) == off
+
+
+def test_paths_may_name_environment_variables(tmp_path, monkeypatch):
+    path = write(tmp_path, 'urdf = "$SOME_FOLDER/robot.urdf"')
+    monkeypatch.setenv("SOME_FOLDER", str(tmp_path / "data"))
+    assert read_job(path).urdf == tmp_path / "data" / "robot.urdf"
+    monkeypatch.delenv("SOME_FOLDER")
+    with pytest.raises(SettingsError, match="names an environment variable that is not set"):
+        read_job(path)
+
+
+WRONG = {
+    "misspelt key": ("order = 4", "ordr = 4", "ordr is not a known key; did you mean 'order'?"),
+    "misspelt table": ("[signals]", "[signal]", "known key; did you mean 'signals'?"),
+    "text for a number": ("trim = 0.2", 'trim = "0.2"', "signals.trim is '0.2', wanted a number"),
+    "true for a number": ("rate = 200.0", "rate = true", "signals.rate is True, wanted a number"),
+    "cutoff true": ("cutoff = 8.0", "cutoff = true", "cutoff is true, wanted a frequency [Hz]"),
+    "negative cutoff": ("cutoff = 8.0", "cutoff = -8.0", "cutoff is -8.0, wanted a positive"),
+    "friction model": ('"viscous"', '"stribeck"', "friction is 'stribeck', wanted one of"),
+    "estimator": ('"wls"', '"magic"', "estimator is 'magic', wanted one of"),
+    "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
+    "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
+    "no log": ('log = "val.parquet"', "end = 2.0", "a [[validation]] has no key 'log'"),
+    "floating base": ("[signals]", "free_flyer = true\n[signals]", "free_flyer is true, but no"),
+    "no urdf": ('urdf = "robot.urdf"', "", "has no key 'urdf'"),
+    "joints text": ('joints = ["a", "b"]', 'joints = "a"', "joints is 'a', wanted a list"),
+    "unit": ('time = "ms"', 'time = "sec"', "time is 'sec', wanted one of"),
+    "effort": ('effort = "current"', 'effort = "force"', "log: effort is 'force', wanted one of"),
+    "stamp": ('stamp = "log"', 'stamp = "wall"', "log: stamp is 'wall', wanted one of"),
+    "joint's name": ('a = "M1"', "a = 1", "log: joints.a is 1, wanted a name"),
+    "misspelt topic": ("topic =", "topics =", "topics is not a known key; did you mean 'topic'?"),
+    "no TOML": ("[signals]", "[signals", "is not valid TOML"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "message"), WRONG.values(), ids=WRONG)
+def test_a_wrong_job_names_what_is_wrong(tmp_path, old, new, message):
+    assert old in FULL
+    with pytest.raises(SettingsError) as caught:
+        read_job(write(tmp_path, FULL.replace(old, new, 1)))
+    assert message in str(caught.value)
+    assert "job.toml" in str(caught.value)
+
+
+def test_a_missing_job_file_is_named(tmp_path):
+    with pytest.raises(SettingsError, match=r"there is no job file '.*none.toml'"):
+        read_job(tmp_path / "none.toml")

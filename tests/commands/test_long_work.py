@@ -1,0 +1,183 @@
+"""Long logs on the command line: workers, cluster, Ctrl-C, resume; always the same result."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.commands import identify as workflow
+from robotid.commands.progress import terminal_progress
+from robotid.exceptions import SettingsError
+from robotid.logs.read import write_log
+from robotid.robot.model import RobotModel
+from robotid.workers.cluster import ClusterBackend
+from robotid.workers.plan import WorkPlan
+
+URDF = str(ROOT / "urdf" / "planar_2r.urdf")
+CHECKPOINT = ".robotid-checkpoint"
+
+
+def write_job(folder, rows_in_memory, *tables):
+    job = folder / "job.toml"
+    lines = [f'urdf = "{URDF}"', *tables, "[reduction]", f"rows_in_memory = {rows_in_memory}"]
+    lines += ["[[identification]]", 'log = "fit.csv"', "[[validation]]", 'log = "keep.csv"']
+    job.write_text("\n".join(lines))
+    return str(job)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """A folder with two motions of an arm, the first of many pieces."""
+    folder = tmp_path_factory.mktemp("logs")
+    model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
+    for name, samples in (("fit", 6_000), ("keep", 1_000)):
+        log = exact_log(model, truth(model), rng, samples=samples, rate=100.0, noise=0.1)
+        write_log(log, folder / f"{name}.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def job(logs):
+    """A job file that cuts the log into two dozen pieces."""
+    return write_job(logs, 1024)
+
+
+@pytest.fixture(scope="module")
+def expected(job, tmp_path_factory):
+    """The result of an uninterrupted run in one process."""
+    out = tmp_path_factory.mktemp("serial")
+    assert main(["identify", job, "--workers", "1", "--out", str(out)]) == 0
+    assert not (out / CHECKPOINT).exists()
+    return (out / "result.json").read_text()
+
+
+def test_two_workers_give_the_same_result_to_the_last_bit(job, expected, tmp_path, capsys):
+    words = ["identify", job, "--workers", "2", "--out", str(tmp_path), "--verbose", "--json"]
+    assert main(words) == 0
+    assert (tmp_path / "result.json").read_text() == expected
+    shown = capsys.readouterr()
+    assert json.loads(shown.out) == json.loads(expected)
+    assert "reducing 24 pieces" in shown.err
+    assert "6000 samples in all: 2 worker processes, one BLAS thread each" in shown.err
+    assert shown.err.count("samples: Pinocchio (fewer than") == 1  # once for all pieces
+    assert "%" not in shown.err  # progress is for terminals
+
+
+def test_a_cluster_gives_the_same_result_to_the_last_bit(job, expected, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        words = ["identify", job, "--scheduler", cluster.scheduler_address]
+        assert main([*words, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "result.json").read_text() == expected
+
+
+def cut_off(job, out, number, workers):
+    """Start the command line, send it a signal once some pieces are done; code and stderr."""
+    command = [sys.executable, "-m", "robotid", "identify", job, "--out", str(out)]
+    run = subprocess.Popen(
+        [*command, "--workers", workers], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while len(list((out / CHECKPOINT).glob("*.npz"))) < 3:
+        assert run.poll() is None, run.stderr.read()
+        time.sleep(0.002)
+    (os.killpg if number == signal.SIGINT else os.kill)(run.pid, number)
+    _, error = run.communicate(timeout=20)
+    return run.returncode, error
+
+
+def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
+    job, expected, tmp_path, capsys
+):
+    assert cut_off(job, tmp_path, signal.SIGKILL, "1")[0] == -signal.SIGKILL
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+    done = len(list((tmp_path / CHECKPOINT).glob("*.npz")))
+    assert 3 <= done < 24
+    words = ["identify", job, "--workers", "2", "--out", str(tmp_path)]
+    assert main([*words, "--resume", "--verbose"]) == 0
+    assert f"reducing 24 pieces, {done} of them kept from before" in capsys.readouterr().err
+    assert (tmp_path / "result.json").read_text() == expected
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, tmp_path):
+    code, error = cut_off(job, tmp_path, signal.SIGINT, "2")
+    assert code == 130
+    assert error.count("\n") == 1
+    assert error.startswith("robotid: interrupted; finished pieces are kept in ")
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+    assert main(["identify", job, "--out", str(tmp_path), "--resume"]) == 0
+    assert (tmp_path / "result.json").read_text() == expected
+
+
+def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).write_text((logs / name).read_text())
+    job, out = write_job(tmp_path, 1024), tmp_path / "out"
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow, "conclude", interrupt)
+        assert main(["identify", job, "--out", str(out)]) == 130
+    (tmp_path / "fit.csv").write_text((logs / "keep.csv").read_text())
+    assert main(["identify", job, "--out", str(out), "--resume"]) == 1
+    error = capsys.readouterr().err
+    assert "is the checkpoint of other inputs: logs[0]." in error
+    assert "fit.csv.changed was" in error
+
+
+def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
+    words = ["identify", URDF, str(logs / "keep.csv"), "--out", str(tmp_path), "--workers", "2"]
+    assert main(words) == 0
+    assert (
+        "read at once: workers, scheduler and resume have nothing to do" in capsys.readouterr().err
+    )
+
+
+def test_no_workers_are_wrong_usage(job, tmp_path, capsys):
+    assert main(["identify", job, "--out", str(tmp_path), "--workers", "0"]) == 2
+    assert capsys.readouterr().err == "robotid: workers is 0, wanted at least 1\n"
+    with pytest.raises(SettingsError):
+        WorkPlan(0)
+
+
+def test_an_address_where_nobody_listens_is_said(job, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(ClusterBackend.__init__, "__kwdefaults__", {"patience": 0.2})
+    words = ["identify", job, "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
+    assert main(words) == 1
+    assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("quiet", "force"), [(False, False), (True, False)])
+def test_no_progress_where_there_is_no_terminal(quiet, force, capsys):
+    with terminal_progress(quiet=quiet, force=force) as show:
+        assert show is None
+    assert capsys.readouterr().err == ""
+
+
+def test_forced_progress_shows_work_rate_and_time_left(capsys):
+    with terminal_progress(quiet=True, force=True) as show:
+        for done in (0, 1000, 2000):
+            show("reducing", done, 4000, "samples")
+            time.sleep(0.35)  # the time left is drawn twice a second
+        show("evaluating", 0, 100, "samples")
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "reducing" in shown.err
+    assert "50 %" in shown.err
+    assert "samples/s" in shown.err
+    assert re.search(r"\d:\d\d:\d\d", shown.err)  # time left
+    assert "evaluating" in shown.err

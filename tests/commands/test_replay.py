@@ -1,0 +1,179 @@
+"""``robotid replay``: a log, results, a track and a ghost from files to one page."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.replay_data import shown
+from helpers.synthetic import exact_log, payload_log, truth
+
+from robotid.cli import main
+from robotid.commands.replay import read_findings
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+URDF = str(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A log of a UR5 that its URDF does not describe, and what identify found in it."""
+    folder = tmp_path_factory.mktemp("replay")
+    model = RobotModel.from_urdf(URDF)
+    rng = np.random.default_rng(0)
+    log = exact_log(model, truth(model), rng, samples=1500, rate=100.0)
+    write_log(log, folder / "log.csv")
+    words = ["identify", URDF, str(folder / "log.csv"), "--out", str(folder / "out")]
+    assert main([*words, "--estimator", "wls"]) == 0
+    return folder
+
+
+def run(folder, *words):
+    target = folder / "page.html"
+    code = main(["replay", URDF, *map(str, words), "--html", str(target)])
+    return code, shown(target.read_text(encoding="utf-8")) if code == 0 else None
+
+
+def test_a_log_alone_plays_with_its_torques(folder, capsys):
+    code, data = run(folder, folder / "log.csv")
+    assert code == 0
+    assert data["motion"]["t"][-1] == pytest.approx(14.99)
+    assert data["torques"]["labels"] == ["measured"]
+    assert data["masses"] == []
+    assert data["notes"] == ["Motion: log.csv."]
+    assert len(data["scene"]["meshes"]) > 0
+    assert "page.html, " in capsys.readouterr().err
+
+
+def test_a_result_predicts_and_shows_masses_before_and_after(folder):
+    _, data = run(folder, folder / "log.csv", folder / "out")
+    assert data["torques"]["labels"] == ["measured", "identified"]
+    measured, predicted = np.split(data["torques"]["values"], 2, axis=1)
+    known = np.isfinite(predicted)
+    assert known.mean() > 0.8
+    # the motion is exact and the fit explains it, but for what the filter takes
+    residual = (predicted - measured)[known]
+    assert np.linalg.norm(residual) < 0.01 * np.linalg.norm(measured[known])
+    result = json.loads((folder / "out" / "result.json").read_text())
+    stated = {entry["name"]: entry["value"] for entry in result["standard_parameters"]}
+    before, after = data["masses"]
+    assert (before["label"], after["label"]) == ("URDF", "identified")
+    for body in after["bodies"]:
+        assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
+
+
+def test_two_results_are_called_by_their_folders(folder):
+    out = folder / "out" / "result.json"
+    _, data = run(folder, folder / "log.csv", out, folder / "out")
+    assert data["torques"]["labels"] == ["measured", "out", "out 2"]
+    assert [m["label"] for m in data["masses"]] == ["URDF", "out", "out 2"]
+
+
+def test_a_ghost_starts_with_the_motion(folder):
+    _, data = run(folder, folder / "log.csv", "--ghost", folder / "log.csv")
+    assert data["ghost"]["label"] == "log.csv"
+    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+
+
+def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    kept = [k for k, name in enumerate(header.split(",")) if name.startswith(("time", "q_"))]
+    cut = [",".join(line.split(",")[k] for k in kept) for line in (header, *rows)]
+    (folder / "design.csv").write_text("\n".join(cut) + "\n")
+    _, data = run(folder, folder / "log.csv", "--ghost", folder / "design.csv")
+    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+    cut[0] = cut[0].replace("q_elbow", "x_elbow")
+    (folder / "design.csv").write_text("\n".join(cut) + "\n")
+    assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1
+    assert "design.csv has no column 'q_elbow_joint'; columns: " in capsys.readouterr().err
+
+
+def test_a_joint_that_stands_still_has_no_prediction(folder):
+    text = (folder / "log.csv").read_text().splitlines()
+    names, last = text[0].split(","), text[-1].split(",")
+    held = ["0" if name.startswith("d") else x for name, x in zip(names, last, strict=True)]
+    still = [",".join([f"{15 + k / 100:.2f}", *held[1:]]) for k in range(300)]
+    (folder / "still.csv").write_text("\n".join([*text, *still]) + "\n")
+    _, data = run(folder, folder / "still.csv", folder / "out")
+    torques = data["torques"]
+    rest = (torques["t"] > 16.0) & (torques["t"] < 17.0)
+    assert np.isfinite(torques["values"][rest, :6]).all()
+    assert np.isnan(torques["values"][rest, 6:]).all()
+
+
+def test_torque_that_the_result_does_not_explain_is_marked(folder):
+    header, *rows = (folder / "log.csv").read_text().splitlines()
+    pushed = header.split(",").index("tau_elbow_joint")
+    table = [row.split(",") for row in rows]
+    for cells in table[700:740]:  # from 7 s to 7.4 s
+        cells[pushed] = str(float(cells[pushed]) + 30.0)
+    text = "\n".join([header, *(",".join(cells) for cells in table)])
+    (folder / "pushed.csv").write_text(text + "\n")
+    (mark,) = run(folder, folder / "pushed.csv", folder / "out")[1]["marks"]
+    assert mark["kind"] == "contact"
+    assert mark["t"] == pytest.approx(7.0, abs=0.15)
+    assert mark["label"].startswith("unexplained torque, most at elbow_joint (")
+    assert " N m on average, for " in mark["label"]
+    assert run(folder, folder / "log.csv", folder / "out")[1]["marks"] == []
+
+
+def test_a_track_gives_parameters_over_time_and_marks_the_load(panda, tmp_path, capsys):
+    log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
+    write_log(log, tmp_path / "log.csv")
+    urdf, joints = str(panda.tree.path), ",".join(panda.joints)
+    words = [urdf, str(tmp_path / "log.csv")]
+    assert main(["track", *words, "--joints", joints, "--out", str(tmp_path / "track")]) == 0
+    page = tmp_path / "page.html"
+    assert main(["replay", *words, str(tmp_path / "track"), "--html", str(page)]) == 0
+    data = shown(page.read_text(encoding="utf-8"))
+    track = json.loads((tmp_path / "track" / "track.json").read_text())
+    (mark,) = data["marks"]
+    assert mark["kind"] == "payload"
+    assert mark["t"] == pytest.approx(10.0, abs=0.05)
+    assert mark["label"].endswith("kg on panda_link7")
+    entries = track["base_parameters"]
+    assert data["bands"]["names"] == [entry["name"] for entry in entries]
+    wanted = [e["value"] for e in entries] + [e["std_error"] for e in entries]
+    np.testing.assert_allclose(data["bands"]["values"][-1], wanted, rtol=1e-6)
+
+
+def test_flags_that_a_result_states_are_refused(folder, capsys):
+    code, _ = run(folder, folder / "log.csv", folder / "out", "--rate", "100")
+    assert code == 2
+    assert "a RESULT says how its logs are read; leave out ['rate']" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("lost.json", None, "there is no result '.*lost.json'"),
+        ("other.json", '{"schema_version": 7}', r"other\.json has schema_version 7, wanted 1"),
+        ("text.json", "oh", r"text\.json is not JSON"),
+    ],
+)
+def test_what_is_no_result_is_refused(tmp_path, name, content, message, folder, capsys):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    assert run(folder, folder / "log.csv", tmp_path / name)[0] == 1
+    import re
+
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_an_empty_folder_and_a_second_track_are_refused(tmp_path):
+    with pytest.raises(Exception, match=r"there is no result\.json or track\.json in"):
+        read_findings([tmp_path])
+    for k in (1, 2):
+        (tmp_path / f"{k}.json").write_text('{"history": "", "changes": [], "settings": {}}')
+    with pytest.raises(Exception, match="2 tracks were given; a replay shows one"):
+        read_findings([tmp_path / "1.json", tmp_path / "2.json"])
+
+
+def test_a_result_of_another_robot_is_refused(folder, capsys):
+    other = Path(example_urdf("panda.urdf"))
+    words = ["replay", str(other), str(folder / "log.csv"), str(folder / "out")]
+    assert main([*words, "--html", str(folder / "p.html")]) == 1
+    assert "panda" in capsys.readouterr().err
+    assert not (folder / "p.html").exists()

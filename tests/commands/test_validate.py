@@ -1,0 +1,85 @@
+"""Validation of a written result: what was fitted shows no prediction, and faults are named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.commands.identify import run_job
+from robotid.commands.job import job_from_settings
+from robotid.commands.validate import validate_result
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
+
+NOISE = 0.1 * np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
+
+
+@pytest.fixture
+def here(ur5, tmp_path):
+    """A result of one log without validation, the log, and another one."""
+    rngs = np.random.default_rng(0).spawn(2)
+    first, other = (
+        exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=NOISE) for rng in rngs
+    )
+    write_log(first, tmp_path / "run.csv")
+    table = {
+        "urdf": str(example_urdf("ur5_robot.urdf")),
+        "identification": [{"log": "run.csv"}],
+        "estimator": {"prior_weight": 1.0, "draws": 0},
+    }
+    run_job(job_from_settings(table, "job.toml", tmp_path), tmp_path / "out")
+    return tmp_path, first, other
+
+
+def verdict(folder, log):
+    write_log(log, folder / "again.csv")
+    return validate_result(folder / "out" / "result.json", [folder / "again.csv"])["verdict"]
+
+
+def rows(log, chosen):
+    return replace(log, **{key: getattr(log, key)[chosen] for key in ("t", "q", "v", "a", "tau")})
+
+
+def test_another_motion_is_a_prediction(here):
+    folder, _, other = here
+    found = verdict(folder, other)
+    assert found["status"] == "good", found["reasons"]
+
+
+@pytest.mark.parametrize(
+    "part", [slice(None), slice(None, None, 2), slice(0, 700)], ids=["all", "thinned", "cut"]
+)
+def test_fitted_rows_show_no_prediction(here, part):
+    folder, first, _ = here
+    found = verdict(folder, rows(first, part))
+    assert found["status"] == "usable"
+    assert "hold rows that were fitted" in found["reasons"][0]
+    assert {joint["status"] for joint in found["per_joint"].values()} == {"not evaluated"}
+
+
+def test_the_same_motion_measured_again_is_no_new_one(here, rng):
+    folder, first, _ = here
+    tau = first.tau + 0.01 * NOISE * rng.standard_normal(first.tau.shape)
+    found = verdict(folder, replace(first, tau=tau))
+    assert found["status"] == "usable"
+    assert [doubt["code"] for doubt in found["doubts"]] == ["repeated_motion"]
+
+
+def test_faults_of_the_new_log_lead_its_verdict(here):
+    folder, _, other = here
+    v = other.v.copy()
+    v[:, 2] *= 0.5
+    found = verdict(folder, replace(other, v=v))
+    assert found["status"] == "poor"
+    assert "dq_elbow_joint is 0.5 times d(q)/dt" in found["reasons"][0]
+
+
+def test_without_the_fitted_logs_nobody_knows(here):
+    folder, first, other = here
+    (folder / "run.csv").unlink()
+    found = verdict(folder, other)
+    assert found["status"] == "usable"
+    assert "the fitted logs ['run.csv'] are not where they were" in found["reasons"][0]
+    # the file itself is known by its hash
+    assert "hold rows that were fitted" in verdict(folder, first)["reasons"][0]

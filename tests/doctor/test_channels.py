@@ -1,0 +1,73 @@
+"""Spikes and limits of a channel, told from a joint that rests, a sensor's step, a dead torque."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotid.commands.job import LogEntry, read_job
+from robotid.doctor.channels import check_clipping, check_spikes
+from robotid.logs.data import Log
+
+RATE, N = 500.0, 20000  # [Hz], rows of 40 s
+JOB = Path(__file__).parents[1] / "jobs" / "ur10e.toml"
+
+
+def log_of_two(q=None, tau=None, moving=1.0):
+    """Return a log of two joints; the first moves all the time, the second in a share of it."""
+    rng = np.random.default_rng(0)
+    t = np.arange(N) / RATE
+    inside = np.clip((t - 10.0) / max(moving * t[-1], 1e-9), 0.0, 1.0)
+    own = np.column_stack([np.sin(2 * t), 0.8 * np.sin(np.pi * inside) ** 2])
+    q = own if q is None else np.column_stack([own[:, 0], q])
+    loads = np.column_stack([20 * np.cos(2 * t), 5 * np.cos(q[:, 1])])
+    loads = loads + 0.05 * rng.standard_normal(loads.shape)
+    tau = loads if tau is None else np.column_stack([loads[:, 0], tau])
+    return Log(t, q, tau, ("a", "b"), v=np.gradient(q, t, axis=0), path="run.csv")
+
+
+def spikes(log):
+    return {f.where.removeprefix("run.csv: "): f.severity for f in check_spikes(log)}
+
+
+def flicker(step, count=17):
+    """Return a channel at rest that now and then reads one step more."""
+    x = np.zeros(N)
+    x[np.random.default_rng(1).choice(N, count, replace=False)] = step
+    return x
+
+
+def test_one_step_of_a_sensor_at_rest_is_no_spike():
+    assert spikes(log_of_two(q=flicker(1e-4))) == {}
+    # a torque of the second joint that is as good as none beside the first one's 20 N m
+    assert spikes(log_of_two(tau=flicker(0.05))) == {}
+
+
+@pytest.mark.parametrize("moving", [0.003, 0.02, 0.3])
+def test_a_joint_that_rests_most_of_the_log_has_no_spikes_where_it_moves(moving):
+    assert spikes(log_of_two(moving=moving)) == {}
+
+
+@pytest.mark.parametrize("moving", [0.0, 0.02, 1.0])
+def test_rows_that_jump_are_found_whether_the_joint_moves_or_rests(moving):
+    log = log_of_two(moving=moving)
+    q, tau = log.q.copy(), log.tau.copy()
+    q[[3000, 9000], 1] += 50.0
+    tau[[500, 6000, 12000], 0] = 5000.0
+    assert spikes(replace(log, q=q, tau=tau)) == {"q_b": "error", "tau_a": "error"}
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 6])
+def test_joints_at_rest_in_a_real_recording_raise_no_alarm(recordings, monkeypatch, number):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(JOB)
+    path = recordings / "ur10e" / f"jointwise_{number}.parquet"
+    assert "error" not in {f.severity for f in check_spikes(job.read(LogEntry(path), job.model()))}
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, 3.0])
+def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
+    (found,) = check_clipping(log_of_two(tau=np.full(N, value)))
+    assert (found.code, found.where) == ("constant_torque", "run.csv: b")
+    assert f"the torque of b is {abs(value):g} in every row" in found.message

@@ -1,0 +1,282 @@
+"""The doctor finds what is wrong, by its own code, and nothing where nothing is."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, robot, table_of
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.commands.job import Job, LogEntry, read_job
+from robotid.doctor.diagnosis import alarming, diagnose, examine, findings_to_dict
+from robotid.exceptions import SettingsError
+from robotid.identification.verdict import Finding
+from robotid.logs.formats import write_columns
+from robotid.logs.read import write_log
+from robotid.logs.signals import SignalSettings
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.closed_loop import another_robot, simulate
+from robotid.simulation.motions import random_fourier
+
+JOBS = Path(__file__).parents[1] / "jobs"
+SIGNALS = SignalSettings()
+
+
+@pytest.fixture(scope="module")
+def table():
+    return table_of(clean_log(robot("ur5"), 0))
+
+
+def loud(findings):
+    return {f.code for f in findings if f.severity != "note"}
+
+
+def spoil(name, table, folder):
+    case = CASES[name]
+    path = folder / "run.csv"
+    write_columns(case.change(table), path)
+    urdf = example_urdf(case.urdf)
+    return case, Job(urdf=urdf, gravity=case.gravity, identification=(LogEntry(path),))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_clean_log_gives_no_more_than_notes(name):
+    model = robot(name)
+    findings = diagnose(model, [clean_log(model, 1, rate=50.0)], [], SIGNALS)
+    assert loud(findings) == set()
+    assert {"rate", "noise", "excitation"} <= {f.code for f in findings}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_exact_log_gives_no_more_than_notes(ur5, seed):
+    log = exact_log(ur5, truth(ur5, seed), np.random.default_rng(seed), samples=1500, rate=100.0)
+    assert loud(diagnose(ur5, [log], [], SIGNALS)) == set()
+
+
+# what a corruption cannot but show besides its own code
+BESIDES = {
+    "two position columns swapped": {"position_order"},
+    "static joint": {"unexplained_torque", "excitation"},
+    "five spikes of 1000 N m": {"unexplained_torque"},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_corruption_is_found_by_its_own_code(name, table, tmp_path):
+    case, job = spoil(name, table, tmp_path)
+    findings = examine(job)
+    assert set(case.codes) & {f.code for f in findings}
+    assert loud(findings) - set(case.codes) <= BESIDES.get(name, set())
+    json.dumps(findings_to_dict(findings), allow_nan=False)
+
+
+def test_where_names_the_joint_and_the_evidence_says_how_much(table, tmp_path):
+    _, job = spoil("one torque negated", table, tmp_path)
+    (found,) = [f for f in examine(job) if f.code == "torque_sign"]
+    assert found.where == "run.csv: elbow_joint"
+    assert found.evidence["unexplained"] > 0.5 > 0.1 > found.evidence["unexplained_if_negated"]
+    assert "negate tau_elbow_joint" in found.message
+    _, job = spoil("two torque columns swapped", table, tmp_path)
+    (found,) = [f for f in examine(job) if f.code == "torque_order"]
+    assert found.where == "run.csv: shoulder_lift_joint, wrist_1_joint"
+    assert "tau_wrist_1_joint is that of shoulder_lift_joint" in found.message
+
+
+def test_delays_are_measured_and_corrected_only_on_request(table, tmp_path):
+    _, job = spoil("torque 30 ms late", table, tmp_path)
+    (found,) = [f for f in examine(job) if f.code == "torque_delay"]
+    delay, error = found.evidence["delay"], found.evidence["std_error"]
+    # 5 ms: unmodelled friction near a change of direction feigns a few
+    assert abs(delay - 0.03) < max(3 * error, 0.005)
+    stated = replace(job, signals=SignalSettings(torque_delay=0.03))
+    assert "torque_delay" not in loud(examine(stated))
+    _, job = spoil("velocity 30 ms late", table, tmp_path)
+    (found,) = [f for f in examine(job) if f.code == "velocity_delay"]
+    assert found.evidence["delay"] == pytest.approx(0.03, abs=0.001)
+    stated = replace(job, signals=SignalSettings(velocity_delay=0.03))
+    assert "velocity_delay" not in {f.code for f in examine(stated)}
+
+
+def test_a_motion_recorded_twice_is_no_validation():
+    model, noise = robot("ur5"), np.array([0.5, 0.5, 0.25, 0.1, 0.1, 0.05])
+
+    def recorded(seed, rate):
+        rng = np.random.default_rng(seed)
+        samples = round(15 * rate)
+        return exact_log(model, truth(model), rng, samples=samples, rate=rate, noise=noise)
+
+    first, again, other = recorded(0, 100.0), recorded(0, 120.0), recorded(1, 100.0)
+    later = replace(again, t=again.t + 100.0).window(104.0, 111.0)
+    assert "repeated_motion" in loud(diagnose(model, [first], [later], SIGNALS))
+    assert "repeated_motion" not in loud(diagnose(model, [first], [other], SIGNALS))
+
+
+def test_a_payload_is_weighed(ur5):
+    pi = truth(ur5)
+    last = pi[: ur5.layout.n_inertial].reshape(-1, 10)[-1]
+    log = clean_log(ur5, 0, pi=pi, rate=50.0)
+    # truth() has 10 to 30 % wrong masses and a tool of 1.2 kg, which is no cause for alarm
+    (tool,) = [f for f in diagnose(ur5, [log], [], SIGNALS) if f.code == "payload"]
+    assert tool.severity == "note"
+    assert abs(tool.evidence["mass"] - 1.2) < 3 * tool.evidence["std_error"]
+    last += 3.0 * np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
+    log = clean_log(ur5, 0, pi=pi, rate=50.0)
+    findings = diagnose(ur5, [log], [], SIGNALS)
+    (found,) = [f for f in findings if f.code == "payload"]
+    assert loud(findings) == {"payload"}
+    assert abs(found.evidence["mass"] - 4.2) < 3 * found.evidence["std_error"]
+
+
+# ---- the recordings of other laboratories: what their descriptions warn of and a log can show
+TRAPS = {
+    "kinova_gen3": {"gap", "jitter"},
+    "panda_inria": {"jitter", "stale_rows", "velocity_delay", "gap", "repeated_motion"},
+    "tiago": {"velocity_delay", "quantised", "unexplained_torque"},
+    "tx40": {"rate"},
+    "ur10e": {"jitter", "quantised"},
+}
+
+
+def examined(recordings, name, monkeypatch):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    return examine(read_job(JOBS / f"{name}.toml"))
+
+
+@pytest.mark.parametrize("name", TRAPS)
+def test_the_traps_of_a_recording_are_found_and_nothing_stops_it(recordings, name, monkeypatch):
+    findings = examined(recordings, name, monkeypatch)
+    assert TRAPS[name] <= {f.code for f in findings}
+    assert [f for f in findings if f.severity == "error"] == []
+
+
+def whole(recordings, monkeypatch, name, *files):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(JOBS / f"{name}.toml")
+    folder = job.identification[0].path.parent
+    entries = tuple(LogEntry(folder / f"{file}.parquet") for file in files)
+    return replace(job, identification=entries[:1], validation=entries[1:])
+
+
+def test_tiago_and_ur10e_and_tx40_rest_at_their_ends(recordings, monkeypatch):
+    tiago = examine(whole(recordings, monkeypatch, "tiago", "tiago_dyn"))
+    (rest,) = [f for f in tiago if f.code == "standstill"]
+    assert 6 < rest.evidence["before"] < 10
+    assert 11 < rest.evidence["after"] < 14
+    tx40 = examine(whole(recordings, monkeypatch, "tx40", "joint_side"))
+    (rest,) = [f for f in tx40 if f.code == "standstill"]
+    assert 1.2 < rest.evidence["after"] < 1.7
+
+
+def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypatch):
+    job = whole(
+        recordings, monkeypatch, "ur10e", "ident_20200219_14harm_load", "ident_20200219_14harm"
+    )
+    findings = examine(job)
+    payload = {f.where.split(":")[0]: f for f in findings if f.code == "payload"}
+    loaded = payload["ident_20200219_14harm_load.parquet"]
+    assert loaded.severity == "warning"
+    assert loaded.evidence["mass"] == pytest.approx(2.805, abs=3 * loaded.evidence["std_error"])
+    assert "ident_20200219_14harm.parquet" not in payload
+    assert "repeated_motion" in loud(findings)  # the same motion with and without the load
+    single = examine(whole(recordings, monkeypatch, "ur10e", "jointwise_2"))
+    still = {f.where.split(": ")[1] for f in single if f.code in ("static_joint", "hardly_moves")}
+    assert "shoulder_lift_joint" not in still
+    assert len(still) >= 4
+
+
+def test_motor_side_columns_are_refused_by_name(recordings, monkeypatch):
+    job = whole(recordings, monkeypatch, "tx40", "motor_side")
+    assert [f.code for f in examine(job)] == ["missing_column"]
+
+
+# ---- command line and identify
+@pytest.fixture(scope="module")
+def wrong_sign(table, tmp_path_factory):
+    path = tmp_path_factory.mktemp("doctor") / "run.csv"
+    write_columns(CASES["one torque negated"].change(table), path)
+    return str(path)
+
+
+URDF = str(example_urdf("ur5_robot.urdf"))
+
+
+def test_doctor_prints_findings_as_json_and_as_text(wrong_sign, tmp_path, capsys):
+    assert main(["doctor", URDF, wrong_sign, "--json"]) == 1
+    (first, *_) = json.loads(capsys.readouterr().out)["findings"]
+    assert set(first) == {"code", "severity", "where", "message", "evidence"}
+    assert (first["code"], first["severity"]) == ("torque_sign", "error")
+    assert main(["doctor", URDF, wrong_sign]) == 1
+    assert capsys.readouterr().out.startswith("error: torque_sign: run.csv: the torque of elbow")
+    job = tmp_path / "job.toml"
+    job.write_text(f'urdf = "{URDF}"\n[[identification]]\nlog = "{wrong_sign}"\n')
+    assert main(["doctor", str(job)]) == 1
+    assert "torque_sign" in capsys.readouterr().out
+    assert main(["doctor", URDF, wrong_sign, "--ignore", "torque_sign"]) == 0
+    assert main(["doctor", URDF, wrong_sign, "--ignore", "torque_sgn"]) == 2
+    assert main(["doctor", URDF, str(tmp_path / "none.csv")]) == 1
+
+
+def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
+    wrong_sign, tmp_path, capsys
+):
+    words = ["identify", URDF, wrong_sign, "--out", str(tmp_path / "out"), "--json"]
+    assert main(words) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["verdict"]["status"] == "poor"
+    assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
+    assert "torque_sign" in [warning["code"] for warning in result["warnings"]]
+    assert main([*words, "--ignore", "torque_sign"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert not any("opposite sign" in reason for reason in result["verdict"]["reasons"])
+    assert result["settings"]["doctor"] == {"ignore": ["torque_sign"]}
+
+
+def test_an_unknown_code_to_ignore_is_wrong_use(wrong_sign, tmp_path, capsys):
+    words = ["identify", URDF, wrong_sign, "--out", str(tmp_path), "--ignore", "torque_sgn"]
+    assert main(words) == 2
+    assert "Did you mean 'torque_sign'?" in capsys.readouterr().err
+    with pytest.raises(SettingsError, match="ignore names 'x'"):
+        alarming([], ["x"])
+
+
+def test_only_errors_alarm_and_only_those_that_are_not_ignored():
+    gap = Finding("gap", "warning", "a.csv", "a gap")
+    sign = Finding("torque_sign", "error", "a.csv", "opposite sign")
+    assert alarming([gap, sign], []) == (sign,)
+    assert alarming([gap, sign], ["torque_sign"]) == ()
+
+
+def test_findings_change_no_data():
+    model = robot("ur5")
+    log = clean_log(model, 0, duration=5.0)
+    before = log.tau.copy(), log.q.copy()
+    diagnose(model, [log], [log], SIGNALS)
+    np.testing.assert_array_equal(log.tau, before[0])
+    np.testing.assert_array_equal(log.q, before[1])
+
+
+def test_a_log_of_standing_still_is_said_to_be_one(ur5, tmp_path):
+    log = clean_log(ur5, 0, duration=5.0)
+    still = replace(log, q=np.tile(log.q[0], (len(log.t), 1)), v=np.zeros_like(log.q))
+    write_log(still, tmp_path / "still.csv")
+    found = examine(Job(Path(URDF), identification=(LogEntry(tmp_path / "still.csv"),)))
+    assert {"no_motion", "static_joint"} <= loud(found)
+
+
+@pytest.mark.parametrize("name", ["finger_edu.urdf", "so101.urdf", "double_pendulum.urdf"])
+def test_a_clean_log_of_a_small_arm_at_30_hertz_raises_no_alarm(name):
+    model = RobotModel.from_urdf(example_urdf(name))
+    rng = np.random.default_rng(0)
+    size = model.layout.n_inertial
+    pi = another_robot(model, rng)
+    # no tool of 1.2 kg: these arms would rightly be said to carry a load
+    share = rng.uniform(0.8, 1.2, size // 10)
+    pi[:size] = (model.standard_parameters()[:size].reshape(-1, 10) * share[:, None]).ravel()
+    motion = random_fourier(model, rng, period=10.0)
+    log = simulate(model, pi, motion, rate=30.0, duration=20.0, rng=rng, noise=NOISE)
+    found = diagnose(model, [log], [], SignalSettings())
+    assert [f.code for f in found if f.severity != "note"] == []

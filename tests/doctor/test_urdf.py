@@ -1,0 +1,312 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from robotid.doctor.urdf import inspect_urdf
+from robotid.exceptions import ModelError
+from robotid.export.urdf import read_with_yourdfpy
+from robotid.robot.examples import example_urdf, example_urdfs
+
+CLEAN = """<robot name="two">
+  <link name="base"/>
+  <link name="upper"><inertial><mass value="2"/><origin xyz="0.1 0 0"/>
+    <inertia ixx="0.1" iyy="0.12" izz="0.11" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><mass value="1"/><origin xyz="0.2 0 0"/>
+    <inertia ixx="0.05" iyy="0.06" izz="0.07" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin rpy="0 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="9" velocity="2"/>
+    <dynamics damping="0.5" friction="0.25"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/></joint>
+</robot>"""
+
+TOOL = """<link name="tool">{inertial}</link><joint name="hold" type="fixed">
+  <parent link="lower"/><child link="tool"/></joint></robot>"""
+INERTIAL = """<inertial><mass value="{m}"/>
+  <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>"""
+
+
+def inspected(tmp_path, *changes, **options):
+    text = CLEAN
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    path = tmp_path / "two.urdf"
+    path.write_text(text)
+    return inspect_urdf(path, **options)
+
+
+def found(inspection, code):
+    return [f for f in inspection.to_dict()["findings"] if f["code"] == code]
+
+
+def test_a_clean_robot_has_no_finding(tmp_path):
+    content = inspected(tmp_path).to_dict()
+    assert content["findings"] == []
+    assert content["robot"] == "two"
+    assert content["joints"] == ["shoulder", "elbow"]
+    structure = content["structure"]
+    # a planar arm in the vertical plane: 2 x (m c_x, m c_z, I) with the second mass grouped
+    assert {key: structure[key] for key in ("standard", "base_inertial", "base", "rank")} == {
+        "standard": 20,
+        "base_inertial": 6,
+        "base": 6 + 8 - 1,  # the armature of the first joint acts like an inertia of its link
+        "rank": 13,
+    }
+    assert 1 <= structure["condition"] < 1e3
+    assert len(content["base_groups"]) == 6
+    assert "upper.mcy" in structure["undetermined"]
+    assert "lower.Iyy" not in structure["undetermined"]
+
+
+def test_the_numbers_are_those_of_a_known_robot():
+    inspection = inspect_urdf(example_urdf("ur5_robot.urdf"))
+    structure = inspection.structure
+    assert structure.standard == 60
+    assert structure.base_inertial == 36
+    assert structure.base == structure.rank
+    assert structure.condition == pytest.approx(inspection.to_dict()["structure"]["condition"])
+    assert inspection == inspect_urdf(example_urdf("ur5_robot.urdf"))  # always the same
+
+
+def test_a_floating_base_adds_its_body(tmp_path):
+    fixed, floating = inspected(tmp_path), inspected(tmp_path, free_flyer=True)
+    assert floating.structure.standard == fixed.structure.standard + 10
+    (finding,) = found(floating, "missing_inertial")
+    assert (finding["link"], finding["severity"]) == ("base", "warning")
+
+
+def test_every_example_robot_can_be_inspected():
+    # the 69 files hold a few twice; the largest, of 101 joints, only costs time here
+    unusable = {}
+    for path in example_urdfs():
+        if path.name == "tiago_dual.urdf":
+            continue
+        inspection = inspect_urdf(path)
+        content = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
+        assert set(content) == {"robot", "joints", "structure", "base_groups", "findings"}
+        for finding in content["findings"]:
+            wanted = {"code", "severity", "message", "evidence"}
+            wanted |= set(finding) & {"link", "joint"}
+            assert set(finding) == wanted
+            assert finding["severity"] in ("note", "warning", "error")
+        if content["structure"] is None:
+            (finding,) = [f for f in content["findings"] if f["code"] == "unusable"]
+            unusable[path.name] = finding["message"]
+    assert set(unusable) == {"ur3.urdf", "quadrotor_base.urdf", "iris_simple.urdf"}
+    assert "<robot> has no name" in unusable["ur3.urdf"]
+
+
+def test_a_moving_link_without_inertial_is_named(tmp_path):
+    massless = inspected(tmp_path, ('<link name="lower">', '<link name="lower"/><link name="x">'),
+                         ("</robot>", '<joint name="j" type="fixed"><parent link="base"/>'
+                          '<child link="x"/></joint></robot>'))  # fmt: skip
+    (finding,) = found(massless, "missing_inertial")
+    assert (finding["link"], finding["severity"]) == ("lower", "warning")
+    assert "its body counts as massless; add an estimate" in finding["message"]
+    frame = inspected(tmp_path, ("</robot>", TOOL.format(inertial="")))
+    (finding,) = found(frame, "missing_inertial")
+    assert (finding["link"], finding["severity"]) == ("tool", "note")
+    assert "the mass of its body is in ['lower']" in finding["message"]
+
+
+def test_masses_of_zero_and_less_are_named(tmp_path):
+    (finding,) = found(inspected(tmp_path, ('"1"/>', '"0"/>')), "zero_mass")
+    assert (finding["link"], finding["severity"]) == ("lower", "warning")
+    assert "has the mass 0 kg, wanted more than 0" in finding["message"]
+    tool = TOOL.format(inertial=INERTIAL.format(m=0))
+    (finding,) = found(inspected(tmp_path, ("</robot>", tool)), "zero_mass")
+    assert (finding["link"], finding["severity"]) == ("tool", "note")
+    (finding,) = found(inspected(tmp_path, ('"2"/>', '"-2"/>')), "negative_mass")
+    assert (finding["link"], finding["severity"]) == ("upper", "error")
+    assert "has the mass -2 kg, wanted more than 0; mend the sign" in finding["message"]
+    assert finding["evidence"] == {"mass": -2.0}
+
+
+def test_an_impossible_inertia_is_named_with_what_it_breaks(tmp_path):
+    (finding,) = found(inspected(tmp_path, ('izz="0.11"', 'izz="0.23"')), "not_positive_definite")
+    assert (finding["link"], finding["severity"]) == ("upper", "error")
+    assert "break the triangle inequality" in finding["message"]
+    assert "add up to 0.22, wanted more than 0.23" in finding["message"]
+    assert finding["evidence"]["triangle"] == pytest.approx(-0.01)
+    (finding,) = found(inspected(tmp_path, ('ixy="0"', 'ixy="0.2"')), "not_positive_definite")
+    assert "are not all positive, wanted > 0 (-0.09" in finding["message"]
+    (finding,) = found(inspected(tmp_path, ('izz="0.11"', 'izz="0.22"')), "not_positive_definite")
+    assert finding["severity"] == "note"
+    assert "flat or thin" in finding["message"]
+
+
+def test_the_inertia_may_be_stated_in_a_turned_frame(tmp_path):
+    turned = inspected(tmp_path, ('<origin xyz="0.1 0 0"/>', '<origin xyz="0 0 0" rpy="1 2 3"/>'))
+    assert turned.to_dict()["findings"] == []
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [
+        ("", "lower None, upper None"),
+        ('<limit effort="1" velocity="1"/>', "lower None, upper None"),
+        ('<limit lower="0" upper="0" effort="1" velocity="1"/>', "lower 0.0, upper 0.0"),
+        ('<limit lower="1" upper="-1" effort="1" velocity="1"/>', "lower 1.0, upper -1.0"),
+    ],
+)
+def test_a_joint_without_a_range_is_named(tmp_path, limit, said):
+    stated = '<limit lower="-1" upper="1" effort="9" velocity="2"/>'
+    (finding,) = found(inspected(tmp_path, (stated, limit)), "no_limits")
+    assert (finding["joint"], finding["severity"]) == ("shoulder", "warning")
+    assert f"is {said}, wanted lower < upper" in finding["message"]
+    half = inspected(tmp_path, ('lower="-1" ', ""))  # a missing bound is 0
+    assert found(half, "no_limits") == []
+
+
+@pytest.mark.parametrize(("key", "old"), [("damping", "0.5"), ("friction", "0.25")])
+def test_negative_friction_is_named(tmp_path, key, old):
+    (finding,) = found(
+        inspected(tmp_path, (f'{key}="{old}"', f'{key}="-{old}"')), f"negative_{key}"
+    )
+    assert (finding["joint"], finding["severity"]) == ("shoulder", "warning")
+    assert f"has {key} -{old}, wanted 0 or more" in finding["message"]
+    assert ("Pinocchio refuses" in finding["message"]) == (key == "friction")
+
+
+def test_a_rounded_angle_is_named_with_its_exact_value(tmp_path):
+    # the axes stay parallel: the number of parameters does not suffer
+    (finding,) = found(inspected(tmp_path, ('rpy="0 0 0"', 'rpy="0 -3.1416 0.1"')), "rounded_rpy")
+    assert (finding["joint"], finding["severity"]) == ("shoulder", "note")
+    assert f"write {-math.pi!r} for -3.1416; the number of identifiable" in finding["message"]
+
+
+def test_a_rounded_angle_that_tilts_an_axis_is_a_warning(tmp_path):
+    tilted = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.1416 0 0"/>')
+    rounded = inspected(tmp_path, tilted)
+    (finding,) = found(rounded, "rounded_rpy")
+    assert (finding["joint"], finding["severity"]) == ("elbow", "warning")
+    exact = inspected(tmp_path, (tilted[0], tilted[1].replace("3.1416", repr(math.pi))))
+    assert found(exact, "rounded_rpy") == []
+    assert rounded.structure.base == exact.structure.base
+    assert "more parameters look identifiable" in finding["message"]
+
+
+def test_angles_that_are_exact_or_meant_are_not_named(tmp_path):
+    for angle in (math.pi, -math.pi / 2, 1.5707963, 3.13, 0.0005, 0.0):
+        inspection = inspected(tmp_path, ('rpy="0 0 0"', f'rpy="0 {angle!r} 0"'))
+        assert found(inspection, "rounded_rpy") == [], angle
+
+
+def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
+    frame = TOOL.format(inertial="").replace("<child", '<origin rpy="0 1.5708 0"/><child')
+    tilted = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.1416 0 0"/>')
+    inspection = inspected(tmp_path, ("</robot>", frame), tilted)
+    severity = {f["joint"]: f["severity"] for f in found(inspection, "rounded_rpy")}
+    assert severity == {"hold": "note", "elbow": "warning"}
+
+
+def test_a_mimic_joint_is_named(tmp_path):
+    mimic = '<mimic joint="shoulder" multiplier="-2"/></joint>\n</robot>'
+    (finding,) = found(inspected(tmp_path, ("</joint>\n</robot>", mimic)), "mimic_joint")
+    assert (finding["joint"], finding["severity"]) == ("elbow", "note")
+    assert "mimics 'shoulder' (multiplier -2, offset 0)" in finding["message"]
+    assert "use mimic = 'coupled'" in finding["message"]
+    lost = mimic.replace("shoulder", "nobody")
+    (finding,) = found(inspected(tmp_path, ("</joint>\n</robot>", lost)), "mimic_joint")
+    assert finding["severity"] == "warning"
+    assert "mimics 'nobody', which is no other movable joint" in finding["message"]
+
+
+def test_lumped_links_are_named(tmp_path):
+    tool = TOOL.format(inertial=INERTIAL.format(m=0.3))
+    (finding,) = found(inspected(tmp_path, ("</robot>", tool)), "fixed_lumped")
+    assert (finding["link"], finding["severity"]) == ("lower", "note")
+    assert "is one body with ['tool'], joined to it by fixed joints" in finding["message"]
+    to_world = ("</robot>", tool.replace('parent link="lower"', 'parent link="base"'))
+    assert found(inspected(tmp_path, to_world), "fixed_lumped") == []
+
+
+NOT_NUMBERS = {
+    "mass": ('value="2"', 'value="nan"', "link", "upper", "inertial mass value is 'nan'"),
+    "inertia": ('ixx="0.1"', 'ixx="inf"', "link", "upper", "inertial inertia ixx is 'inf'"),
+    "com": ('xyz="0.1 0 0"', 'xyz="0,1 0 0"', "link", "upper", "inertial origin xyz is '0,1 0 0'"),
+    "origin": ('xyz="0.5 0 0"', 'xyz="${l} 0 0"', "joint", "elbow", "origin xyz is '${l} 0 0'"),
+    "limit": ('lower="-1"', 'lower=""', "joint", "shoulder", "limit lower is ''"),
+}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kind", "name", "said"), NOT_NUMBERS.values(), ids=NOT_NUMBERS
+)
+def test_what_is_no_number_is_named(tmp_path, old, new, kind, name, said):
+    inspection = inspected(tmp_path, (old, new))
+    (finding,) = found(inspection, "not_a_number")
+    assert (finding[kind], finding["severity"]) == (name, "error")
+    assert f"{kind} {name!r}: {said}, wanted finite numbers" in finding["message"]
+    content = inspection.to_dict()
+    assert content["structure"] is None
+    assert content["base_groups"] == []
+    assert content["joints"] == ["shoulder", "elbow"]
+    json.dumps(content, allow_nan=False)
+
+
+def test_every_bad_number_is_named_at_once(tmp_path):
+    inspection = inspected(tmp_path, ('"2"/>', '"nan"/>'), ('"1"/>', '"1e999"/>'))
+    assert [f["link"] for f in found(inspection, "not_a_number")] == ["upper", "lower"]
+
+
+def test_a_number_that_the_dynamics_do_not_use_does_not_stop_them(tmp_path):
+    inspection = inspected(tmp_path, ('damping="0.5"', 'damping="nan"'))
+    (finding,) = found(inspection, "not_a_number")
+    assert finding["joint"] == "shoulder"
+    assert inspection.structure is not None
+
+
+UNUSABLE = {
+    "missing": (None, "there is no URDF file"),
+    "no XML": ("<robot", "is not well-formed XML"),
+    "other XML": ("<sdf/>", "the top element is <sdf>, wanted <robot>"),
+    "no name": ("<robot/>", "<robot> has no name"),
+    "no joint": ('<robot name="r"><link name="l"/></robot>', "has no movable joint"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), UNUSABLE.values(), ids=UNUSABLE)
+def test_a_file_that_is_no_model_is_a_finding(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "bad.urdf").write_text(text)
+    inspection = inspect_urdf(tmp_path / "bad.urdf")
+    (finding,) = inspection.to_dict()["findings"]
+    assert (finding["code"], finding["severity"]) == ("unusable", "error")
+    assert message in finding["message"]
+    assert "link" not in finding
+    assert "joint" not in finding
+    assert inspection.structure is None
+
+
+def test_what_yourdfpy_cannot_read_is_a_finding(tmp_path):
+    visual = (
+        '<visual><material name="m"><color rgba="1,2"/></material>'
+        '<geometry><box size="1 1 1"/></geometry></visual>'
+    )
+    inspection = inspected(tmp_path, ('<link name="base"/>', f'<link name="base">{visual}</link>'))
+    (finding,) = found(inspection, "yourdfpy_refuses")
+    assert finding["severity"] == "warning"
+    assert "ValueError" in finding["message"]
+    assert (
+        "limits, damping, friction and mimic of its joints were not checked" in finding["message"]
+    )
+    assert inspection.structure is not None
+    with pytest.raises(ModelError, match=r"yourdfpy cannot read two.urdf"):
+        read_with_yourdfpy(tmp_path / "two.urdf")
+
+
+def test_the_condition_number_is_that_of_unit_columns(tmp_path):
+    from robotid.identification.pipeline import structural_mapping
+    from robotid.regressor.torque import random_regressor
+    from robotid.robot.model import RobotModel
+
+    structure = inspected(tmp_path).structure
+    model = RobotModel.from_urdf(tmp_path / "two.urdf")
+    W = random_regressor(model, 2000, np.random.default_rng(5))
+    W = W[:, structural_mapping(model).independent]
+    unit = np.linalg.cond(W / np.linalg.norm(W, axis=0))
+    assert structure.condition == pytest.approx(unit, rel=0.5)  # other states, same size

@@ -1,0 +1,124 @@
+import os
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotid.doctor.urdf import inspect_urdf
+from robotid.doctor.urdf_geometry import audit_links
+from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.model import RobotModel
+
+DOCS = Path(__file__).parents[2] / "docs" / "urdf_audit.md"
+ARM = """<robot name="arm">
+  <link name="base"/>
+  <joint name="j1" type="continuous"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.1"/><axis xyz="0 0 1"/></joint>
+  <link name="upper">
+    <inertial><origin xyz="{com}"/><mass value="{mass}"/>
+      <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>
+    <collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.1 0.1"/></geometry></collision>
+  </link>
+  <joint name="j2" type="continuous"><parent link="upper"/><child link="fore"/>
+    <origin xyz="0.4 0 0"/><axis xyz="0 1 0"/></joint>
+  <link name="fore">
+    <inertial><origin xyz="0.1 0 0"/><mass value="2.1"/>
+      <inertia ixx="0.004" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial>
+    <collision><origin xyz="0.1 0 0"/><geometry>{shape}</geometry></collision>
+  </link>
+</robot>"""
+GOOD = {
+    "com": "0.2 0 0", "mass": "4.0", "ixx": "0.0067", "iyy": "0.0567", "izz": "0.0567",
+    "shape": '<box size="0.2 0.08 0.08"/>',
+}  # fmt: skip
+
+
+def audit(tmp_path, **changed):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM.format(**(GOOD | changed)))
+    return list(audit_links(RobotModel.from_urdf(path)))
+
+
+def test_inertials_that_fit_their_geometry_are_not_mentioned(tmp_path):
+    assert audit(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "code", "evidence"),
+    [
+        ({"com": "0.2 0 0.3"}, "com_outside", {"outside": 0.25}),
+        ({"mass": "400"}, "density", {"density": 100_000.0}),
+        (
+            {"mass": "0.02", "ixx": "3e-5", "iyy": "3e-4", "izz": "3e-4"},
+            "density",
+            {"density": 5.0},
+        ),
+        ({"iyy": "0.56", "izz": "0.56"}, "gyration", None),
+    ],
+)
+def test_what_the_geometry_does_not_allow_is_named_with_its_figure(
+    tmp_path, changed, code, evidence
+):
+    found = audit(tmp_path, **changed)
+    assert [finding.code for finding in found] == [code]
+    assert found[0].where == "link upper"
+    if evidence is not None:
+        assert found[0].evidence == pytest.approx(evidence)
+
+
+def test_what_hardly_weighs_hardly_matters(tmp_path):
+    light = {"mass": "1e-3", "ixx": "0", "iyy": "0", "izz": "0", "com": "0.2 0 0.3"}
+    found = audit(tmp_path, **light)
+    assert {(f.code, f.severity) for f in found} == {("com_outside", "note"), ("density", "note")}
+
+
+def test_the_radius_of_gyration_is_that_of_the_inertia(tmp_path):
+    (found,) = audit(tmp_path, iyy="0.56", izz="0.56")
+    # the second moments add up to half the trace of the inertia
+    assert found.evidence["gyration"] == pytest.approx(np.sqrt(0.5 * (0.0067 + 1.12) / 4.0))
+    assert found.evidence["farthest"] == pytest.approx(np.linalg.norm([0.2, 0.05, 0.05]))
+
+
+def test_a_copied_inertial_is_told_by_the_other_size(tmp_path):
+    copy = {"com": "0.1 0 0", "mass": "2.1", "ixx": "0.004", "iyy": "0.02", "izz": "0.02"}
+    (found,) = audit(tmp_path, **copy)
+    assert found.code == "copied_inertial"
+    assert "['upper', 'fore']" in found.message
+    same = '<box size="0.4 0.1 0.1"/>'
+    assert [f.code for f in audit(tmp_path, **copy, shape=same)] == []
+
+
+def test_numbers_of_templates_are_named(tmp_path):
+    numbers = {"com": "0 0 0", "mass": "1.0", "ixx": "0.001", "iyy": "0.001", "izz": "0.001"}
+    (found,) = audit(tmp_path, **numbers)
+    assert found.code == "default_inertial"
+    assert "1 kg and 0.001 kg m^2 about every axis" in found.message
+
+
+def test_a_mesh_that_is_not_found_is_one_note(tmp_path):
+    (found,) = audit(tmp_path, shape='<mesh filename="package://nowhere/none.stl"/>')
+    assert (found.code, found.severity) == ("geometry_unread", "note")
+    assert "'fore'" in found.message
+
+
+def test_the_panda_of_the_examples_has_an_inertia_that_its_shape_cannot_have():
+    codes = {(f.code, f.where) for f in inspect_urdf(example_urdf("panda.urdf")).findings}
+    assert ("gyration", "link panda_link1") in codes
+
+
+def test_the_table_of_all_example_robots_is_the_documents():
+    lines = ["| robot | joints | errors | warnings | which |", "|---|---|---|---|---|"]
+    for path in example_urdfs():
+        found = inspect_urdf(path)
+        graves = [f for f in found.findings if f.severity != "note"]
+        counts = Counter(f.code for f in graves)
+        errors = sum(f.severity == "error" for f in graves)
+        which = ", ".join(f"{code} {count}" for code, count in sorted(counts.items()))
+        name = f"{path.parent.parent.name}/{path.name}"
+        cells = [name, len(found.joints), errors, len(graves) - errors, which or "–"]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    table = "\n".join(lines) + "\n"
+    if os.environ.get("ROBOTID_WRITE_DOCS"):
+        DOCS.write_text(DOCS.read_text().split("| robot |")[0] + table)
+    assert DOCS.read_text().endswith(table)

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators import TLS, WLS
+from robotid.estimators.batch.total_least_squares import mixed_tls
+from robotid.exceptions import DataError, RankDeficientError
+from robotid.identification.pipeline import EstimatorSettings, identify
+from robotid.logs.signals import SignalSettings
+from robotid.regressor.factors import compress
+from robotid.regressor.problem import Problem
+
+
+def problem(W, tau, names):
+    blocks = [(W, tau, np.ones(len(tau)))]
+    return Problem(lambda: iter(blocks), names, 1, np.ones((1, W.shape[1]), dtype=bool))
+
+
+def test_one_column_is_demings_closed_form(rng):
+    x = rng.standard_normal(200)
+    y = 0.7 * x + 0.3 * rng.standard_normal(200)
+    noise = 0.5  # of x, where that of y is 1
+    xx, yy, xy = noise**-2 * (x @ x), y @ y, (x @ y) / noise
+    slope = (yy - xx + np.sqrt((yy - xx) ** 2 + 4 * xy**2)) / (2 * xy)
+    found = mixed_tls(np.column_stack([x, y]), np.array([noise]))
+    assert found[0] == pytest.approx(slope / noise, rel=1e-10)
+
+
+def test_it_makes_the_smallest_correction(rng):
+    W, tau = rng.standard_normal((60, 3)), rng.standard_normal(60)
+    W[:, 1] = 1.0
+    noise = np.array([0.5, 0.0, 2.0])
+    theta = mixed_tls(np.column_stack([W, tau]), noise)
+
+    def size(theta):  # of the smallest correction under which theta fits exactly
+        return np.sum((tau - W @ theta) ** 2) / (1 + np.sum((noise * theta) ** 2))
+
+    for step in 1e-4 * rng.standard_normal((50, 3)):
+        assert size(theta + step) > size(theta)
+
+
+def test_without_noise_of_the_regressor_it_is_weighted_least_squares(rng):
+    W = rng.standard_normal((300, 4))
+    tau = W @ [1.0, -2.0, 0.5, 3.0] + 0.2 * rng.standard_normal(300)
+    factors = compress(problem(W, tau, ("a", "b", "c", "d")))
+    exact = TLS(regressor_noise=1e-7).fit(factors)
+    np.testing.assert_allclose(exact.theta, WLS().fit(factors).theta, rtol=1e-9)
+
+
+def test_it_undoes_the_bias_that_a_noisy_regressor_gives_least_squares(rng):
+    clean = rng.standard_normal((20000, 3))
+    clean[:, 2] = 1.0
+    theta, share = np.array([2.0, -1.0, 0.5]), 0.3
+    noisy = clean + share * rng.standard_normal(clean.shape) * [1, 1, 0]
+    tau = clean @ theta + 0.5 * rng.standard_normal(len(clean))
+    factors = compress(problem(noisy, tau, ("a", "b", "j.offset")))
+    wls = WLS().fit(factors)
+    found = TLS(regressor_noise=share / np.sqrt(1 + share**2)).fit(factors)
+    assert np.abs(wls.theta - theta)[0] > 0.1
+    np.testing.assert_allclose(found.theta, theta, atol=0.03)
+    assert np.allclose(found.theta, theta, atol=5 * found.std_error)
+
+
+def test_more_noise_than_the_residual_holds_is_refused(rng):
+    W = rng.standard_normal((300, 2))
+    tau = W @ [10.0, 3.0] + 0.01 * rng.standard_normal(300)
+    with pytest.raises(DataError, match=r"regressor_noise 0\.01 alone would make"):
+        TLS().fit(compress(problem(W, tau, ("a", "b"))))
+
+
+def test_a_robot_is_identified_and_the_message_tells_the_noise(ur5):
+    log = exact_log(ur5, truth(ur5), np.random.default_rng(0), noise=np.full(6, 0.5))
+    signals = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+    small = EstimatorSettings("tls", regressor_noise=1e-6)
+    found = identify(ur5, [log], signals=signals, estimator=small)
+    np.testing.assert_allclose(found.base, found.wls.theta, rtol=1e-3, atol=1e-3)
+    assert "total least squares" in found.estimate.message
+
+
+def test_data_that_leave_parameters_open_are_refused(rng):
+    W = rng.standard_normal((50, 2))
+    W[:, 1] = 2 * W[:, 0]
+    with pytest.raises(RankDeficientError):
+        TLS().fit(compress(problem(W, W[:, 0].copy(), ("a", "b"))))
+
+
+def test_noise_beyond_the_signal_has_no_single_solution():
+    with pytest.raises(DataError, match="no single smallest"):
+        mixed_tls(np.eye(3), np.ones(2))

@@ -1,0 +1,213 @@
+"""Bounds of bodies: kept by the fit, refused where they contradict each other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators import Consistent
+from robotid.estimators.consistent.constraints import Constraints
+from robotid.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.identification.constraint_settings import ConstraintSettings
+from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.prior import prior_spread
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.factors import compress
+from robotid.regressor.torque import build_problem
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+
+
+@pytest.fixture
+def case(ur5, rng):
+    """The fit of a UR5 whose masses are unlike its URDF's, and the factors of a noisy log."""
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+    factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
+    prior = ur5.standard_parameters()
+    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+    return fit, factors
+
+
+def constrained(fit, **bounds):
+    return replace(fit, constraints=Constraints(**bounds))
+
+
+def masses(estimate):
+    return estimate.theta[:60:10]
+
+
+def centre(estimate, body):
+    values = estimate.theta[10 * body : 10 * body + 4]
+    return values[1:] / values[0]
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
+def test_bounds_of_mass_are_kept_and_reached(case, metric):
+    fit, factors = case
+    fit = replace(fit, metric=metric)
+    free = masses(fit.fit(factors))
+    low, high = 1.2 * free[2], 0.7 * free[3]
+    mass = {"forearm_link": (low, np.inf), "wrist_1_link": (0.0, high)}
+    estimate = constrained(fit, mass=mass).fit(factors)
+    assert masses(estimate)[2] == pytest.approx(low, rel=1e-6)
+    assert masses(estimate)[3] == pytest.approx(high, rel=1e-6)
+    assert {"mass forearm_link", "mass wrist_1_link"} <= set(estimate.details["active"])
+    assert "mass" in estimate.details["constraints"]
+
+
+def test_a_bound_that_does_not_bind_changes_nothing(case):
+    fit, factors = case
+    free = fit.fit(factors)
+    wide = {name: (0.01, 100.0) for name in fit.layout.bodies}
+    estimate = constrained(fit, mass=wide, total_mass=(0.1, 500.0)).fit(factors)
+    np.testing.assert_allclose(estimate.theta, free.theta, rtol=0, atol=1e-6 * fit.prior_std.max())
+
+
+def test_a_known_total_mass_is_met_exactly(case):
+    fit, factors = case
+    total = 1.1 * masses(fit.fit(factors)).sum()
+    estimate = constrained(fit, total_mass=(total, total)).fit(factors)
+    assert masses(estimate).sum() == pytest.approx(total, rel=1e-12)
+    bounded = constrained(fit, total_mass=(total, 2 * total)).fit(factors)
+    assert masses(bounded).sum() == pytest.approx(total, rel=1e-6)
+    # the known sum leaves it less room: its variance in that direction is 0
+    one = np.zeros(len(fit.prior))
+    one[:60:10] = 1.0
+    assert one @ estimate.covariance @ one == pytest.approx(0.0, abs=1e-12)
+
+
+def test_pinned_bodies_keep_the_urdf_and_the_rest_is_the_constrained_least_squares(case, ur5):
+    fit, factors = case
+    estimate = constrained(fit, pinned=("forearm_link", "wrist_1_link")).fit(factors)
+    np.testing.assert_allclose(estimate.theta[20:40], fit.prior[20:40], rtol=1e-12, atol=1e-14)
+    assert not estimate.std_error[20:40].any()
+    # oracle: the same quadratic without those columns, where no inequality binds
+    fit = replace(fit, prior=truth(ur5), prior_weight=10.0, metric="riemannian")
+    pinned = constrained(fit, pinned=("forearm_link", "wrist_1_link"))
+    estimate = pinned.fit(factors)
+    assert estimate.message == "no constraint binds"
+    rows = pinned.rows(factors, estimate.sigma)
+    D = rows[:, :-1] @ fit.K
+    H = D.T @ D + 0.5 * fit.prior_weight * fit.penalty.hessian(fit.prior)
+    slope = D.T @ (D @ fit.prior - rows[:, -1])
+    slope += 0.5 * fit.prior_weight * fit.penalty.gradient(fit.prior)
+    kept = np.setdiff1d(np.arange(len(fit.prior)), np.arange(20, 40))
+    step = np.linalg.solve(H[np.ix_(kept, kept)], -slope[kept])
+    np.testing.assert_allclose(
+        (estimate.theta - fit.prior)[kept] / fit.prior_std[kept],
+        step / fit.prior_std[kept],
+        atol=1e-8,
+    )
+
+
+def test_a_centre_of_mass_stays_in_its_box(case):
+    fit, factors = case
+    free = centre(fit.fit(factors), 2)
+    corners = [free - 0.2, free - [0.02, -0.1, -0.1]]  # x at least 2 cm less
+    settings = ConstraintSettings(com={"forearm_link": [list(c) for c in corners]})
+    estimate = replace(fit, constraints=settings.to_constraints({})).fit(factors)
+    found = centre(estimate, 2)
+    assert (corners[0] - 1e-6 <= found).all()
+    assert (found <= corners[1] + 1e-6).all()
+    assert found[0] == pytest.approx(corners[1][0], abs=1e-6)
+    assert "centre_of_mass forearm_link" in estimate.details["active"]
+
+
+def test_gradients_of_active_constraints_are_those_of_their_slack(case):
+    fit, factors = case
+    low = 1.2 * masses(fit.fit(factors))[2]
+    fit = constrained(fit, mass={"forearm_link": (low, np.inf)})
+    estimate = fit.fit(factors)
+    gradients, labels = fit.active(estimate.theta)
+    row = gradients[labels.index("mass forearm_link")]
+    assert np.flatnonzero(row).tolist() == [20]
+    # stationary: the gradient of the objective is a combination of the active ones
+    rows = fit.rows(factors, estimate.sigma)
+    D = rows[:, :-1] @ fit.K
+    slope = 2 * D.T @ (D @ estimate.theta - rows[:, -1])
+    slope += fit.prior_weight * fit.penalty.gradient(estimate.theta)
+    slope, gradients = slope * fit.prior_std, gradients * fit.prior_std
+    left = slope - gradients.T @ np.linalg.lstsq(gradients.T, slope, rcond=None)[0]
+    assert np.linalg.norm(left) < 1e-4 * np.linalg.norm(slope)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [
+        ({"mass": {"tool0": (1.0, 2.0)}}, r"\['tool0'\], which are no bodies of the model"),
+        ({"mass": {"forearm_link": (3.0, 2.0)}}, r"\[3, 2\] kg: the first is above the second"),
+        ({"mass": {"forearm_link": (-2.0, -1.0)}}, "is bounded by -1 kg, wanted a positive"),
+        ({"total_mass": (0.0, 2.0), "mass": {"forearm_link": (3.0, 9.0)}}, "allow .3, inf. kg"),
+        (
+            {"mass": {"forearm_link": (0.1, 0.2)}, "pinned": ("forearm_link",)},
+            "forearm_link is pinned at the URDF's 2.275 kg, outside its bounds",
+        ),
+        (
+            {
+                "com": {"forearm_link": (np.eye(3)[:1], np.array([-1.0]))},
+                "pinned": ("forearm_link",),
+            },
+            "forearm_link is pinned, but the URDF's centre of mass .* mm outside its bounds",
+        ),
+    ],
+)
+def test_bounds_that_contradict_each_other_are_refused_before_the_solver_runs(case, bounds, text):
+    with pytest.raises(SettingsError, match=text):
+        constrained(case[0], **bounds)
+
+
+def test_links_on_locked_joints_count_in_the_bounds(case):
+    held = np.zeros(60)
+    held[20:30] = [2.0, 0, 0, 0, 0.01, 0, 0.01, 0, 0, 0.01]
+    with pytest.raises(SettingsError, match="its links on locked joints alone weigh 2 kg"):
+        constrained(replace(case[0], held=held), mass={"forearm_link": (0.5, 1.0)})
+
+
+def test_bounds_that_no_body_meets_are_named(case):
+    # the centre of mass above one plane and below another one under it
+    A = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
+    fit = constrained(case[0], com={"forearm_link": (A, np.array([-0.2, 0.1]))})
+    with pytest.raises(NotConvergedError, match="no parameters meet all constraints") as caught:
+        fit.fit(case[1])
+    assert "centre_of_mass" in str(caught.value)
+    assert caught.value.status == "PrimalInfeasible"
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"mass": {"a": "heavy"}}, "mass of a is 'heavy', wanted a number or"),
+        ({"mass": {"a": [np.inf, np.inf]}}, r"a is \[inf, inf\] kg, wanted finite numbers"),
+        ({"total_mass": [1.0, np.nan]}, r"total_mass is \[1, nan\] kg, wanted finite numbers"),
+        ({"total_mass": [3.0]}, r"total_mass is \[3.0\], wanted a number or"),
+        ({"total_mass": [4.0, 3.0]}, "the first is above the second"),
+        ({"com": {"a": [[0, 0], [1, 1]]}}, "com of a is .* wanted"),
+        ({"com": {"a": [[0, 0, 1], [1, 1, 0]]}}, "the first corner is above the second"),
+        ({"com_within": "sphere"}, "com_within is 'sphere', wanted one of"),
+    ],
+)
+def test_settings_that_are_no_bounds_are_refused(options, text):
+    with pytest.raises(SettingsError, match=text):
+        EstimatorSettings(constraints=options)
+
+
+def test_a_job_states_its_constraints(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    settings = EstimatorSettings(
+        constraints={"mass": {"forearm_link": 2.5}, "pinned": ["wrist_3_link"], "total_mass": 20.0}
+    )
+    found = identify(ur5, [log], signals=EXACT, estimator=settings)
+    assert found.standard[20] == pytest.approx(2.5, rel=1e-9)
+    assert found.standard[:60:10].sum() == pytest.approx(20.0, rel=1e-9)
+    np.testing.assert_allclose(found.standard[50:60], found.prior[50:60], rtol=1e-9, atol=1e-12)
+    assert found.sources[50:60] == ("prior",) * 10
+    assert found.is_consistent
+
+
+def test_an_unknown_metric_is_refused(case):
+    with pytest.raises(DataError, match="metric is 'manhattan', wanted one of"):
+        replace(case[0], metric="manhattan")

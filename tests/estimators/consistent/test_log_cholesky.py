@@ -1,0 +1,136 @@
+"""Log-Cholesky against Pinocchio, finite differences and the cone programme."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators import Consistent
+from robotid.estimators.consistent.constraints import Constraints
+from robotid.estimators.consistent.log_cholesky import (
+    LogCholesky,
+    from_log_cholesky,
+    log_cholesky_curvature,
+    log_cholesky_jacobian,
+    to_log_cholesky,
+)
+from robotid.exceptions import SettingsError
+from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.prior import prior_spread
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.factors import compress
+from robotid.regressor.torque import build_problem
+from robotid.robot.parameters import inertial_from_pseudo_inertia
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+
+
+def make_case(ur5, rng, noise):
+    log = exact_log(ur5, truth(ur5), rng, noise=noise)
+    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+    factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
+    prior = ur5.standard_parameters()
+    return Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory])), factors
+
+
+@pytest.fixture
+def case(ur5, rng):
+    """A fit at whose optimum constraints bind, and its factors."""
+    return make_case(ur5, rng, 10 * NOISE)
+
+
+def test_it_is_pinocchios_parameterisation(rng):
+    for z in 0.5 * rng.standard_normal((5, 10)):
+        theirs = pin.LogCholeskyParameters(z)
+        ours = inertial_from_pseudo_inertia(from_log_cholesky(z[None])[0])
+        np.testing.assert_allclose(ours, theirs.toDynamicParameters(), rtol=1e-12, atol=1e-13)
+        slopes = [inertial_from_pseudo_inertia(dJ) for dJ in log_cholesky_jacobian(z[None])[0]]
+        np.testing.assert_allclose(
+            np.array(slopes).T, theirs.calculateJacobian(), rtol=1e-11, atol=1e-12
+        )
+        np.testing.assert_allclose(to_log_cholesky(from_log_cholesky(z[None]))[0], z, atol=1e-10)
+
+
+def test_curvature_is_that_of_finite_differences(rng):
+    z, G = 0.5 * rng.standard_normal((1, 10)), rng.standard_normal((1, 4, 4))
+    G = G + G.transpose(0, 2, 1)
+
+    def slope(z):
+        return np.einsum("nij,nkij->nk", G, log_cholesky_jacobian(z))[0]
+
+    h = 1e-6
+    numeric = [(slope(z + h * v) - slope(z - h * v)) / (2 * h) for v in np.eye(10)]
+    np.testing.assert_allclose(log_cholesky_curvature(z, G)[0], numeric, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("metric", ["riemannian", "entropic"])
+def test_gradient_and_hessian_of_the_fit_are_those_of_finite_differences(case, metric, rng):
+    fit, factors = case
+    fit = replace(fit, metric=metric)
+    smooth, rows = LogCholesky(fit), fit.rows(factors, NOISE)
+    z = smooth._coordinates(fit.fit(factors).theta) + 0.2 * rng.standard_normal(len(fit.prior))
+    slope, hessian = smooth.derivatives(rows, z)
+    h, numeric, bent = 1e-5, [], []
+    for step in h * np.eye(len(z)):
+        ends = [fit.objective(rows, smooth._parameters(z + s)[0]) for s in (step, -step)]
+        numeric.append((ends[0] - ends[1]) / (2 * h))
+        slopes = [smooth.derivatives(rows, z + s)[0] for s in (step, -step)]
+        bent.append((slopes[0] - slopes[1]) / (2 * h))
+    np.testing.assert_allclose(slope, numeric, atol=1e-6 * np.abs(slope).max())
+    np.testing.assert_allclose(hessian, bent, atol=1e-6 * np.abs(hessian).max())
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
+def test_it_agrees_with_the_cone_programme_where_no_constraint_binds(ur5, rng, metric):
+    fit, factors = make_case(ur5, rng, 1e-2 * NOISE)
+    # data and prior agree: all bodies are well inside
+    fit = replace(fit, metric=metric, prior=truth(ur5))
+    cone, smooth = fit.fit(factors), LogCholesky(fit).fit(factors)
+    assert cone.details["active"] == []
+    difference = (smooth.theta - cone.theta) / fit.prior_std
+    assert np.abs(difference).max() < 1e-6
+    assert abs(smooth.details["gaps"][0]) < 1e-9
+    assert smooth.converged
+
+
+def test_at_active_constraints_the_gap_is_stated_and_small(case):
+    fit, factors = case
+    cone, smooth = fit.fit(factors), LogCholesky(fit, starts=2).fit(factors)
+    assert cone.details["active"]
+    gaps = smooth.details["gaps"]
+    assert len(gaps) == 3
+    assert abs(gaps[0]) < 1e-6
+    assert min(gaps) > -1e-6  # nothing lies below the optimum of a convex programme
+    rows = fit.rows(factors, cone.sigma)
+    ratio = fit.objective(rows, smooth.theta) / fit.objective(rows, cone.theta)
+    assert ratio - 1.0 == pytest.approx(min(gaps), abs=1e-12)
+
+
+def test_every_end_is_possible(case):
+    fit, factors = case
+    held = np.zeros(60)
+    held[50:] = 0.5 * fit.prior[50:60]
+    fit = replace(fit, held=held)
+    estimate = LogCholesky(fit, starts=1, rng=np.random.default_rng(1)).fit(factors)
+    slack = fit.programme.cone.slack(estimate.theta / fit.prior_std)
+    assert slack.min() > -1e-12
+
+
+def test_it_knows_no_further_constraints(case):
+    bounds = Constraints(total_mass=(1.0, 2.0))
+    with pytest.raises(SettingsError, match="'log_cholesky' knows no constraints beside"):
+        LogCholesky(replace(case[0], constraints=bounds))
+
+
+def test_identify_takes_it_by_name(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    settings = EstimatorSettings("log_cholesky", starts=1, seed=2)
+    found = identify(ur5, [log], signals=EXACT, estimator=settings)
+    other = identify(ur5, [log], signals=EXACT)
+    assert found.is_consistent
+    assert len(found.estimate.details["gaps"]) == 2
+    np.testing.assert_allclose(found.base, other.base, atol=1e-5 * np.abs(other.base).max())

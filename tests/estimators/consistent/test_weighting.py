@@ -1,0 +1,195 @@
+"""The weight of the prior chosen from the data: brute force, closed form, what it is good for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators import Consistent
+from robotid.estimators.consistent.weighting import choose_weight, held_out_errors, log_evidence
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.prior import prior_spread
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.factors import compress, compress_stretches, gather, merge
+from robotid.regressor.torque import build_problem
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+
+
+@pytest.fixture
+def case(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+    problem = mapping.reduce(build_problem(ur5, trajectory))
+    prior = ur5.standard_parameters()
+    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+    return fit, problem
+
+
+def cut(problem, count):
+    return compress_stretches(problem, -(-problem.sources[0].samples // count))
+
+
+def test_neighbours_are_gathered_in_order(case):
+    _, problem = case
+    parts = cut(problem, 10)
+    folds = gather(parts, 3)
+    assert [int(fold.rows[0]) for fold in folds] == [180, 240, 180]
+    whole, theta = compress(problem), np.arange(58.0)
+    np.testing.assert_allclose(merge(folds).residual_squares(theta), whole.residual_squares(theta))
+    assert len(gather(parts, 20)) == 10
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "riemannian", "entropic"])
+def test_the_evidence_is_the_density_of_the_data(case, metric):
+    fit, problem = case
+    fit = replace(fit, metric=metric)
+    rows = fit.rows(compress(problem), NOISE)
+    C = np.linalg.inv(0.5 * fit.penalty.hessian(fit.penalty.centre))
+    D, d = rows[:, :-1] @ fit.K, rows[:, -1]
+    stated, expected = [], []
+    for weight in (0.01, 1.0, 30.0):
+        S = np.eye(len(d)) + D @ C @ D.T / weight
+        mean = D @ fit.penalty.centre
+        expected.append(scipy.stats.multivariate_normal(mean, S).logpdf(d))
+        stated.append(log_evidence(fit, rows, weight))
+    np.testing.assert_allclose(np.diff(stated), np.diff(expected), rtol=1e-6, atol=1e-4)
+
+
+def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
+    # parameters drawn around the prior with a tenth of its spread: weight 100
+    fit, _ = case
+    fit = replace(fit, metric="euclidean")
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(8):
+        pi = fit.prior + 0.1 * fit.prior_std * rng.standard_normal(len(fit.prior))
+        D = rng.standard_normal((58, 58)) @ fit.K / fit.prior_std.mean()
+        rows = np.zeros((58, 59))
+        rows[:, :-1] = D @ np.linalg.pinv(fit.K)
+        rows[:, -1] = rows[:, :-1] @ (fit.K @ pi) + 1e-3 * rng.standard_normal(58)
+        weights = 10.0 ** np.arange(-1.0, 5.0, 0.25)
+        values = [log_evidence(fit, 1e3 * rows, weight) for weight in weights]
+        found.append(np.log10(weights[int(np.argmax(values))]))
+    assert np.mean(found) == pytest.approx(2.0, abs=0.2)
+
+
+def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
+    fit, problem = case
+    stretches = cut(problem, 3)
+    total, count = 0.0, 0
+    for k in range(3):
+        others = [s for i, s in enumerate(stretches) if i != k]
+        rows = fit.rows(merge(others), NOISE)
+        pi = replace(fit, prior_weight=2.0).minimise(rows)[0].x
+        W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
+        part = slice(200 * 6 * k, 200 * 6 * (k + 1))
+        residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
+        total, count = total + (residual**2).sum(), count + residual.size
+    error = np.sqrt(held_out_errors(fit, stretches, NOISE, 2.0).sum())
+    # it is computed to the solver's tolerance only
+    assert error == pytest.approx(np.sqrt(total / count), rel=2e-4)
+
+
+def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    for how in ("cv", "evidence"):
+        settings = EstimatorSettings(prior_weight=how)
+        found = identify(ur5, [log], signals=EXACT, estimator=settings)
+        prior = found.estimate.details["prior"]
+        assert prior["chosen_by"] == how
+        weights, scores = np.array(prior["curve"]).T
+        assert prior["weight"] in weights
+        assert prior["weight"] >= weights[np.argmin(scores)]
+        assert (np.diff(weights) > 0).all()
+        assert len(weights) >= 5
+        assert weights.max() == 1.0
+
+
+@pytest.mark.parametrize(("gain", "weight"), [(0.01, 1.0), (0.5, 0.01)])
+def test_a_lighter_weight_must_be_better_beyond_chance(case, monkeypatch, gain, weight):
+    fit, problem = case
+    chance = np.array([0.1, -0.1, 0.05, -0.1, 0.1, -0.05])  # in favour of some stretches only
+
+    def errors(fit, stretches, sigma, w):
+        distance = abs(np.log10(w) + 2.0)  # smallest at 0.01
+        return 1.0 + distance * (gain + chance)
+
+    monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", errors)
+    choice = choose_weight(fit, cut(problem, 6), "cv")
+    assert choice.weight == pytest.approx(weight)
+    weights, scores = zip(*choice.curve, strict=True)
+    assert weights[int(np.argmin(scores))] == pytest.approx(0.01)
+
+
+def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
+    fit, problem = case
+    stretches = cut(problem, 4)
+    true = fit.fit(compress(problem)).theta
+    wrong = true + 30.0 * fit.prior_std
+    for how in ("cv", "evidence"):
+        good = choose_weight(replace(fit, prior=true), stretches, how).weight
+        bad = choose_weight(replace(fit, prior=wrong), stretches, how).weight
+        assert good == 1.0
+        assert bad <= 0.1, how
+
+
+def test_one_stretch_is_too_few(case):
+    fit, problem = case
+    with pytest.raises(DataError, match="cannot be chosen from 1 stretch"):
+        choose_weight(fit, [compress(problem)], "cv")
+
+
+def test_an_unknown_way_is_refused():
+    with pytest.raises(SettingsError, match="prior_weight is 'best', wanted a positive number or"):
+        EstimatorSettings(prior_weight="best")
+
+
+def test_poor_excitation_is_predicted_better_than_by_wls(ur5, rng):
+    # 2 s of motion, then a new one
+    pi = truth(ur5)
+    short = exact_log(ur5, pi, rng, samples=100, noise=NOISE)
+    new = exact_log(ur5, pi, rng, noise=NOISE)
+    for settings in (EstimatorSettings(), EstimatorSettings(prior_weight=1.0)):
+        found = identify(ur5, [short], validation=[new], signals=EXACT, estimator=settings)
+        measured = found.validation[0].metrics
+        ours, wls = (
+            np.array([m.rmse for m in measured[name].per_joint.values()])
+            for name in ("estimate", "wls")
+        )
+        assert (ours < wls).all()
+        assert ours.sum() < 0.6 * wls.sum()
+
+
+def test_rows_that_repeat_each_other_tell_the_noise_no_better(ur5, rng):
+    # each row four times over, of which a quarter is independent: the same as once
+    log = exact_log(ur5, truth(ur5), rng, samples=40, noise=NOISE)
+    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+    factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
+    prior = ur5.standard_parameters()
+    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+    once = fit.noise(factors)
+    repeated = replace(fit, independent_share=0.25)
+    np.testing.assert_allclose(repeated.noise(merge([factors] * 4)), once, rtol=3e-3)
+    # weighted least squares believes in all of them
+    assert np.median(fit.noise(merge([factors] * 4)) / once) < 0.95
+
+
+def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
+    found = []
+    for _ in range(15):
+        log = exact_log(ur5, truth(ur5), rng, samples=40, noise=NOISE)
+        trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
+        factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
+        prior = ur5.standard_parameters()
+        fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+        found.append(fit.noise(factors) ** 2)
+    ratio = np.sqrt(np.mean(found, axis=0)) / NOISE
+    # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
+    assert (ratio > 0.85).all()
+    assert (ratio < 1.2).all()

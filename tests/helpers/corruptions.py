@@ -1,0 +1,187 @@
+"""Ways to spoil a clean log, with the codes of the finding that must name each."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robotid.logs.data import Log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.closed_loop import Noise, another_robot, simulate
+from robotid.simulation.motions import random_fourier
+
+NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)
+ROBOTS = {
+    "ur5": ("ur5_robot.urdf", None),
+    "panda": ("panda.urdf", [f"panda_joint{i}" for i in range(1, 8)]),
+    "tiago": ("tiago.urdf", ["torso_lift_joint", *(f"arm_{i}_joint" for i in range(1, 8))]),
+}
+
+
+def robot(name, **options):
+    file, joints = ROBOTS[name]
+    return RobotModel.from_urdf(example_urdf(file), joints=joints, **options)
+
+
+def clean_log(model, seed, *, pi=None, rate=100.0, duration=20.0, path="run.csv"):
+    """Simulate a robot like the model, but with other masses, a tool, friction and noise."""
+    rng = np.random.default_rng(seed)
+    truth = another_robot(model, rng) if pi is None else pi
+    motion = random_fourier(model, rng, period=duration / 2)
+    log = simulate(model, truth, motion, rate=rate, duration=duration, rng=rng, noise=NOISE)
+    return replace(log, path=path)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log file's table, the robot it is said to be of, and what must be found."""
+
+    codes: tuple
+    change: object  # table -> table
+    urdf: str = "ur5_robot.urdf"
+    gravity: tuple = (0.0, 0.0, -9.81)
+
+
+def table_of(log: Log):
+    columns = {"time": log.t}
+    for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
+        columns |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    return columns
+
+
+def column(name, function):
+    return lambda table: {**table, name: function(table[name].copy(), table["time"])}
+
+
+def swap(*pairs):
+    def change(table):
+        changed = dict(table)
+        for a, b in pairs:
+            changed[a], changed[b] = table[b], table[a]
+        return changed
+
+    return change
+
+
+def rows(function):
+    return lambda table: {name: function(values) for name, values in table.items()}
+
+
+def scaled(prefix, factor):
+    return lambda table: {
+        name: values * factor if name.startswith(prefix) else values
+        for name, values in table.items()
+    }
+
+
+def late(prefix, delay):
+    def change(table):
+        t = table["time"]
+        return {
+            name: np.interp(t - delay, t, values) if name.startswith(prefix) else values
+            for name, values in table.items()
+        }
+
+    return change
+
+
+def without(name):
+    return lambda table: {key: values for key, values in table.items() if key != name}
+
+
+def set_rows(where, value):
+    def function(x, _t):
+        x[where] = value
+        return x
+
+    return function
+
+
+def frozen(x, _t):
+    return np.full_like(x, x[0])
+
+
+def both(*changes):
+    def change(table):
+        for one in changes:
+            table = one(table)
+        return table
+
+    return change
+
+
+def stale(table):
+    held = np.arange(len(table["time"]))
+    held[1::5] -= 1  # every fifth row repeats the one before
+    return {name: x if name == "time" else x[held] for name, x in table.items()}
+
+
+def duplicated(x):
+    return np.insert(x, 500, x[500])
+
+
+def exchanged(x, _t):
+    x[[700, 701]] = x[[701, 700]]
+    return x
+
+
+A, B = "shoulder_lift_joint", "wrist_1_joint"
+# fmt: off
+CASES = {
+    "two torque columns swapped": Case(("torque_order",), swap((f"tau_{A}", f"tau_{B}"))),
+    "three torque columns turned round": Case(("torque_order",), swap(
+        ("tau_elbow_joint", f"tau_{B}"), (f"tau_{B}", "tau_wrist_2_joint"),
+        ("tau_wrist_2_joint", "tau_elbow_joint"))),
+    "two position columns swapped": Case(("velocity_order",), swap((f"q_{A}", f"q_{B}"))),
+    "two positions, velocities swapped": Case(("position_order",), swap(
+        (f"q_{A}", f"q_{B}"), (f"dq_{A}", f"dq_{B}"))),
+    "two joints exchanged whole": Case(("joint_order",), swap(
+        (f"q_{A}", f"q_{B}"), (f"dq_{A}", f"dq_{B}"), (f"tau_{A}", f"tau_{B}"))),
+    "one torque negated": Case(("torque_sign",), scaled("tau_elbow", -1)),
+    "wrist torque negated": Case(("torque_sign",), scaled("tau_wrist_3", -1)),
+    "all torques negated": Case(("torque_sign",), scaled("tau_", -1)),
+    "one velocity negated": Case(("velocity_sign",), scaled("dq_elbow", -1)),
+    "one axis negated": Case(("position_sign",), both(
+        scaled("q_elbow", -1), scaled("dq_elbow", -1))),
+    "one joint reversed whole": Case(("joint_axis",), both(
+        scaled("q_elbow", -1), scaled("dq_elbow", -1), scaled("tau_elbow", -1))),
+    "degrees": Case(("angle_unit",), both(scaled("q_", 57.29578), scaled("dq_", 57.29578))),
+    "velocity in degrees": Case(("angle_unit",), scaled("dq_", 57.29578)),
+    "one velocity halved": Case(("velocity_scale",), scaled("dq_elbow", 0.5)),
+    "velocity in rpm": Case(("velocity_scale",), scaled("dq_", 9.5493)),
+    "dead velocity channel": Case(("velocity_scale",), scaled("dq_elbow", 0.0)),
+    "milliseconds": Case(("time_unit",), scaled("time", 1000)),
+    "NaN torque": Case(("not_finite",), column("tau_elbow_joint", set_rows(300, np.nan))),
+    "NaN position": Case(("not_finite",), column("q_elbow_joint", set_rows(300, np.nan))),
+    "duplicate stamp": Case(("duplicate_stamp",), rows(duplicated)),
+    "swapped stamps": Case(("stamp_order",), column("time", exchanged)),
+    "gap of 1 s": Case(("gap",), rows(lambda x: np.delete(x, slice(900, 1000)))),
+    "torque 30 ms late": Case(("torque_delay",), late("tau_", 0.03)),
+    "velocity 30 ms late": Case(("velocity_delay",), late("dq_", 0.03)),
+    "torque clipped": Case(("clipped",), column("tau_elbow_joint",
+        lambda x, _t: np.minimum(x, np.quantile(x, 0.9)))),
+    "dead torque channel": Case(("constant_torque",), column("tau_wrist_2_joint",
+        lambda x, _t: np.full_like(x, 3.0))),
+    "static joint": Case(("static_joint",), both(
+        column("q_wrist_3_joint", frozen), scaled("dq_wrist_3", 0))),
+    "stale rows": Case(("stale_rows",), stale),
+    "torque in coarse steps": Case(("quantised",), column("tau_wrist_2_joint",
+        lambda x, _t: np.round(x / np.ptp(x) * 20) * np.ptp(x) / 20)),
+    "currents for torques": Case(("current_for_torque",), scaled("tau_", 0.08)),
+    "one current for torque": Case(("current_for_torque",), scaled(f"tau_{A}", 0.08)),
+    "URDF of a UR10": Case(("urdf_mismatch",), lambda table: table, urdf="ur10_robot.urdf"),
+    # five times the torque at the same motion: by the log alone, a gain or another robot
+    "URDF of a UR3": Case(("urdf_mismatch", "current_for_torque"), lambda table: table,
+        urdf="ur3_robot.urdf"),
+    "gravity stated along x": Case(("gravity",), lambda table: table, gravity=(9.81, 0.0, 0.0)),
+    "gravity stated upside down": Case(("gravity",), lambda table: table, gravity=(0, 0, 9.81)),
+    "gravity stated 15 deg off": Case(("gravity",), lambda table: table,
+        gravity=(2.54, 0.0, -9.476)),
+    "missing torque column": Case(("missing_column",), without("tau_elbow_joint")),
+    "position offset by 0.5 rad": Case(("position_offset",), column(f"q_{A}",
+        lambda x, _t: x + 0.5)),
+    "five spikes of 1000 N m": Case(("spikes",), column("tau_elbow_joint",
+        set_rows([200, 600, 1000, 1400, 1800], 1000.0))),
+    "too few rows": Case(("too_short",), rows(lambda x: x[:30])),
+}
+# fmt: on

@@ -1,0 +1,128 @@
+"""Pieces for tests of who reduces them: random rows by seed, with a mark for each reduction.
+
+As a script, it reduces ten slow pieces with a checkpoint: ``piecework.py FOLDER WORKERS [resume]``.
+"""
+
+import os
+import signal
+import socket
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robotid.exceptions import DataError
+from robotid.regressor.factors import Factors
+from robotid.workers.checkpoint import Checkpoint
+from robotid.workers.pieces import Piece, Reduction, join
+from robotid.workers.processes import ProcessBackend, SerialBackend, reduce_pieces
+
+NAMES = ("a", "b", "c", "d", "e")
+
+
+@dataclass(frozen=True)
+class RandomPiece(Piece):
+    """Rows of two joints. ``fault``: what goes wrong with it."""
+
+    seed: int
+    marks: str  # folder with a file per time that a piece was reduced
+    pause: float = 0.0  # [s]
+    fault: str = ""
+
+    @property
+    def name(self):
+        return f"random rows {self.seed}"
+
+    @property
+    def samples(self):
+        return 100 + self.seed
+
+    def reduce(self, *, threads=None):
+        time.sleep(self.pause)
+        mark(self)
+        if self.fault == "data":
+            raise DataError("row 7 is not finite", "not_finite")
+        if self.fault == "missing":
+            Path("/no/such/log.csv").read_bytes()
+        if self.fault == "kill" or (self.fault == "kill once" and len(reduced(self)) == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.fault == "meet":
+            meet(self.marks)
+        rng = np.random.default_rng(self.seed)
+        rows = rng.standard_normal((2, self.samples, len(NAMES) + 1))
+        R = np.array([np.linalg.qr(part, mode="r") for part in rows])
+        own = np.arange(len(NAMES))
+        rows = np.full(2, self.samples)
+        factors = Factors(tuple(np.asfortranarray(R_j) for R_j in R), (own, own), rows, NAMES)
+        return Reduction(factors, rng.random((3, 2)), self.samples)
+
+
+def mark(piece):
+    """Leave a file that says who reduced a piece."""
+    path = Path(piece.marks) / f"{piece.seed:03d}-{os.getpid()}-{time.monotonic_ns()}"
+    path.write_text(socket.gethostname())
+
+
+def meet(folder, seconds=3.0):
+    """Wait until another process reduces something, too."""
+    end = time.monotonic() + seconds
+    while len(workers_of(folder)) < 2:
+        if time.monotonic() > end:
+            raise DataError("alone")
+        time.sleep(0.01)
+
+
+def reduced(piece):
+    return sorted(Path(piece.marks).glob(f"{piece.seed:03d}-*"))
+
+
+def marks(folder):
+    """Return how often each piece was reduced, by seed."""
+    counts = {}
+    for path in Path(folder).iterdir():
+        seed = int(path.name[:3])
+        counts[seed] = counts.get(seed, 0) + 1
+    return counts
+
+
+def workers_of(folder):
+    """Return the processes that reduced something."""
+    return {int(path.name.split("-")[1]) for path in Path(folder).iterdir()}
+
+
+def pieces_in(folder, count=10, pause=0.0, faults=()):
+    """Return pieces that leave their marks in a folder; faults by seed."""
+    Path(folder).mkdir(exist_ok=True)
+    by_seed = dict(faults)
+    return [RandomPiece(k, str(folder), pause, by_seed.get(k, "")) for k in range(count)]
+
+
+def reduce_all(pieces, **options):
+    """Return the reductions of all pieces."""
+    return tuple(reduce_pieces(pieces, **options))
+
+
+def same_bits(one, other):
+    """Return whether two reductions are equal to the last bit."""
+    ours, theirs = one.to_arrays(), other.to_arrays()
+    return all(
+        ours[key].dtype == theirs[key].dtype and ours[key].tobytes() == theirs[key].tobytes()
+        for key in ours.keys() | theirs.keys()
+    )
+
+
+def main(folder, workers, *words):
+    pieces = pieces_in(Path(folder) / "marks", pause=0.15)
+    checkpoint = Checkpoint.open(folder, {"inputs": "these"}, pieces, resume="resume" in words)
+    backend = ProcessBackend(int(workers)) if int(workers) > 1 else SerialBackend()
+    with backend:
+        found = reduce_all(pieces, backend=backend, checkpoint=checkpoint)
+    with open(Path(folder) / "joined.npz", "wb") as file:
+        np.savez(file, **join(found).to_arrays())
+    checkpoint.remove()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

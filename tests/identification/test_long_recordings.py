@@ -1,0 +1,211 @@
+"""A job whose logs are read in pieces ends where the same job in memory ends."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.commands.identify import run_job
+from robotid.commands.job import Job, LogEntry, job_from_settings, read_job
+from robotid.commands.logs import is_long, survey_logs
+from robotid.commands.validate import validate_result
+from robotid.doctor.diagnosis import examine
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification.long_recordings import evaluate_long
+from robotid.identification.pipeline import structural_mapping
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.data import Log
+from robotid.logs.read import read_log, write_log
+from robotid.logs.signals import SignalSettings
+
+HELD = 1024  # rows in memory, so that pieces have 256
+
+
+@pytest.fixture(scope="module")
+def noisy_job(ur5, tmp_path_factory):
+    """Return a job with a log to fit in CSV, and one kept apart in Parquet."""
+    rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("job")
+    logs = [exact_log(ur5, truth(ur5), rng, samples=n, noise=0.3) for n in (1500, 700)]
+    paths = [folder / "fit.csv", folder / "kept.parquet"]
+    for log, path in zip(logs, paths, strict=True):
+        write_log(log, path)
+    return Job(
+        urdf=Path(ur5.tree.path),
+        signals=SignalSettings(cutoff=10.0),
+        identification=(LogEntry(paths[0]),),
+        validation=(LogEntry(paths[1]), LogEntry(paths[1], 2.0, 9.0)),
+    )
+
+
+@pytest.fixture
+def without_page(monkeypatch):
+    """Write no report: it takes longer than all the rest."""
+    monkeypatch.setattr("robotid.commands.identify.write_report", lambda *_, **__: None)
+
+
+@pytest.fixture
+def without_doctor(monkeypatch):
+    monkeypatch.setattr("robotid.commands.identify.diagnose", lambda *_: ())
+
+
+def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
+    """Run a job in memory and in pieces; check all that result.json says. Return both.
+
+    What the conic solver of "consistent" makes of equal factors differs within its tolerance.
+    """
+    in_memory = run_job(replace(job, rows_in_memory=10**9), folder / "memory")
+    in_pieces = run_job(replace(job, rows_in_memory=held), folder / "pieces")
+    (one, first), (other, second) = in_memory, in_pieces
+    wls = one.wls.theta
+    np.testing.assert_allclose(other.wls.theta, wls, rtol=0, atol=rtol * np.abs(wls).max())
+    np.testing.assert_allclose(other.prior_std, one.prior_std, rtol=rtol)
+    # standard errors are the scatter of stretches, which pieces cut elsewhere
+    ratio = other.standard_error / one.standard_error
+    assert ((ratio > 0.5) & (ratio < 2.0)).all(), ratio
+    gap = np.abs(other.standard - one.standard) / one.standard_error
+    assert gap.max() < 1e-3, "standard errors"
+    for key in ("verdict", "structure", "joints", "outputs"):
+        assert_close(second[key], first[key], 1e-6)
+    assert_close(second["inputs"], first["inputs"], 1e-14)
+    for key in ("identification", "validation"):
+        assert_close(without_bands(second[key]), without_bands(first[key]), fit_rtol)
+        assert_close(second["wls"][key], first["wls"][key], 1e-8)
+    assert {w["code"] for w in second["warnings"]} == {w["code"] for w in first["warnings"]}
+    return one, other
+
+
+def without_bands(metrics):
+    """Return metrics without the bands of standard errors, which pieces cut elsewhere."""
+    if isinstance(metrics, list):
+        return [without_bands(entry) for entry in metrics]
+    return {key: value for key, value in metrics.items() if key != "band"}
+
+
+def assert_close(found, wanted, rtol):
+    """Check values of JSON, numbers to a tolerance."""
+    if isinstance(wanted, dict):
+        assert found.keys() == wanted.keys()
+        for key in wanted:
+            assert_close(found[key], wanted[key], rtol)
+    elif isinstance(wanted, list):
+        assert len(found) == len(wanted)
+        for one, other in zip(found, wanted, strict=True):
+            assert_close(one, other, rtol)
+    elif isinstance(wanted, float):
+        assert found == pytest.approx(wanted, rel=rtol, abs=1e-12)
+    else:
+        assert found == wanted
+
+
+def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
+    one, other = compare(noisy_job, tmp_path)
+    page = (tmp_path / "pieces" / "report.html").read_text()
+    assert "A long log" not in page  # all samples are drawn of one so short
+    assert other.identification[0].recording.name == one.identification[0].recording.name
+    result = json.loads((tmp_path / "pieces" / "result.json").read_text())
+    assert result["settings"]["reduction"] == {"rows_in_memory": HELD}
+    kept = noisy_job.validation[0].path
+    again = [validate_result(tmp_path / w / "result.json", [kept]) for w in ("memory", "pieces")]
+    assert_close(again[1]["validation"], again[0]["validation"], 1e-5)
+
+
+def test_a_real_recording_in_pieces_ends_where_it_ends_in_memory(
+    recordings, tmp_path, monkeypatch, without_page
+):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    job = read_job(Path(__file__).parents[1] / "jobs" / "tx40.toml")
+    compare(job, tmp_path, held=8000)
+
+
+@pytest.mark.parametrize("name", ["rls", "kalman", "prx", "gradient"])
+def test_recursive_estimators_read_pieces_in_the_order_of_time(
+    noisy_job, name, tmp_path, without_page, without_doctor
+):
+    passes = {"passes": 1} if name in ("prx", "gradient") else {}
+    job = replace(noisy_job, estimator=EstimatorSettings(name, **passes), validation=())
+    one, _ = run_job(replace(job, rows_in_memory=10**9), tmp_path / "memory")
+    other, _ = run_job(replace(job, rows_in_memory=HELD), tmp_path / "pieces")
+    size = np.abs(one.estimate.theta).max()
+    np.testing.assert_allclose(other.estimate.theta, one.estimate.theta, rtol=0, atol=1e-8 * size)
+
+
+def test_a_fitted_recording_is_no_validation_in_pieces_either(
+    noisy_job, ur5, tmp_path, without_page, without_doctor
+):
+    """The rows are found whatever the file is called, where it starts and what its clock says."""
+    log = read_log(noisy_job.identification[0].path, ur5.joints)
+    part = Log(t=log.t + 7.0, q=log.q, tau=log.tau, joints=log.joints).window(20.0, 30.0)
+    write_log(part, tmp_path / "other_name.parquet")
+    again, apart = LogEntry(tmp_path / "other_name.parquet"), noisy_job.validation[0]
+    job = replace(noisy_job, validation=(apart, again), rows_in_memory=HELD)
+    identification, _ = run_job(job, tmp_path / "out")
+    assert [e.is_refitted for e in identification.validation] == [False, True]
+
+
+def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path, monkeypatch):
+    monkeypatch.setattr("robotid.identification.long_recordings._SHOWN", 100)
+    monkeypatch.setattr("robotid.identification.survey._WINDOW", 400)
+    job = replace(noisy_job, rows_in_memory=HELD, validation=())
+    identification, result = run_job(job, tmp_path)
+    (evaluation,) = identification.identification
+    recording = evaluation.recording
+    assert recording.is_partial
+    assert len(recording.trajectory.t) == 300
+    assert recording.trajectory.t[0] == pytest.approx(0.22)
+    assert recording.trajectory.t[-1] == pytest.approx(29.98 - 0.22)
+    assert recording.trajectory.segment.tolist() == [0] * 100 + [1] * 100 + [2] * 100
+    assert recording.trajectory.direction.shape == (300, 6)
+    rows = evaluation.metrics["estimate"].per_joint["elbow_joint"].rows
+    assert 1000 < rows <= recording.extent.smooth == 1478
+    page = (tmp_path / "report.html").read_text()
+    assert "A long log: 300 of its 1478 samples are drawn, from its beginning" in page
+    notes = [w["message"] for w in result["warnings"] if w["code"] == "log_note"]
+    assert any("looked at rows 0-400, 550-950, 1100-1500 only" in note for note in notes)
+    found = [f for f in examine(job) if f.code == "rate"]
+    assert [f.where for f in found] == [
+        "fit.csv rows 0-400",
+        "fit.csv rows 550-950",
+        "fit.csv rows 1100-1500",
+    ]
+
+
+def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(ur5, rng, tmp_path):
+    path, pi = tmp_path / "run.parquet", truth(ur5)
+    write_log(exact_log(ur5, pi, rng, samples=1010), path)
+    job = Job(
+        urdf=Path(ur5.tree.path),
+        signals=SignalSettings(cutoff=10.0, trim=10.0),
+        rows_in_memory=HELD,
+    )
+    (log,) = survey_logs(job, [LogEntry(path)], ur5, structural_mapping(ur5))
+    assert [len(piece.read()[1].t) for piece in log.pieces] == [0, 8, 0, 0]
+    evaluation = evaluate_long(log, {"estimate": pi}, pi)
+    assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 8
+    assert not evaluation.recording.is_partial
+
+
+def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
+    entries = (*noisy_job.identification, *noisy_job.validation)
+    assert is_long(replace(noisy_job, rows_in_memory=2199), entries)
+    assert not is_long(replace(noisy_job, rows_in_memory=2200), entries)
+    assert not is_long(replace(noisy_job, rows_in_memory=1), (LogEntry(Path("missing.csv")),))
+    with pytest.raises(SettingsError, match="rows_in_memory is 0, wanted a positive number"):
+        replace(noisy_job, rows_in_memory=0)
+    given = job_from_settings({"urdf": "x", "reduction": {"rows_in_memory": 7}}, "job", Path())
+    assert given.rows_in_memory == 7
+
+
+def test_a_long_log_without_motion_long_enough_is_refused_as_in_memory(
+    noisy_job, tmp_path, without_doctor
+):
+    job = replace(noisy_job, signals=SignalSettings(trim=20.0))
+    messages = []
+    for held in (10**9, HELD):
+        with pytest.raises(DataError) as found:
+            run_job(replace(job, rows_in_memory=held), tmp_path)
+        messages.append(str(found.value))
+    assert messages[0] == messages[1]
+    assert "none of its 1 uninterrupted stretches is long enough" in messages[0]

@@ -1,0 +1,131 @@
+"""Standard errors where bounds bind: projections, closed forms, what identify makes of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators import Consistent
+from robotid.estimators.consistent.cones import Cone, svec, unsvec
+from robotid.estimators.consistent.solvers import nearest
+from robotid.exceptions import NotConvergedError, SettingsError
+from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.prior import prior_spread
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.signals import SignalSettings, process
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+
+
+@pytest.fixture
+def inside(ur5, rng):
+    """A fit whose prior is so narrow and so far inside that no bound binds."""
+    trajectory, mapping = process(exact_log(ur5, truth(ur5), rng), EXACT), structural_mapping(ur5)
+    prior, spread = ur5.standard_parameters(), 1e-3 * prior_spread(ur5, [trajectory])
+    prior[ur5.layout.n_inertial :] = 100.0 * spread[ur5.layout.n_inertial :]
+    return Consistent(ur5.layout, mapping.K, prior, spread, metric="euclidean", margin=1e-9)
+
+
+def information(fit, rng, strength):
+    """Return rows that agree with the prior: |R (beta - K prior)|^2, R of some strength."""
+    b = len(fit.K)
+    unit = np.sqrt(np.sum((fit.K * fit.prior_std) ** 2, axis=1))
+    R = strength * np.triu(rng.standard_normal((b, b)) + 3.0 * np.eye(b)) / unit
+    return np.column_stack([R, R @ (fit.K @ fit.prior)])
+
+
+def test_the_nearest_point_of_the_orthant_is_the_positive_part(rng):
+    points = rng.standard_normal((20, 6))
+    cone = Cone(np.eye(6), np.zeros(6), np.zeros((0, 6)), np.zeros(0), ("bound x",) * 6)
+    found, failures = nearest(points, cone)
+    assert failures == []
+    np.testing.assert_allclose(found, np.maximum(points, 0.0), atol=2e-3)
+
+
+def test_the_nearest_matrix_has_the_positive_eigenvalues(rng):
+    S = rng.standard_normal((20, 4, 4))
+    S = S + S.transpose(0, 2, 1)
+    cone = Cone(np.zeros((0, 10)), np.zeros(0), np.eye(10), np.zeros(10), ("matrix x",))
+    found, _ = nearest(svec(S), cone)
+    values, V = np.linalg.eigh(S)
+    clipped = V @ (np.maximum(values, 0.0)[:, :, None] * V.transpose(0, 2, 1))
+    np.testing.assert_allclose(unsvec(found.reshape(-1)), clipped, atol=5e-3)
+
+
+@pytest.mark.parametrize("meat_over_bread", [1.0, 9.0])
+def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread):
+    rows = information(inside, rng, 1.0)
+    R = rows[:, :-1]
+    meat = meat_over_bread * R.T @ R
+    found, failures = inside.redrawn(rows, inside.prior, meat, 3000, rng)
+    assert failures == []
+    L = np.diag(inside.prior_std**-2)
+    B = np.linalg.inv(inside.K.T @ R.T @ R @ inside.K + L)
+    expected = B @ (inside.K.T @ meat @ inside.K + L) @ B
+    scale = np.sqrt(np.diag(expected))
+    difference = (found.T @ found / len(found) - expected) / np.outer(scale, scale)
+    assert np.abs(np.diag(difference)).max() < 0.12  # 3000 draws know a variance to 2.6 %
+    assert np.sqrt(np.mean(difference**2)) < 0.03
+
+
+def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
+    # prior and data put a friction coefficient at its bound, and tell nothing else of it
+    i = inside.layout.names.index("elbow_joint.viscous")
+    prior = inside.prior.copy()
+    prior[i] = 0.0
+    fit = replace(inside, prior=prior, K=np.delete(inside.K, np.flatnonzero(inside.K[:, i]), 0))
+    rows = information(fit, rng, 1.0)
+    found, _ = fit.redrawn(rows, prior, rows[:, :-1].T @ rows[:, :-1], 2000, rng)
+    away = found[:, i] / fit.prior_std[i]
+    assert away.min() > -2e-3
+    assert np.mean(away < 2e-3) == pytest.approx(0.5, abs=0.04)
+    assert np.mean(away**2) == pytest.approx(0.5, abs=0.06)  # E max(0, z)^2
+
+
+def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=2000, noise=NOISE)
+    found = identify(ur5, [log], signals=EXACT)
+    free = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(draws=0))
+    assert found.estimate.details["active"]
+    np.testing.assert_array_equal(found.standard, free.standard)
+    assert "64 fits to redrawn data and prior" in found.errors.method
+    assert "redrawn" not in free.errors.method
+    np.testing.assert_allclose(found.errors.unbounded, free.standard_error)
+    ratio = found.standard_error / free.standard_error
+    assert np.median(ratio) < 1.0
+    assert ratio.max() < 1.4
+    assert found.errors.freedom.max() < 64
+    again = identify(ur5, [log], signals=EXACT)
+    np.testing.assert_array_equal(again.standard_error, found.standard_error)
+
+
+def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, monkeypatch):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, noise=NOISE)
+    solve = Consistent.redrawn
+
+    def some_fail(self, rows, pi, meat, draws, rng):
+        found, _ = solve(self, rows, pi, meat, draws, rng)
+        return found[:-lost], ["InsufficientProgress"] * lost
+
+    monkeypatch.setattr(Consistent, "redrawn", some_fail)
+    lost = 3
+    found = identify(ur5, [log], signals=EXACT)
+    assert "61 fits" in found.errors.method
+    assert "(3 more not solved: InsufficientProgress)" in found.errors.method
+    lost = 20
+    with pytest.raises(NotConvergedError, match="solved 44 of 64 fits to redrawn data; set draws"):
+        identify(ur5, [log], signals=EXACT)
+
+
+def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=300, noise=NOISE)
+    found = identify(ur5, [log])
+    assert "only" in found.errors.method
+    assert "fits to redrawn data" in found.errors.method
+
+
+def test_a_handful_of_draws_is_refused():
+    with pytest.raises(SettingsError, match="draws is 3, wanted 0, or 10 or more"):
+        EstimatorSettings(draws=3)

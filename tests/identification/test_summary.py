@@ -1,0 +1,103 @@
+"""What a notebook and print() show of a result."""
+
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.commands.identify import run_job
+from robotid.commands.job import Job, LogEntry
+from robotid.identification.pipeline import identify
+from robotid.logs.read import write_log
+from robotid.report.page import percent
+from robotid.robot.model import RobotModel
+
+
+class Words(HTMLParser):
+    def __init__(self, html):
+        super().__init__()
+        self.words, self.tags = [], []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return RobotModel.from_urdf(ROOT / "urdf" / "planar_2r.urdf")
+
+
+@pytest.fixture(scope="module")
+def logs(arm):
+    rng = np.random.default_rng(0)
+    return [exact_log(arm, truth(arm), rng, samples=800, noise=0.1) for _ in range(2)]
+
+
+@pytest.fixture(scope="module")
+def found(arm, logs):
+    return identify(arm, logs[:1], validation=logs[1:])
+
+
+def test_an_identification_is_one_short_line(found):
+    status = found.verdict.status
+    assert repr(found) == (
+        f"<Identification of {found.model.name}: {len(found.base)} base parameters by consistent, "
+        f"verdict {status}>"
+    )
+    assert "array(" not in repr(found.estimate)
+    assert repr(found.estimate).startswith(f"<Estimate: {len(found.estimate.names)} parameters")
+
+
+def test_its_text_has_verdict_reasons_and_every_joint(found):
+    text = str(found)
+    assert text == found.summary()
+    assert text.splitlines()[0].endswith(f"verdict {found.verdict.status}")
+    for reason in found.verdict.reasons:
+        assert reason in text
+    for joint in found.model.joints:
+        error = found.validation[0].metrics["estimate"].per_joint[joint].relative_error_pct
+        (first, _) = [line.split() for line in text.splitlines() if line.split()[0] == joint]
+        assert first[1:3] == [percent(error).html, "%"]
+        assert text.count(f"  {joint} ") == 2  # kept and fitted rows
+
+
+def test_its_html_has_verdict_and_tables_and_nothing_that_runs(found):
+    page = Words(found._repr_html_())
+    assert found.verdict.status in page.words
+    for joint in found.model.joints:
+        assert "".join(page.words).count(joint) >= 2
+    assert not {"script", "style", "link", "img"} & {tag for tag, _ in page.tags}
+    assert "writes the whole report" in " ".join(page.words)
+
+
+def test_names_and_the_link_to_the_report_are_escaped(arm, logs):
+    found = identify(arm, logs[:1], validation=[replace(logs[1], path="<i>.csv")])
+    html = replace(found, report='a"b<c>/report.html')._repr_html_()
+    assert "<i>" not in html
+    assert ("a", {"href": 'a"b<c>/report.html'}) in Words(html).tags
+
+
+def test_a_job_s_identification_links_to_its_report(arm, logs, tmp_path):
+    write_log(logs[0], tmp_path / "log.csv")
+    job = Job(
+        urdf=ROOT / "urdf" / "planar_2r.urdf", identification=(LogEntry(tmp_path / "log.csv"),)
+    )
+    found, _ = run_job(job, tmp_path / "out")
+    assert found.report == str(tmp_path / "out" / "report.html")
+    assert f'href="{found.report}"' in found._repr_html_()
+    assert f"report: {found.report}" in str(found)
+
+
+def test_an_estimate_lists_every_parameter(found):
+    text, html = str(found.wls), found.wls._repr_html_()
+    for name, value in zip(found.wls.names, found.wls.theta, strict=True):
+        (line,) = [line for line in text.splitlines() if line.split()[0] == name]
+        assert float(line.split()[1]) == pytest.approx(value, rel=1e-3)
+        assert name in "".join(Words(html).words)

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.stats
+
+from robotid.estimators import WLS
+from robotid.exceptions import DataError
+from robotid.identification.standard_errors import measured_errors
+from robotid.identification.uncertainty import quantile, scatter
+from robotid.regressor.factors import compress, merge
+from robotid.regressor.problem import Problem
+
+N, JOINTS, STRETCHES = 2400, 2, 40
+SIGMA = np.array([2.0, 0.1])
+TRUTH = np.array([1.0, -2.0, 0.5, 3.0])
+
+
+@pytest.fixture(scope="module")
+def W():
+    rng = np.random.default_rng(0)
+    slow = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.standard_normal((N, JOINTS, 3)), axis=0)
+    return np.concatenate([slow, np.ones((N, JOINTS, 1))], axis=2)
+
+
+def noise(rng, colour):
+    white = rng.standard_normal((N, JOINTS))
+    coloured = scipy.signal.lfilter([np.sqrt(1 - colour**2)], [1.0, -colour], white, axis=0)
+    return SIGMA * coloured
+
+
+def stretches(W, tau):
+    def problem(W, tau):
+        k = len(tau) * JOINTS
+        return Problem(
+            lambda: iter([(W.reshape(k, -1), tau.reshape(k), np.ones(k))]),
+            tuple("abcd"),
+            JOINTS,
+            np.ones((JOINTS, 4), dtype=bool),
+        )
+
+    parts = zip(np.split(W, STRETCHES), np.split(tau, STRETCHES), strict=True)
+    return [compress(problem(*part)) for part in parts]
+
+
+def estimate(W, tau):
+    parts = stretches(W, tau)
+    whole = merge(parts)
+    rough = WLS().fit(whole)
+    return measured_errors(rough, parts, whole, 1.0, np.eye(4), rough.sigma)
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
+    rng = np.random.default_rng(1)
+    errors, reported, held = [], [], []
+    for _ in range(150):
+        found, basis = estimate(W, W @ TRUTH + noise(rng, colour))
+        errors.append(found.theta - TRUTH)
+        reported.append(found.std_error)
+        held.append(np.abs(errors[-1]) <= basis.reach * found.std_error)
+    scattered = np.sqrt(np.mean(np.square(errors), axis=0))
+    ratio = np.sqrt(np.mean(np.square(reported), axis=0)) / scattered
+    # 150 runs know their own scatter to 6 %
+    assert ((ratio > 0.82) & (ratio < 1.25)).all(), ratio
+    assert 0.92 < np.mean(held) < 0.98
+
+
+def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):
+    rng = np.random.default_rng(2)
+    _, white = estimate(W, W @ TRUTH + noise(rng, 0.0))
+    _, coloured = estimate(W, W @ TRUTH + noise(rng, 0.9))
+    assert 0.7 < white.inflation < 1.4
+    assert coloured.inflation > 5  # (1 + 0.9) / (1 - 0.9) = 19 for rows that never change
+
+
+def test_one_parameter_is_the_closed_form_of_cr2(rng):
+    x, e = rng.standard_normal((20, 10)), rng.standard_normal((20, 10))
+    y = 0.7 * x + e
+    theta = (x * y).sum() / (x**2).sum()
+    bread = 1 / (x**2).sum()
+
+    def problem(x, y):
+        blocks = [(x[:, None], y, np.ones(len(x)))]
+        return Problem(lambda: iter(blocks), ("a",), 1, np.ones((1, 1), dtype=bool))
+
+    parts = [compress(problem(*part)) for part in zip(x, y, strict=True)]
+    found = scatter(parts, np.array([theta]), np.ones(1), np.array([[bread]]))
+    # with one column, (I - H_ss)^-1/2 acts along x_s alone, with leverage h_s
+    h = (x**2).sum(axis=1) * bread
+    scores = (x * (y - theta * x)).sum(axis=1) / np.sqrt(1 - h)
+    assert found.covariance[0, 0] == pytest.approx(bread**2 * (scores**2).sum(), rel=1e-9)
+    a = np.sqrt((x**2).sum(axis=1) / (1 - h)) * bread
+    back = np.sqrt((x**2).sum(axis=1)) * a
+    gram = np.diag(a**2) - np.outer(back, back) * bread
+    freedom = np.trace(gram) ** 2 / (gram**2).sum()
+    assert found.freedom()[0] == pytest.approx(freedom, rel=1e-9)
+
+
+def test_a_direction_of_one_stretch_alone_gets_the_scatter_of_the_others(W):
+    alone = W.copy()
+    alone[:, :, 1] = 0.0
+    alone[60:120, :, 1] = W[60:120, :, 1]  # the second of 40 stretches
+    rng = np.random.default_rng(3)
+    ratio = []
+    for _ in range(40):
+        found, _ = estimate(alone, alone @ TRUTH + noise(rng, 0.0))
+        ratio.append(((found.theta - TRUTH)[1] / found.std_error[1]) ** 2)
+    assert 0.5 < np.mean(ratio) < 2.0
+
+
+def test_few_stretches_keep_the_band_of_the_filter(W):
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(0), 0.0))[:11]
+    whole = merge(parts)
+    rough = WLS(independent_share=0.2).fit(whole)
+    found, basis = measured_errors(rough, parts, whole, 0.2, np.eye(4), rough.sigma)
+    np.testing.assert_array_equal(found.covariance, rough.covariance)
+    assert basis.inflation == pytest.approx(5.0)
+    assert "only 11 stretches" in basis.method
+    with pytest.raises(DataError, match="11 stretches"):
+        scatter(parts, rough.theta, rough.sigma, rough.covariance)
+
+
+def test_quantiles_are_students():
+    np.testing.assert_allclose(
+        quantile(np.array([5.0, 30.0, np.inf])), scipy.stats.t.ppf(0.975, [5.0, 30.0, 1e12]), 1e-9
+    )

@@ -1,0 +1,640 @@
+"""Log files are read whole and right, or refused by name."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from robotid.exceptions import DataError, MissingDependencyError, SettingsError
+from robotid.logs.data import Log
+from robotid.logs.read import read_log, write_log
+from robotid.logs.units import LogUnits
+
+JOINTS = ("shoulder", "elbow")
+FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[3] / "shared" / "data")
+BOTH = pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+
+
+def refused(text, kind=DataError):
+    return pytest.raises(kind, match="^" + re.escape(text) + "$")
+
+
+def make_log(**changes):
+    t = np.arange(300) / 100
+    phase = t[:, None] * [2.0, 3.0]
+    fields = {
+        "t": t,
+        "q": np.sin(phase),
+        "v": np.cos(phase) * [2.0, 3.0],
+        "a": -np.sin(phase) * [4.0, 9.0],
+        "tau": 10 * np.cos(phase),
+        "joints": JOINTS,
+    }
+    return Log(**(fields | changes))
+
+
+def make_table(**changes):
+    """The columns of a small log by standard name; None takes one out."""
+    log = make_log()
+    table = {"time": log.t}
+    for kind, values in (("q", log.q), ("tau", log.tau)):
+        table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(JOINTS)}
+    return {name: values for name, values in (table | changes).items() if values is not None}
+
+
+def save(path, table, separator=","):
+    if path.suffix == ".parquet":
+        pq.write_table(pa.table(table), path)
+        return path
+    rows = zip(*(np.asarray(values).tolist() for values in table.values()), strict=True)
+    lines = [separator.join(table), *(separator.join(map(str, row)) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(params=[".csv", ".parquet"])
+def run(request, tmp_path):
+    """A function that writes a table to run.csv or run.parquet."""
+    return lambda table: save(tmp_path / f"run{request.param}", table)
+
+
+@pytest.fixture
+def text(tmp_path):
+    """A function that writes text to run.csv."""
+
+    def write(content):
+        path = tmp_path / "run.csv"
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    return write
+
+
+# --- the columns ----------------------------------------------------------------------------------
+
+
+def test_standard_columns_are_read(run):
+    path = run(make_table())
+    log = read_log(path, JOINTS)
+    truth = make_log()
+    for name in ("t", "q", "tau"):
+        np.testing.assert_array_equal(getattr(log, name), getattr(truth, name))
+    assert (log.v, log.a, log.notes) == (None, None, ())
+    assert (log.joints, log.path) == (JOINTS, str(path))
+
+
+def test_columns_come_in_the_order_of_the_joints_not_of_the_file(run):
+    table = dict(reversed(make_table().items()))
+    log = read_log(run(table), ("elbow", "shoulder"))
+    np.testing.assert_array_equal(log.q, make_log().q[:, ::-1])
+    np.testing.assert_array_equal(log.tau, make_log().tau[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("q", "dq", "ddq", "tau"),
+    [
+        ("q_", "dq_", "ddq_", "tau_"),
+        ("position_", "velocity_", "acceleration_", "effort_"),
+        ("q_", "qd_", "qdd_", "torque_"),
+    ],
+)
+@pytest.mark.parametrize("clock", ["time", "t"])
+def test_aliases_are_read(run, q, dq, ddq, tau, clock):
+    truth = make_log()
+    table = {clock: truth.t}
+    for prefix, values in ((q, truth.q), (dq, truth.v), (ddq, truth.a), (tau, truth.tau)):
+        table |= {prefix + joint: values[:, j] for j, joint in enumerate(JOINTS)}
+    log = read_log(run(table), JOINTS)
+    for name in ("t", "q", "v", "a", "tau"):
+        np.testing.assert_array_equal(getattr(log, name), getattr(truth, name))
+
+
+def test_two_names_of_one_quantity_are_refused(run):
+    path = run(make_table(position_elbow=np.zeros(300)))
+    with refused(
+        f"{path.name} has 'q_elbow' and 'position_elbow', two names of the same quantity; remove "
+        "one, or pass columns={'q_elbow': ...}"
+    ):
+        read_log(path, JOINTS)
+    log = read_log(path, JOINTS, columns={"q_elbow": "position_elbow"})
+    np.testing.assert_array_equal(log.q[:, 1], 0.0)
+    assert log.notes == ("columns ignored: ['q_elbow']",)
+    path = run(make_table(t=np.arange(300)))
+    with pytest.raises(DataError, match="has 'time' and 't', two names of the same quantity"):
+        read_log(path, JOINTS)
+
+
+def test_missing_column_is_named_with_those_of_its_kind(run):
+    path = run(make_table(tau_elbow=None))
+    with refused(
+        f"{path.name} has no column 'tau_elbow'; torque or current columns found: "
+        "['tau_shoulder']. Rename it, or pass columns={'tau_elbow': ...}; "
+        "if 'elbow' stood still, leave it out of joints and lock it"
+    ):
+        read_log(path, JOINTS)
+    path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
+    with refused(
+        f"{path.name} has no column 'q_shoulder'; position columns found: []. Rename it, or pass "
+        "columns={'q_shoulder': ...}; if 'shoulder' stood still, leave it out of joints and lock it"
+    ):
+        read_log(path, JOINTS)
+
+
+def test_misspelt_column_is_suggested(run):
+    path = run(make_table(q_elbow=None, q_elbow2=np.zeros(300)))
+    with refused(
+        f"{path.name} has no column 'q_elbow'; position columns found: ['q_shoulder', 'q_elbow2']. "
+        "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}; "
+        "if 'elbow' stood still, leave it out of joints and lock it"
+    ):
+        read_log(path, JOINTS)
+    log = read_log(path, JOINTS, columns={"q_elbow": "q_elbow2"})
+    np.testing.assert_array_equal(log.q[:, 1], 0.0)
+
+
+def test_the_column_of_another_joint_is_not_suggested(run):
+    zeros = np.zeros(3)
+    path = run({"time": np.arange(3), "q_joint_1": zeros, "q_joint_2": zeros, "tau_joint_1": zeros})
+    with refused(
+        f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
+        "['tau_joint_1']. Rename it, or pass columns={'tau_joint_2': ...}; "
+        "if 'joint_2' stood still, leave it out of joints and lock it"
+    ):
+        read_log(path, ["joint_1", "joint_2"])
+
+
+def test_missing_time_lists_all_columns(run):
+    path = run(make_table(time=None, Time=np.arange(300.0)))
+    with refused(
+        f"{path.name} has no column 'time'; columns found: ['q_shoulder', 'q_elbow', "
+        "'tau_shoulder', 'tau_elbow', 'Time']. Did you mean 'Time'? Rename it, or pass "
+        "columns={'time': 'Time'}"
+    ):
+        read_log(path, JOINTS)
+
+
+def test_columns_must_name_what_is_read(run):
+    path = run(make_table())
+    with pytest.raises(SettingsError) as caught:
+        read_log(path, JOINTS, columns={"tau_elbw": "tau_elbow"})
+    assert str(caught.value) == (
+        "columns: 'tau_elbw' is not the standard name of a column that is read, as 'time' or "
+        "'tau_shoulder'. Did you mean 'tau_elbow'?"
+    )
+    with pytest.raises(DataError) as caught:
+        read_log(path, JOINTS, columns={"tau_elbow": "tau_elbo"})
+    assert str(caught.value).startswith(
+        f"{path.name} has no column 'tau_elbo', which columns gives for 'tau_elbow'; columns found:"
+    )
+    assert str(caught.value).endswith("Did you mean 'tau_elbow'?")
+
+
+def test_columns_may_swap_but_not_share(run):
+    path = run(make_table())
+    log = read_log(path, JOINTS, columns={"q_elbow": "q_shoulder", "q_shoulder": "q_elbow"})
+    np.testing.assert_array_equal(log.q, make_log().q[:, ::-1])
+    with refused(
+        f"{path.name}: ['tau_elbow'] are read twice; correct columns={{...}}",
+        SettingsError,
+    ):
+        read_log(path, JOINTS, columns={"tau_shoulder": "tau_elbow", "tau_elbow": "tau_elbow"})
+
+
+def test_a_column_given_to_one_quantity_is_no_alias_of_another(run):
+    path = run(make_table(q_shoulder=None, position_elbow=np.zeros(300)))
+    log = read_log(path, JOINTS, columns={"q_shoulder": "position_elbow"})
+    np.testing.assert_array_equal(log.q[:, 0], 0.0)
+    np.testing.assert_array_equal(log.q[:, 1], make_log().q[:, 1])
+
+
+def test_extra_columns_are_named_once(run):
+    table = make_table(tau_wrist=np.zeros(300), temperature=np.zeros(300))
+    log = read_log(run(table), JOINTS)
+    assert log.notes == ("columns ignored: ['tau_wrist', 'temperature']",)
+
+
+def test_velocity_of_some_joints_only_is_noted(run):
+    table = make_table(dq_elbow=make_log().v[:, 1], qdd_shoulder=make_log().a[:, 0])
+    log = read_log(run(table), JOINTS)
+    assert (log.v, log.a) == (None, None)
+    assert log.notes == (
+        "['dq_elbow'] ignored: ['shoulder'] have no velocity",
+        "['qdd_shoulder'] ignored: ['elbow'] have no acceleration",
+    )
+    assert read_log(run(table), ["elbow"]).v.shape == (300, 1)
+
+
+@pytest.mark.parametrize("joints", [(), "elbow"])
+def test_joints_must_be_a_list_of_names(run, joints):
+    with refused(f"joints is {joints!r}, wanted a list of at least one name", SettingsError):
+        read_log(run(make_table()), joints)
+
+
+def test_a_joint_named_twice_is_refused(run):
+    with pytest.raises(SettingsError, match=r"\['q_elbow', 'tau_elbow'\] are read twice"):
+        read_log(run(make_table()), ["elbow", "elbow"])
+
+
+# --- torque from current --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prefix", ["current_", "i_"])
+def test_current_times_gain_is_torque(run, prefix):
+    path = run(make_table(tau_elbow=None, **{prefix + "elbow": np.full(300, 2.0)}))
+    log = read_log(path, JOINTS, gains={"elbow": -8.7})
+    np.testing.assert_array_equal(log.tau[:, 1], -17.4)
+    np.testing.assert_array_equal(log.tau[:, 0], make_log().tau[:, 0])
+    assert log.notes == ()
+
+
+def test_current_without_gain_is_refused(run):
+    path = run(make_table(tau_elbow=None, i_elbow=np.ones(300)))
+    with refused(
+        f"{path.name}: joint 'elbow' has the current 'i_elbow' but no gain; give it in N m/A: "
+        "gains={'elbow': ...} (job file table [torque], key gains; CLI --gain elbow=...)"
+    ):
+        read_log(path, JOINTS)
+
+
+def test_gain_decides_between_current_and_torque(run):
+    path = run(make_table(current_elbow=np.full(300, 2.0)))
+    log = read_log(path, JOINTS, gains={"elbow": 10.0})
+    np.testing.assert_array_equal(log.tau[:, 1], 20.0)
+    assert log.notes == ("tau_elbow ignored: current_elbow is read (a gain)",)
+    log = read_log(path, JOINTS)
+    np.testing.assert_array_equal(log.tau, make_log().tau)
+    assert log.notes == ("current_elbow ignored: tau_elbow is read (no gain)",)
+
+
+def test_gain_without_current_is_noted(run):
+    log = read_log(run(make_table()), JOINTS, gains={"elbow": 10.0})
+    np.testing.assert_array_equal(log.tau, make_log().tau)
+    assert log.notes == ("the gain of 'elbow' is not used: tau_elbow is a torque",)
+
+
+def test_gain_of_a_joint_that_is_not_read_is_refused(run):
+    path = run(make_table())
+    with refused(
+        f"{path.name}: a gain is given for 'elbo', which is not among the joints read: "
+        "['shoulder', 'elbow']. Did you mean 'elbow'?",
+        SettingsError,
+    ):
+        read_log(path, JOINTS, gains={"elbo": 10.0})
+
+
+@pytest.mark.parametrize("gain", [0.0, np.nan, np.inf])
+def test_gain_must_be_a_number(run, gain):
+    with refused(f"gain of 'elbow' is {gain}, wanted a number other than 0", SettingsError):
+        read_log(run(make_table()), JOINTS, gains={"elbow": gain})
+
+
+# --- units and window -----------------------------------------------------------------------------
+
+
+def test_stated_units_become_si(run):
+    truth = make_log()
+    degrees = {
+        "time": truth.t * 1e3,
+        "q_shoulder": np.degrees(truth.q[:, 0]),
+        "q_elbow": truth.q[:, 1],  # [m]
+        "dq_shoulder": np.degrees(truth.v[:, 0]),
+        "dq_elbow": truth.v[:, 1],
+        "ddq_shoulder": np.degrees(truth.a[:, 0]),
+        "ddq_elbow": truth.a[:, 1],
+    }
+    path = run(make_table(**degrees))
+    with pytest.raises(DataError, match="looks like milliseconds"):
+        read_log(path, JOINTS)
+    with pytest.raises(DataError, match="looks like degrees"):
+        read_log(path, JOINTS, units=LogUnits(time="ms"))
+    log = read_log(
+        path, JOINTS, units=LogUnits("ms", "deg"), prismatic=["elbow", "torso"], start=1, end=2
+    )
+    np.testing.assert_allclose(log.t, truth.t[100:201], rtol=1e-15)
+    for name in ("q", "v", "a"):
+        np.testing.assert_allclose(getattr(log, name), getattr(truth, name)[100:201], rtol=1e-14)
+        np.testing.assert_array_equal(getattr(log, name)[:, 1], getattr(truth, name)[100:201, 1])
+
+
+def test_joints_that_slide_may_go_far(run):
+    path = run(make_table(q_elbow=make_log().q[:, 1] * 20))
+    assert np.abs(read_log(path, JOINTS, prismatic=["elbow"]).q).max() > 19
+    with pytest.raises(DataError, match="q_elbow reaches 20, which looks like degrees"):
+        read_log(path, JOINTS)
+
+
+def test_window_is_read_alone(run):
+    assert len(read_log(run(make_table()), JOINTS, start=1.0).t) == 200
+    assert len(read_log(run(make_table()), JOINTS, end=1.0).t) == 101
+    with pytest.raises(DataError, match=r"the log spans 0 s to 2\.99 s"):
+        read_log(run(make_table()), JOINTS, start=5.0)
+
+
+# --- values ---------------------------------------------------------------------------------------
+
+
+def test_nan_is_refused_by_row_and_column(run):
+    tau = make_table()["tau_elbow"].copy()
+    tau[34] = np.nan
+    path = run(make_table(tau_elbow=tau))
+    with refused(
+        f"{path.name}: tau_elbow is NaN at row 34 (t = 0.34 s); remove the row or mend the "
+        "recording"
+    ):
+        read_log(path, JOINTS)
+
+
+def test_nan_in_a_column_that_is_not_read_does_not_matter(run):
+    log = read_log(run(make_table(tau_wrist=np.full(300, np.nan))), JOINTS)
+    assert np.isfinite(log.tau).all()
+
+
+def test_null_is_refused_as_nan(tmp_path):
+    for values in ([1.0, None, 3.0], [1, None, 3]):
+        table = {"t": [0.0, 0.1, 0.2], "q_a": [0, 1, 2], "tau_a": values}
+        path = save(tmp_path / "run.parquet", table)
+        with pytest.raises(DataError, match=r"^run\.parquet: tau_a is NaN at row 1 \(t = 0\.1 s\)"):
+            read_log(path, ["a"])
+
+
+def test_whole_numbers_and_single_precision_are_read(tmp_path):
+    table = {"t": pa.array([0, 1, 2], pa.int32()), "q_a": pa.array([0.5, 1, 2], pa.float32())}
+    path = save(tmp_path / "run.parquet", table | {"tau_a": pa.array([1, 2, 3], pa.uint8())})
+    log = read_log(path, ["a"], units=LogUnits(time="s"))
+    np.testing.assert_array_equal(log.q[:, 0], [0.5, 1, 2])
+    assert log.t.dtype == log.q.dtype == log.tau.dtype == np.float64
+
+
+def test_parquet_columns_that_are_no_numbers_are_refused(tmp_path):
+    stamps = pa.array([0, 1, 2], pa.timestamp("ns"))
+    path = save(tmp_path / "run.parquet", {"time": stamps, "q_a": [0, 1, 2], "tau_a": [0, 1, 2]})
+    with refused("run.parquet: time holds timestamp[ns], wanted numbers; convert it"):
+        read_log(path, ["a"])
+
+
+def test_fewer_than_two_rows_are_refused(run):
+    path = run({"t": [0.0], "q_a": [0.0], "tau_a": [0.0]})
+    with refused(f"{path.name} has 1 rows, wanted at least 2"):
+        read_log(path, ["a"])
+
+
+# --- CSV text -------------------------------------------------------------------------------------
+
+HEADER = "time,q_a,tau_a\n"
+ROWS = "0.0,1.0,2.0\n0.1,1.5,2.5\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        HEADER + ROWS,
+        ("\ufeff" + HEADER + ROWS),
+        (HEADER + ROWS).replace("\n", "\r\n"),
+        (HEADER + ROWS).rstrip("\n"),
+        HEADER + ROWS + "\n  \n",
+        (HEADER + ROWS).replace(",", ";"),
+        (HEADER + ROWS).replace(",", "\t"),
+        (HEADER + ROWS).replace(",", " , "),
+        "# " + HEADER + ROWS,
+        'mode,time,q_a,"tau_a"\n"a, b",0.0,1.0,2.0\n#c,0.1,"1.5",2.5\n',
+    ],
+)
+def test_csv_dialects(text, content):
+    log = read_log(text(content), ["a"])
+    np.testing.assert_array_equal(log.t, [0.0, 0.1])
+    np.testing.assert_array_equal(log.q, [[1.0], [1.5]])
+    np.testing.assert_array_equal(log.tau, [[2.0], [2.5]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "run.csv is empty; its first line must name the columns"),
+        ("\n" + HEADER + ROWS, "run.csv is empty; its first line must name the columns"),
+        (HEADER, "run.csv has a header but no rows; record at least 2"),
+        (HEADER + "\n", "run.csv has a header but no rows; record at least 2"),
+        (ROWS, "run.csv has no header; its first line must name the columns"),
+        (
+            (HEADER + ROWS).replace(",", " "),
+            "run.csv has no column 'time'; columns found: ['time q_a tau_a']. Rename it, or pass "
+            "columns={'time': ...}",
+        ),
+        (
+            "time,q_a,q_a,tau_a\n0,1,2,3\n1,1,2,3\n",
+            "run.csv has more than one column ['q_a']; rename or remove one",
+        ),
+        (
+            HEADER + ROWS + "0.2,1.",
+            "run.csv: line 4 has 2 cells, the header has 3; mend it",
+        ),
+        (
+            HEADER + "0.0,1.0,2.0,9.0\n" + ROWS,
+            "run.csv: line 2 has 4 cells, the header has 3; mend it",
+        ),
+        (
+            HEADER + ROWS + "0.2,abc,3.0\n",
+            "run.csv: q_a is 'abc' at row 2, wanted a number; remove the row or mend the recording",
+        ),
+        (
+            HEADER + ROWS + "0.2,1.0,\n",
+            "run.csv: tau_a is empty at row 2, wanted a number; remove the row or mend the "
+            "recording",
+        ),
+        (
+            "time;q_a;tau_a\n0,0;1,0;2,0\n",
+            "run.csv: time is '0,0' at row 0, wanted a number; write decimals with a point; remove "
+            "the row or mend the recording",
+        ),
+    ],
+)
+def test_csv_that_cannot_be_read_says_why(text, content, message):
+    with refused(message):
+        read_log(text(content), ["a"])
+
+
+@pytest.mark.parametrize("content", [(HEADER + ROWS).encode("utf-16"), HEADER.encode() + b"\xe9\n"])
+def test_csv_that_is_not_utf8_is_refused(text, content):
+    with pytest.raises(DataError, match=r"^run\.csv is not UTF-8 text: .*; save it as UTF-8$"):
+        read_log(text(content), ["a"])
+
+
+def test_csv_is_quick(tmp_path):
+    log = make_wide_log(20_000)
+    path = tmp_path / "run.csv"
+    write_log(log, path)
+    start = time.perf_counter()
+    read_log(path, log.joints)
+    # 1e5 x 30 takes 1 s; a loop over the cells in Python takes ten times as long
+    assert time.perf_counter() - start < 1.5
+
+
+def make_wide_log(count):
+    rng = np.random.default_rng(0)
+    tau = rng.standard_normal((count, 15))
+    q = np.cumsum(rng.standard_normal((count, 15)), axis=0) * 1e-3
+    return Log(t=np.arange(count) * 1e-3, q=q, tau=tau, joints=[f"j{i}" for i in range(15)])
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    known = ".csv, .parquet, .npz, .h5, .hdf5, .mat"
+    for path in (tmp_path / "run.xlsx", "run.xlsx"):
+        with refused(
+            f"run.xlsx: logs are {known}, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag, "
+            "not '.xlsx'; convert it"
+        ):
+            read_log(path, ["a"])
+    written = known.replace(", .mat", " or .mat")
+    for name, suffix in (("run", ""), ("run.mcap", ".mcap")):
+        with refused(f"{name}: logs are written as {written} files, not {suffix!r}"):
+            write_log(make_log(), tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_capital_suffix_is_read(tmp_path):
+    path = save(tmp_path / "run.csv", make_table()).rename(tmp_path / "RUN.CSV")
+    assert len(read_log(path, JOINTS).t) == 300
+
+
+@BOTH
+def test_missing_file_is_named(tmp_path, suffix):
+    path = tmp_path / f"run{suffix}"
+    with refused(f"there is no log file {str(path)!r}"):
+        read_log(path, ["a"])
+
+
+def test_broken_parquet_is_refused(tmp_path):
+    path = tmp_path / "run.parquet"
+    path.write_bytes(b"PAR1 not really")
+    with pytest.raises(
+        DataError, match=r"^run\.parquet: broken Parquet file \(.*\); export it again$"
+    ):
+        read_log(path, ["a"])
+
+
+def test_parquet_without_pyarrow_says_how_to_install_it(tmp_path, monkeypatch):
+    path = save(tmp_path / "run.parquet", make_table())
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    how = "needs pyarrow, which is not installed: pip install robotid[parquet]"
+    with refused(f"reading Parquet {how}", MissingDependencyError):
+        read_log(path, JOINTS)
+    with refused(f"writing Parquet {how}", MissingDependencyError):
+        write_log(make_log(), path)
+
+
+def test_import_does_not_load_pyarrow():
+    code = "import sys, robotid, robotid.logs.read; sys.exit('pyarrow' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# --- writing --------------------------------------------------------------------------------------
+
+
+@BOTH
+def test_round_trip_is_exact_to_the_last_bit(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    tau = rng.standard_normal((5000, 2)) * 10.0 ** rng.integers(-300, 300, (5000, 2))
+    tau[:5, 0] = [-0.0, 5e-324, 1.7976931348623157e308, 0.1 + 0.2, 1e22]
+    log = Log(
+        t=1.7e9 + np.cumsum(rng.uniform(1e-4, 1e-2, 5000)),
+        q=rng.standard_normal((5000, 2)),
+        v=rng.standard_normal((5000, 2)),
+        a=rng.standard_normal((5000, 2)),
+        tau=tau,
+        joints=("arm, left", 'the "elbow"'),
+    )
+    write_log(log, tmp_path / f"run{suffix}")
+    back = read_log(tmp_path / f"run{suffix}", log.joints)
+    for name in ("t", "q", "v", "a", "tau"):
+        assert getattr(back, name).tobytes() == getattr(log, name).tobytes()
+    assert back.notes == ()
+
+
+@BOTH
+def test_written_columns_have_standard_names(tmp_path, suffix):
+    path = tmp_path / f"run{suffix}"
+    write_log(make_log(a=None), path)
+    names = path.read_text().split("\n")[0].split(",") if suffix == ".csv" else None
+    names = names or pq.read_schema(path).names
+    assert names == [
+        "time", "q_shoulder", "q_elbow", "dq_shoulder", "dq_elbow", "tau_shoulder", "tau_elbow",
+    ]  # fmt: skip
+    assert read_log(path, JOINTS).a is None
+
+
+@BOTH
+def test_writing_replaces_a_file_at_once_or_not_at_all(tmp_path, suffix, monkeypatch):
+    path = tmp_path / f"run{suffix}"
+    write_log(make_log(), path)
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises(OSError, match="disk full"):
+            write_log(make_log(v=None), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+    write_log(make_log(v=None), path)
+    assert read_log(path, JOINTS).v is None
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# --- real recordings ------------------------------------------------------------------------------
+
+DATA = next((Path(folder) for folder in FOLDERS if folder and Path(folder).is_dir()), Path("none"))
+RECORDINGS = sorted(p for p in DATA.glob("*/*.parquet") if p.stem != "motor_side")
+PRISMATIC = ("torso_lift_joint",)
+each = pytest.mark.parametrize("path", RECORDINGS or [None], ids=lambda p: p.stem if p else "none")
+real = pytest.mark.usefixtures("recordings")  # which skips, or fails in CI, if there are none
+
+
+def read_real(path):
+    names = pq.read_schema(path).names
+    joints = [name[2:] for name in names if name.startswith("q_")]
+    gains = {joint: 10.0 for joint in joints if f"current_{joint}" in names}
+    return read_log(path, joints, gains=gains, prismatic=PRISMATIC)
+
+
+@real
+@each
+def test_real_recordings_are_not_refused_and_survive_csv(path, tmp_path):
+    log = read_real(path)
+    write_log(log, tmp_path / "run.csv")
+    back = read_log(tmp_path / "run.csv", log.joints, prismatic=PRISMATIC)
+    for name in ("t", "q", "tau"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(log, name))
+
+
+@real
+@each
+def test_real_recordings_in_other_units_are_refused(path, tmp_path):
+    log = read_real(path)
+
+    def reread(**changes):
+        write_log(replace(log, **changes), tmp_path / "run.parquet")
+        return read_log(tmp_path / "run.parquet", log.joints, prismatic=PRISMATIC)
+
+    turns = np.array([joint not in PRISMATIC for joint in log.joints])
+    degrees = np.where(turns, 180 / np.pi, 1.0)
+    with pytest.raises(DataError, match=r"(looks like degrees|the time looks like|milliseconds)"):
+        reread(t=log.t * 1e3)
+    with pytest.raises(DataError, match="looks like degrees"):
+        reread(q=log.q * degrees, v=None if log.v is None else log.v * degrees)
+    if log.v is not None:
+        with pytest.raises(DataError, match="the velocity looks like degrees"):
+            reread(v=log.v * degrees)
+        with pytest.raises(DataError, match="opposite sign"):
+            reread(v=-log.v)

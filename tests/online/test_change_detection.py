@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from robotid.online.change_detection import ChangeDetector, Innovations, load_spread, payload_of
+
+
+def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):
+    detector = ChangeDetector(3, 40.0, 4.0)
+    for k in range(20_000):
+        assert detector.push(k * 0.1, rng.standard_normal(3) ** 2, 1.0) is None
+    flagged = None
+    for k in range(20_000, 20_100):
+        e = rng.standard_normal(3) + np.array([0.0, 4.0, 0.0])
+        flagged = detector.push(k * 0.1, e**2, 1.0)
+        if flagged is not None:
+            break
+    assert flagged == pytest.approx(2000.0, abs=0.3)
+    assert k - 20_000 < 10
+    np.testing.assert_array_equal(detector.evidence, 0.0)
+
+
+def test_a_single_outlier_is_no_change():
+    detector = ChangeDetector(1, 40.0, 4.0)
+    assert detector.push(0.0, np.array([1e6]), 1.0) is None
+    for k in range(6):
+        assert detector.push(k + 1.0, np.array([0.5]), 1.0) is None
+    assert detector.evidence[0] == pytest.approx(0.0)
+
+
+def innovations(n=1, model_error=0.0):
+    detector = ChangeDetector(n, 40.0, 4.0)
+    return Innovations(np.full(n, 10.0), 0.01, 5.0, model_error, detector)
+
+
+def test_the_noise_is_learnt_also_while_the_parameters_are_uncertain(rng):
+    monitor, used = innovations(), np.array([True])
+    doubt = np.array([3.0])  # variance from the parameters, with noise of variance 0.25
+    for k in range(5000):
+        noise, wrong = 0.5 * rng.standard_normal(1), np.sqrt(3.0) * rng.standard_normal(1)
+        e = wrong + noise
+        residual = e * 0.25 / 3.25  # what an update with the true variances leaves
+        assert monitor.push(0.01 * k, e, e, residual, doubt, used, 0.2) is None
+    assert monitor.variance[0] == pytest.approx(0.25, rel=0.15)
+    assert not monitor.is_converged
+    assert monitor.doubt[0] == pytest.approx(3.0 / 0.25, rel=0.2)
+
+
+def test_a_row_that_is_not_used_teaches_nothing():
+    monitor = innovations(2)
+    before = monitor.variance.copy()
+    e = np.array([100.0, 0.01])
+    monitor.push(0.0, e, e, e, np.zeros(2), np.array([False, True]), 1.0)
+    assert monitor.variance[0] == before[0]
+    assert monitor.variance[1] < before[1]
+    assert np.isinf(monitor.doubt[0])
+
+
+@pytest.mark.parametrize(("model_error", "is_flagged"), [(0.0, True), (0.1, False)])
+def test_what_a_model_may_miss_is_no_change(model_error, is_flagged):
+    monitor, used = innovations(model_error=model_error), np.array([True])
+    flagged, tau = False, np.array([10.0])
+    for k in range(500):
+        monitor.push(0.01 * k, tau, 0.1 * np.ones(1), 0.1 * np.ones(1), np.zeros(1), used, 0.2)
+    for k in range(500, 700):
+        e = np.ones(1)  # a tenth of the torque
+        flagged |= monitor.push(0.01 * k, tau, e, e, np.zeros(1), used, 0.2) is not None
+    assert flagged is is_flagged
+
+
+def test_a_load_is_found_from_what_it_changes(rng):
+    columns = rng.standard_normal((30, 10))
+    load = np.array([2.0, 0.0, 0.0, 0.2, 0.02, 0.0, 0.02, 0.0, 0.0, 0.01])
+    C = 1e-6 * np.eye(30)
+    found = payload_of(columns @ load, C, columns, np.full(10, 5.0))
+    np.testing.assert_allclose(found.parameters, load, atol=1e-5)
+    assert found.mass == pytest.approx(2.0, abs=1e-5)
+    wide = payload_of(columns @ load, 4 * C, columns, np.full(10, 5.0))
+    assert wide.mass_std_error == pytest.approx(2 * found.mass_std_error, rel=1e-3)
+    # columns that say nothing about a parameter leave it as wide as it may be
+    columns[:, 0] = 0.0
+    blind = payload_of(columns @ load, C, columns, np.full(10, 5.0))
+    assert blind.mass_std_error == pytest.approx(5.0)
+
+
+def test_a_load_may_be_as_heavy_as_a_mean_link():
+    spread = np.concatenate([np.full(10, 4.0), np.array([1.0, *[0.1] * 3, *[0.01] * 6])[:10]])
+    found = load_spread(spread)
+    assert found[0] == 2.5
+    np.testing.assert_allclose(found[1:4], 0.5)

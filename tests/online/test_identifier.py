@@ -1,0 +1,128 @@
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, payload_log, truth
+
+from robotid.exceptions import DataError, SettingsError
+from robotid.online.identifier import OnlineIdentifier
+from robotid.online.settings import OnlineSettings
+
+
+def run(identifier, log, start=0, end=None):
+    for k in range(start, len(log.t) if end is None else end):
+        identifier.update(log.t[k], log.q[k], log.tau[k])
+    return identifier
+
+
+@pytest.fixture(scope="module")
+def picked_up(panda):
+    log = payload_log(panda, np.random.default_rng(0))
+    return log, run(OnlineIdentifier(panda), log)
+
+
+def test_a_load_picked_up_at_ten_seconds_is_flagged_and_weighed(picked_up):
+    _, identifier = picked_up
+    assert len(identifier.changes) == 1
+    (change,) = identifier.changes
+    assert 10.0 < change.flagged < 10.3
+    assert change.onset == pytest.approx(10.0, abs=0.05)
+    load = identifier.payload()
+    assert load.mass == pytest.approx(2.0, abs=0.06)
+    assert load.mass_std_error < 0.03
+    assert load.parameters[3] / load.mass == pytest.approx(0.1, abs=0.01)  # 10 cm behind
+    with pytest.raises(DataError, match="there is no change 1: 1 were flagged"):
+        identifier.payload(1)
+
+
+def test_the_new_parameters_are_followed(panda, picked_up):
+    _, identifier = picked_up
+    pi = truth(panda)
+    last = slice(panda.layout.n_inertial - 10, panda.layout.n_inertial)
+    own = 0.4 * 2.0 * 0.05**2
+    loaded = pi.copy()
+    load = [2.0, 0, 0, 0.2, own + 0.02, 0, own + 0.02, 0, 0, own]
+    loaded[last] += load
+    reading = identifier.reading
+    beta, before = identifier.mapping.to_base(loaded), identifier.mapping.to_base(pi)
+    error = np.abs(reading.theta - beta) / reading.std_error
+    # filter and differentiation leave a little that is not noise
+    assert np.sqrt(np.mean(error**2)) < 2.5
+    miss = np.linalg.norm(reading.theta - beta)
+    assert miss < 0.5 * np.linalg.norm(before - beta)
+    assert identifier.estimate.names == identifier.names
+    np.testing.assert_array_equal(identifier.estimate.theta, reading.theta)
+
+
+def test_without_a_change_none_is_flagged_and_it_converges(panda):
+    log = payload_log(panda, np.random.default_rng(1), mass=0.0, duration=15.0)
+    identifier = OnlineIdentifier(panda)
+    run(identifier, log, 0, 1000)
+    early = identifier.reading
+    run(identifier, log, 1000)
+    late = identifier.reading
+    assert identifier.changes == ()
+    assert not early.converged
+    assert late.converged
+    assert 0.5 < early.excitation < late.excitation <= 1.0
+    assert (late.std_error < early.std_error * 1.001).all()
+    assert late.t == pytest.approx(log.t[-1] - identifier.delay, abs=0.011)
+    # the filter keeps 2 * 8 / 200 of the variance of white noise, and smears Coulomb friction
+    white = 0.02 * np.sqrt(np.mean(log.tau**2, axis=0) * 2 * 8 / 200)
+    assert (late.sigma < 6 * white).all()
+    assert (late.sigma > 0.5 * white).all()
+
+
+def test_smooth_motion_can_be_given_as_it_is(ur5, rng):
+    noise = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
+    log = exact_log(ur5, truth(ur5), rng, samples=2000, rate=50.0, noise=0.1 * noise)
+    # a cut-off of 2 Hz would leave two of three filtered samples out; these are all taken
+    identifier = OnlineIdentifier(ur5, OnlineSettings(rate=50.0, cutoff=2.0))
+    for k in range(len(log.t)):
+        identifier.update(log.t[k], log.q[k], log.v[k], log.a[k], log.tau[k])
+    reading = identifier.reading
+    assert identifier.delay == 0.0
+    assert reading.t == log.t[-1]
+    assert identifier.changes == ()
+    assert identifier.estimate.n_iter == len(log.t)
+    error = np.abs(reading.theta - identifier.mapping.to_base(truth(ur5))) / reading.std_error
+    assert np.sqrt(np.mean(error**2)) < 1.5
+    np.testing.assert_allclose(reading.sigma, 0.1 * noise, rtol=0.3)
+
+
+def test_a_bad_sample_is_refused_without_harm(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=600, rate=200.0)
+    clean, disturbed = OnlineIdentifier(ur5), OnlineIdentifier(ur5)
+    run(clean, log)
+    bad = np.full(6, np.nan)
+    for k in range(len(log.t)):
+        disturbed.update(log.t[k], log.q[k], log.tau[k])
+        with pytest.raises(DataError, match="is not finite, so it was refused"):
+            disturbed.update(log.t[k] + 1e-3, bad, log.tau[k])
+    np.testing.assert_array_equal(disturbed.reading.theta, clean.reading.theta)
+    with pytest.raises(DataError, match=r"update takes \(t, q, tau\) or .* found 4 values"):
+        clean.update(9.0, log.q[0], log.q[0], log.q[0])
+    with pytest.raises(DataError, match="t must increase"):
+        clean.update(log.t[-1], log.q[0], log.q[0], log.q[0], log.tau[0])
+    with pytest.raises(DataError, match="is not finite, so it was refused"):
+        clean.update(9.0, log.q[0], bad, log.q[0], log.tau[0])
+    with pytest.raises(DataError, match=r"wanted \(6,\) each"):
+        clean.update(9.0, log.q[0], bad[:5], log.q[0], log.tau[0])
+
+
+def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
+    identifier = OnlineIdentifier(ur5)
+    for k in range(400):
+        identifier.update(k / 200.0, np.zeros(6), np.ones(6))
+    assert not identifier.is_ready
+    with pytest.raises(
+        DataError, match=r"no estimate yet: the robot has moved for 0\.00 s of the 1"
+    ):
+        _ = identifier.reading
+    with pytest.raises(DataError, match="there is no change -1: 0 were flagged"):
+        identifier.payload()
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(SettingsError, match="threshold is 0"):
+        OnlineSettings(threshold=0)
+    with pytest.raises(SettingsError, match="walk is -1, wanted 0 or more"):
+        OnlineSettings(walk=-1)

@@ -1,0 +1,98 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from helpers.synthetic import payload_log
+
+from robotid.cli import main
+from robotid.commands.job import read_job
+from robotid.exceptions import DataError, MissingDependencyError
+from robotid.logs import parquet_files
+from robotid.logs.read import write_log
+from robotid.online.settings import OnlineSettings
+from robotid.online.tracking import track
+
+ARM = [f"panda_joint{i}" for i in range(1, 8)]
+
+
+@pytest.fixture(scope="module")
+def log_file(panda, tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "payload.parquet"
+    write_log(payload_log(panda, np.random.default_rng(0)), path)
+    return path
+
+
+def words(panda, log_file, out):
+    return ["track", str(panda.tree.path), str(log_file), "--joints", ",".join(ARM), "--out", out]
+
+
+def test_track_writes_the_history_and_says_when_the_load_came(panda, log_file, tmp_path, capsys):
+    assert main([*words(panda, log_file, str(tmp_path)), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "track.json").read_text())
+    (change,) = printed["changes"]
+    assert change["onset"] == pytest.approx(10.0, abs=0.05)
+    assert change["payload"]["body"] == "panda_link7"
+    assert change["payload"]["mass"] == pytest.approx(2.0, abs=0.06)
+    history = pq.read_table(tmp_path / "track.parquet")
+    last = printed["base_parameters"][-1]
+    assert history.column_names[0] == "time"
+    assert history.column(last["name"])[-1].as_py() == last["value"]
+    assert history.column(last["name"] + ".std_error")[-1].as_py() == last["std_error"]
+    assert len(history.column_names) == 1 + 2 * len(printed["base_parameters"]) + 2
+    # 20 rows a second from the first estimate on
+    assert history.num_rows == pytest.approx(20 * (15 - printed["first_estimate"]), abs=5)
+
+
+def test_track_tells_it_in_words(panda, log_file, tmp_path, capsys):
+    assert main(words(panda, log_file, str(tmp_path))) == 0
+    text = capsys.readouterr().out
+    assert "estimate 47 ms behind" in text
+    assert "step change at 9.99 s, flagged at 10.17 s; as a load on panda_link7" in text
+
+
+def test_without_pyarrow_the_history_is_csv(panda, log_file, tmp_path, monkeypatch, capsys):
+    log = payload_log(panda, np.random.default_rng(0), duration=3.0, at=99.0)
+    write_log(log, tmp_path / "short.csv")
+
+    def missing(purpose):
+        raise MissingDependencyError(purpose, "pyarrow", "parquet")
+
+    monkeypatch.setattr("robotid.online.tracking.load_pyarrow", missing)
+    monkeypatch.setattr(parquet_files, "load_pyarrow", missing)
+    assert main(words(panda, tmp_path / "short.csv", str(tmp_path / "out"))) == 0
+    lines = (tmp_path / "out" / "track.csv").read_text().splitlines()
+    assert lines[0].startswith("time,panda_link1.Izz,panda_link1.Izz.std_error,")
+    assert len(lines) > 20
+
+
+def test_a_log_without_motion_is_refused(panda, tmp_path):
+    log = payload_log(panda, np.random.default_rng(0), duration=3.0, at=99.0)
+    still = replace(log, q=np.zeros(log.q.shape))
+    with pytest.raises(DataError, match="moves for less than the warm-up of 1 s"):
+        track(panda, still, OnlineSettings())
+
+
+def test_a_filter_is_needed(panda, log_file, tmp_path, capsys):
+    assert main([*words(panda, log_file, str(tmp_path)), "--cutoff", "false"]) == 2
+    assert "it needs a cutoff" in capsys.readouterr().err
+
+
+def test_real_recordings_are_tracked_without_a_false_alarm(recordings, monkeypatch):
+    monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    from pathlib import Path
+
+    for robot in ("ur10e", "panda_inria"):
+        job = read_job(Path(__file__).parents[1] / "jobs" / f"{robot}.toml")
+        model = job.model()
+        log = job.read(job.identification[-1], model)
+        settings = OnlineSettings(
+            rate=1.0 / float(np.median(np.diff(log.t))),
+            cutoff=job.signals.cutoff,
+            min_velocity=job.signals.min_velocity,
+        )
+        found = track(model, log, settings)
+        assert found.identifier.changes == ()
+        assert found.excitation[-1] > 0.8

@@ -1,0 +1,320 @@
+"""The closed-loop procedure (14)-(25), on the paper's arm and on a UR5 under gravity."""
+
+import numpy as np
+import pytest
+from helpers.synthetic import truth
+
+from robotid.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.identification.pipeline import structural_mapping
+from robotid.paper import planar_2r
+from robotid.paper.closed_loop import run_procedure
+from robotid.paper.dynamics import (
+    BaseDynamics,
+    LinearPlant,
+    PlanarDynamics,
+    mass_matrix,
+    smallest_eigenvalue,
+)
+from robotid.paper.formulas import Bounds, recursive_update
+from robotid.paper.procedure import Influences, LoopSettings, random_torque
+from robotid.robot.model import RobotModel
+from robotid.simulation.plant import RobotPlant
+from robotid.simulation.program import ProgramMotion
+
+P4 = planar_2r.parameters(planar_2r.PAPER_LINKS)
+ARM = PlanarDynamics("corrected")
+PLANT = LinearPlant(ARM, P4)
+MOTION = ProgramMotion(np.array([1.0, 1.5]), 2.0)
+DEGREE = np.array([np.pi / 180, 0.0])
+
+
+def short(iterations=3, **settings):
+    return LoopSettings(iterations=iterations, **settings)
+
+
+def run(P0=P4 / 2, **options):
+    return run_procedure(ARM, PLANT, MOTION, np.atleast_2d(P0), **options)
+
+
+@pytest.fixture(scope="module")
+def gentle_ur5(ur5):
+    """A UR5 without drives, its base dynamics and the motion it makes."""
+    model = RobotModel.from_urdf(ur5.tree.path, terms=())
+    dynamics = BaseDynamics(model, structural_mapping(model))
+    reach = np.array([1.0, -0.8, 1.2, 0.9, -1.1, 0.7])
+    return model, dynamics, ProgramMotion(reach, 2.0, np.full(6, 0.2))
+
+
+# --- with the true parameters -----------------------------------------------------------------
+
+
+def test_the_true_parameters_track_the_program():
+    # the torque is held for T / 1000, so that the error falls with it; eta itself is exactly 0
+    history = run(P4, settings=short(1, updates=1000))
+    assert history.tracking.max() < 1e-3
+    finer = run(P4, settings=short(1, updates=4000))
+    assert finer.tracking.max() < history.tracking.max() / 3
+
+
+def test_at_the_true_parameters_prx_is_zero_and_the_procedure_stops_at_once():
+    history = run(P4, settings=short(5))
+    np.testing.assert_array_equal(history.NA, [1])
+    assert len(history.prx) == 1
+    np.testing.assert_array_equal(history.estimates[-1], [P4])
+
+
+def test_with_the_printed_sign_it_never_stops():
+    history = run(P4, settings=short(3, sign="printed"))
+    np.testing.assert_array_equal(history.NA, [0])
+    assert history.prx.min() > 10.0
+    np.testing.assert_allclose(history.estimates[-1], [P4], rtol=1e-9)
+
+
+def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
+    model, dynamics, motion = gentle_ur5
+    pi = model.standard_parameters()
+    beta = dynamics.mapping.to_base(pi)
+    history = run_procedure(
+        dynamics, RobotPlant(model, pi), motion, beta[None], settings=short(1, updates=200)
+    )
+    assert history.prx.max() < 1e-9  # [N m / s^2], of 1e3 and more for wrong parameters
+    assert history.tracking.max() < 0.01
+
+
+# --- towards the true parameters --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("form", "P", "iterations", "left"),
+    [
+        ("printed", planar_2r.PAPER_PARAMETERS, 100, 2e-6),
+        ("corrected_five", planar_2r.PAPER_PARAMETERS, 40, 5e-3),
+        ("corrected", P4, 40, 3e-3),
+    ],
+)
+def test_the_recursion_finds_the_papers_parameters(form, P, iterations, left):
+    dynamics = PlanarDynamics(form)
+    plant, settings = LinearPlant(dynamics, P), LoopSettings(iterations=iterations)
+    history = run_procedure(dynamics, plant, MOTION, P[None] / 2, settings=settings, offset=DEGREE)
+    error = history.relative_error(P)[:, 0]
+    assert error[0] == 0.5
+    assert 0.34 < error[1] < 0.40  # the reading has 0.39, 0.15 and, after 100, 1e-5
+    assert 0.10 < error[10] < 0.16
+    assert error[-1] < left
+    assert (np.diff(error) < 0).all()
+
+
+def test_from_the_program_exactly_the_same_procedure_is_slow():
+    error = run(settings=LoopSettings(iterations=15)).relative_error(P4)[:, 0]
+    assert error[15] > 0.18  # 0.21; one degree beside the program it is 0.07
+
+
+def test_the_error_never_grows_while_the_guarantee_holds(rng):
+    # sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)), checked at every q2 and every estimate
+    guesses = P4 * rng.uniform(0.3, 1.3, (8, 4))
+    motion = ProgramMotion(rng.uniform(0.5, 2.0, (8, 2)), rng.uniform(1, 3, 8))
+    history = run_procedure(
+        ARM, PLANT, motion, guesses, settings=short(6), offset=rng.uniform(-0.1, 0.1, (8, 2))
+    )
+    q = np.column_stack([np.zeros(73), np.linspace(-np.pi, np.pi, 73)])
+    true = smallest_eigenvalue(mass_matrix(ARM, q, P4))
+    for P in history.estimates.reshape(-1, 4):
+        assert (smallest_eigenvalue(mass_matrix(ARM, q, P)) <= 2 * true).all()
+    assert (np.diff(history.relative_error(P4), axis=0) < 0).all()
+
+
+def test_one_update_never_raises_the_error(rng):
+    # the same law update by update, at states that no motion links
+    P_hat = P4 * rng.uniform(0.3, 1.3, (500, 4))
+    q, v, q_star = (bound * rng.uniform(-1, 1, (500, 2)) for bound in (np.pi, 5.0, 20.0))
+    Psi = ARM.regressor(q, v, q_star)
+    u = np.einsum("rnc,rc->rn", Psi, P_hat)
+    eta = PLANT.acceleration(q, v, u) - q_star
+    sigma = smallest_eigenvalue(mass_matrix(ARM, q, P_hat))
+    guaranteed = sigma <= 2 * smallest_eigenvalue(mass_matrix(ARM, q, P4))
+    assert guaranteed.sum() > 400
+    after = recursive_update(P_hat, Psi, eta, sigma, np.ones(500, dtype=bool))
+    ratio = np.linalg.norm(after - P4, axis=1) / np.linalg.norm(P_hat - P4, axis=1)
+    assert ratio[guaranteed].max() <= 1.0 + 1e-12
+
+
+def test_prx_falls_as_the_estimate_comes_near():
+    history = run(settings=LoopSettings(iterations=10), offset=DEGREE)
+    assert (np.diff(history.prx[2:, 0]) < 0).all()
+
+
+def test_na_is_the_iteration_in_which_prx_is_zero():
+    history = run(settings=LoopSettings(iterations=20, eps1=25.0), offset=DEGREE)
+    NA = int(history.NA[0])
+    assert len(history.prx) == NA > 1
+    assert history.prx[NA - 1, 0] <= 25.0 < history.prx[NA - 2, 0]
+
+
+def test_one_shot_finds_the_parameters_after_one_run():
+    history = run(settings=short(1, method="one_shot"), offset=DEGREE)
+    np.testing.assert_allclose(history.estimates[-1], [P4], rtol=1e-11)
+
+
+def test_one_shot_says_what_the_motion_leaves_open():
+    still, settings = ProgramMotion(np.zeros(2), 2.0), short(1, method="one_shot")
+    with pytest.raises(RankDeficientError, match=r"^the data excite 0 of 4 base parameters"):
+        run_procedure(ARM, PLANT, still, P4[None], settings=settings)
+
+
+def test_a_ur5_under_gravity_comes_nearer_and_one_shot_arrives(gentle_ur5):
+    model, dynamics, motion = gentle_ur5
+    pi = model.standard_parameters()
+    beta = dynamics.mapping.to_base(pi)
+    plant, guess = RobotPlant(model, pi), 0.8 * beta[None]
+    recursive = run_procedure(
+        dynamics, plant, motion, guess, settings=short(2, updates=60), offset=0.05
+    )
+    error = recursive.relative_error(beta)[:, 0]
+    assert error[2] < error[1] < error[0]
+    once = run_procedure(
+        dynamics, plant, motion, guess,
+        settings=short(1, updates=60, method="one_shot"), offset=np.linspace(-0.2, 0.2, 6),
+    )  # fmt: skip
+    # the motion excites the weakest base parameter 1e4 times less than the strongest
+    np.testing.assert_allclose(once.estimates[-1, 0], beta, atol=1e-8)
+
+
+def test_the_closed_form_arm_and_its_urdf_are_one_plant(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(planar_2r.urdf_text())
+    model = RobotModel.from_urdf(path, terms=())
+    robot = RobotPlant(model, model.standard_parameters())
+    ours, theirs = (
+        run_procedure(ARM, plant, MOTION, P4[None] / 2, settings=short(2, updates=50))
+        for plant in (PLANT, robot)
+    )
+    np.testing.assert_allclose(ours.estimates, theirs.estimates, rtol=1e-9)
+
+
+# --- bounds, disturbance, noise, friction -----------------------------------------------------
+
+
+def test_the_estimate_stays_in_its_bounds():
+    bounds = Bounds(np.array([0.0, 0.0, 0.0, 0.0]), np.array([15.0, 4.0, 10.0, 1.0]))
+    history = run(settings=short(3, bounds=bounds), offset=DEGREE)
+    free = run(settings=short(3), offset=DEGREE)
+    assert (history.estimates >= 0).all()
+    assert (history.estimates <= bounds.upper).all()
+    assert free.estimates.min() < -1.0  # p5 goes there without them
+
+
+def test_a_disturbance_keeps_the_estimate_from_settling(rng):
+    disturbed = Influences(random_torque(0.1, rng))
+    history = run(P4, settings=short(5), influences=disturbed, offset=DEGREE)
+    error = history.relative_error(P4)[1:, 0]
+    assert (error > 1e-4).all()
+    assert (error < 0.1).all()
+    np.testing.assert_array_equal(history.NA, [0])
+
+
+def test_a_constant_torque_is_a_disturbance_too():
+    history = run(P4, settings=short(1), influences=Influences(lambda t, u: np.full_like(u, 5.0)))
+    # eta = D^-1 v; 5 N m on an inertia of about 3 kg m^2, held by beta = 100
+    assert 0.005 < history.tracking.max() < 0.1
+
+
+def test_noise_is_the_same_for_the_same_seed():
+    first, again, other = (
+        run(settings=short(2, eps2=1.0), offset=DEGREE, influences=noise(seed))
+        for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first.estimates, again.estimates)
+    assert np.abs(first.estimates - other.estimates).max() > 1e-6
+
+
+def test_noise_makes_the_smallest_samples_dangerous_and_eps2_leaves_them_out():
+    # at rest on the program Psi is all noise, and (24) divides by its square
+    bare, guarded = (
+        run(P4, settings=short(2, eps2=eps2), influences=noise(1)).relative_error(P4)[-1, 0]
+        for eps2 in (1e-12, 1.0)
+    )
+    assert 10 * guarded < bare  # 0.003 and 0.6
+
+
+def noise(seed):
+    return Influences(q=1e-5, v=1e-4, a=1e-2, rng=np.random.default_rng(seed))
+
+
+def test_drives_are_part_of_the_plant_and_of_the_parameters(ur5):
+    # the last three joints of a UR5 with armature and friction in all of them
+    model = RobotModel.from_urdf(
+        ur5.tree.path, joints=ur5.joints[3:], terms=("armature", "viscous")
+    )
+    pi = truth(model)
+    dynamics = BaseDynamics(model, structural_mapping(model))
+    beta = dynamics.mapping.to_base(pi)
+    history = run_procedure(
+        dynamics,
+        RobotPlant(model, pi),
+        ProgramMotion(np.array([1.0, -0.7, 1.3]), 2.0),
+        beta[None],
+        settings=short(1, substeps=4),
+    )
+    assert history.prx.max() < 1e-9
+
+
+def test_runs_at_once_are_the_runs_one_by_one(rng):
+    A, T = rng.uniform(0.5, 1.5, (3, 2)), rng.uniform(1, 3, 3)
+    guess, gain = P4 * rng.uniform(0.5, 1.5, (3, 4)), rng.uniform(5, 20, 3)
+    settings = short(2, updates=40, alpha=2 * gain, beta=gain**2)
+    together = run_procedure(ARM, PLANT, ProgramMotion(A, T), guess, settings=settings)
+    for r in range(3):
+        settings = short(2, updates=40, alpha=2 * gain[r], beta=gain[r] ** 2)
+        alone = run_procedure(
+            ARM, PLANT, ProgramMotion(A[r], T[r]), guess[r : r + 1], settings=settings
+        )
+        np.testing.assert_allclose(together.estimates[:, r], alone.estimates[:, 0], rtol=1e-10)
+
+
+def test_an_impossible_guess_is_not_updated_and_a_runaway_is_told():
+    # D of -P is negative definite: the control drives the robot away
+    history = run(np.stack([-P4, P4 / 2]), settings=short(2), offset=DEGREE)
+    np.testing.assert_array_equal(history.lost, [1, 0])
+    assert history.skipped[0] > 0 == history.skipped[1]
+    np.testing.assert_array_equal(history.estimates[-1, 0], -P4)
+    alone = run(settings=short(2), offset=DEGREE)
+    np.testing.assert_array_equal(history.estimates[:, 1], alone.estimates[:, 0])
+
+
+def test_a_run_that_is_lost_keeps_its_estimate():
+    history = run(settings=short(2), offset=np.array([2e3, 0.0]))  # [rad]
+    np.testing.assert_array_equal(history.lost, [1])
+    assert len(history.estimates) == 2  # there was nothing left to do
+    np.testing.assert_array_equal(history.estimates[-1], [P4 / 2])
+
+
+def test_the_history_keeps_the_control_when_asked():
+    history = run(settings=short(2, updates=10), keep_torques=True)
+    assert history.torques.shape == (2, 10, 1, 2)
+    assert run(settings=short(1, updates=10)).torques is None
+
+
+# --- errors -----------------------------------------------------------------------------------
+
+
+def test_a_guess_of_another_shape_is_named():
+    with pytest.raises(DataError, match=r"^P0 has shape \(4,\), wanted \(R, 4\)$"):
+        run_procedure(ARM, PLANT, MOTION, P4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"alpha": -1.0}, r"^alpha is -1.0, wanted a positive number$"),
+        ({"iterations": 0}, r"^iterations is 0, wanted a positive number$"),
+        ({"method": "both"}, r"^method is 'both', wanted 'recursive' or 'one_shot'$"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(settings, message):
+    with pytest.raises(SettingsError, match=message):
+        LoopSettings(**settings)
+
+
+def test_noise_without_a_source_is_refused():
+    with pytest.raises(SettingsError, match=r"^sensor noise needs rng, the source of its random"):
+        Influences(q=1e-3)

@@ -1,0 +1,433 @@
+"""The closed-form arm against Pinocchio, the printed definitions and the laws of mechanics."""
+
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.paper.planar_2r import (
+    PAPER_LINKS,
+    PAPER_PARAMETERS,
+    PARAMETER_NAMES,
+    PlanarLinks,
+    mass_matrix,
+    parameters,
+    printed_velocity_coefficient,
+    program_motion,
+    regressor,
+    urdf_text,
+    velocity_vector,
+)
+from robotid.robot.parameters import pseudo_inertia
+
+URDF = Path(__file__).parents[2] / "urdf" / "planar_2r.urdf"
+FORMS = tuple(PARAMETER_NAMES)
+#: Another possible arm, every field unlike the others, so that no term can hide behind a 0 or 1.
+OTHER_LINKS = PlanarLinks(0.7, 0.4, 3.0, -0.3, 0.05, 0.9, 2.0, -0.15, -0.08, 0.3)
+ARMS = pytest.mark.parametrize("links", [PAPER_LINKS, OTHER_LINKS], ids=["paper", "other"])
+
+
+def states(n):
+    """Yield n random states: q in +-pi rad, v in +-10 rad/s, a in +-20 rad/s^2."""
+    rng = np.random.default_rng(0)
+    for _ in range(n):
+        yield tuple(rng.uniform(-bound, bound, 2) for bound in (np.pi, 10.0, 20.0))
+
+
+def mass_matrix_rate(q, v, P, form):
+    """Return dD/dt exactly: D is constant + A cos q2 + B sin q2, so dD/dq2 is a difference."""
+    quarter = np.array([0.0, np.pi / 2])
+    change = mass_matrix(q + quarter, P, form=form) - mass_matrix(q - quarter, P, form=form)
+    return change / 2 * v[1]
+
+
+def invented_power(q, v, P, form):
+    """Return v^T C - v^T (dD/dt) v / 2, the power that no torque supplies; 0 for rigid bodies."""
+    D_rate = mass_matrix_rate(q, v, P, form)
+    return v @ velocity_vector(q, v, P, form=form) - v @ D_rate @ v / 2
+
+
+def stacked_rank(rows):
+    # a column that others span leaves rounding, about 1e-16 of the largest singular value
+    return np.linalg.matrix_rank(np.vstack(rows), rtol=1e-10)
+
+
+# --- corrected form against Pinocchio ---------------------------------------------------------
+
+
+@ARMS
+@pytest.mark.parametrize("form", ["corrected", "corrected_five"])
+def test_corrected_torque_equals_pinocchio(links, form):
+    model = pin.buildModelFromXML(urdf_text(links))
+    data = model.createData()
+    P = parameters(links, form=form)
+    for q, v, a in states(200):
+        tau = pin.rnea(model, data, q, v, a)
+        error = np.linalg.norm(regressor(q, v, a, form=form) @ P - tau)
+        # rounding of terms of up to 1e4 N m in links of about 1 m
+        assert error <= 1e-12 * np.linalg.norm(tau)
+
+
+def test_mass_matrix_and_velocity_vector_equal_pinocchio():
+    model = pin.buildModelFromXML(urdf_text())
+    data = model.createData()
+    P = parameters(PAPER_LINKS)
+    for q, v, _ in states(50):
+        D = pin.crba(model, data, q)
+        np.testing.assert_allclose(mass_matrix(q, P), D, rtol=1e-12)
+        C = pin.nonLinearEffects(model, data, q, v)
+        np.testing.assert_allclose(velocity_vector(q, v, P), C, rtol=1e-12, atol=1e-12)
+
+
+def test_gravity_does_no_work_on_the_arm():
+    model = pin.buildModelFromXML(urdf_text())
+    data = model.createData()
+    for q, _, _ in states(20):
+        np.testing.assert_allclose(pin.computeGeneralizedGravity(model, data, q), 0.0, atol=1e-13)
+
+
+# --- D, C and G say the same ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_mass_matrix_velocity_vector_and_regressor_agree(form):
+    P = np.random.default_rng(1).normal(size=len(PARAMETER_NAMES[form]))
+    for q, v, a in states(50):
+        tau = mass_matrix(q, P, form=form) @ a + velocity_vector(q, v, P, form=form)
+        np.testing.assert_allclose(regressor(q, v, a, form=form) @ P, tau, rtol=1e-12, atol=1e-10)
+
+
+@ARMS
+@pytest.mark.parametrize("form", FORMS)
+def test_mass_matrix_is_that_of_equation_26(links, form):
+    L1, L2, m1, m2 = links.L1, links.L2, links.m1, links.m2
+    m1x, m2x, m2y = m1 * links.xbar1, m2 * links.xbar2, m2 * links.ybar2
+    for q, _, _ in states(20):
+        c2, s2 = np.cos(q[1]), np.sin(q[1])
+        D22 = links.Izz2 + L2**2 * m2 + 2 * L2 * m2x
+        D12 = links.Izz2 + (c2 * L1 * L2 + L2**2) * m2
+        D12 += (c2 * L1 + 2 * L2) * m2x - L1 * s2 * m2y
+        D11 = links.Izz1 + L1**2 * m1 + 2 * L1 * m1x + links.Izz2
+        D11 += (2 * c2 * L1 * L2 + L1**2 + L2**2) * m2
+        D11 += (2 * c2 * L1 + 2 * L2) * m2x - 2 * L1 * s2 * m2y
+        D = mass_matrix(q, parameters(links, form=form), form=form)
+        np.testing.assert_allclose(D, [[D11, D12], [D12, D22]], rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_mass_matrix_is_positive_definite_at_the_papers_parameters(form):
+    P = parameters(PAPER_LINKS, form=form)
+    for q2 in np.linspace(-np.pi, np.pi, 721):
+        D = mass_matrix(np.array([0.3, q2]), P, form=form)
+        assert np.array_equal(D, D.T)
+        assert np.linalg.eigvalsh(D)[0] > 2.8  # [kg m^2], 2.87 at its least
+
+
+# --- the errata -------------------------------------------------------------------------------
+
+
+def test_printed_definitions_give_the_papers_parameters_exactly():
+    np.testing.assert_array_equal(PAPER_PARAMETERS, [22.0, 5.0, 3.0, 2.0, 0.1])
+    printed = parameters(PAPER_LINKS, form="printed")
+    np.testing.assert_allclose(printed, PAPER_PARAMETERS, rtol=1e-15)
+
+
+def test_papers_parameters_cannot_be_overwritten():
+    with pytest.raises(ValueError, match="read-only"):
+        PAPER_PARAMETERS[0] = 0.0
+
+
+@ARMS
+def test_printed_p4_takes_ybar_where_column_4_needs_xbar(links):
+    printed = parameters(links, form="printed")
+    mended = parameters(links, form="corrected_five")
+    difference = links.L1 * links.m2 * (links.ybar2 - links.xbar2)
+    np.testing.assert_allclose(printed - mended, [0, 0, 0, difference, 0], atol=1e-15)
+    np.testing.assert_array_equal(mended[[0, 1, 2, 4]], parameters(links))
+
+
+def test_printed_regressor_is_wrong_in_both_rows_of_column_4_only():
+    for q, v, a in states(50):
+        wrong = regressor(q, v, a, form="printed") - regressor(q, v, a, form="corrected_five")
+        expected = np.zeros((2, 5))
+        expected[:, 3] = np.sin(q[1]) * (v @ v) * np.array([1.0, -1.0])
+        np.testing.assert_allclose(wrong, expected, atol=1e-12)
+
+
+def test_printed_torque_is_off_by_hundreds_of_newton_metres():
+    P_printed, P = parameters(PAPER_LINKS, form="printed"), parameters(PAPER_LINKS)
+    errors = np.array(
+        [
+            regressor(q, v, a, form="printed") @ P_printed - regressor(q, v, a) @ P
+            for q, v, a in states(200)
+        ]
+    )
+    # p4 s2 v1^2 + p3 s2 v2^2 and the like, at most 5 kg m^2 times (10 rad/s)^2
+    assert (np.abs(errors).max(axis=0) > 100.0).all()
+    assert (np.abs(errors).max(axis=0) < 500.0).all()
+
+
+def test_printed_regressor_entry_by_entry():
+    q, v, a = np.array([0.3, np.arctan2(0.6, 0.8)]), np.array([2.0, 3.0]), np.array([5.0, 7.0])
+    # c2 = 0.8, s2 = 0.6, put into the matrix between (26) and (27) by hand
+    row1 = [5, 12, 2 * 0.8 * 5 + 0.8 * 7 - 2 * 0.6 * 6, 0.6 * 4]
+    row1 += [-2 * 0.6 * 5 - 0.6 * 7 - 0.8 * 9 - 2 * 0.8 * 6]
+    row2 = [0, 12, 0.8 * 5, -0.6 * 9, -0.6 * 5 + 0.8 * 4]
+    np.testing.assert_allclose(regressor(q, v, a, form="printed"), [row1, row2], rtol=1e-14)
+
+
+@ARMS
+def test_printed_c122_has_the_wrong_sign_and_c112_is_missing(links):
+    P = parameters(links)
+    for q, v, _ in states(50):
+        h = printed_velocity_coefficient(q, links)
+        v1, v2 = v
+        mended = [-h * v2**2 - 2 * h * v1 * v2, h * v1**2]
+        np.testing.assert_allclose(velocity_vector(q, v, P), mended, rtol=1e-12, atol=1e-11)
+        printed = np.array([h * v2**2, h * v1**2])  # (26) without the undefined C112
+        missing = velocity_vector(q, v, P) - printed
+        np.testing.assert_allclose(missing, [-2 * h * v2 * (v1 + v2), 0.0], atol=1e-11)
+
+
+def test_printed_regressor_contradicts_printed_equation_26_too():
+    P = parameters(PAPER_LINKS, form="printed")
+    q, v = np.array([0.0, np.pi / 2]), np.array([1.0, 0.0])
+    h = printed_velocity_coefficient(q, PAPER_LINKS)
+    np.testing.assert_allclose(h, 3.0)
+    # with only joint 1 moving, (26) loads joint 2 with C211 v1^2 and G loads joint 1 with p4 v1^2
+    np.testing.assert_allclose(velocity_vector(q, v, P, form="printed"), [2.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(velocity_vector(q, v, parameters(PAPER_LINKS)), [0.0, h], atol=1e-15)
+
+
+# --- energy -----------------------------------------------------------------------------------
+
+
+@ARMS
+@pytest.mark.parametrize("form", ["corrected", "corrected_five"])
+def test_corrected_arm_conserves_energy(links, form):
+    P = parameters(links, form=form)
+    for q, v, a in states(50):
+        D = mass_matrix(q, P, form=form)
+        energy_rate = v @ D @ a + v @ mass_matrix_rate(q, v, P, form) @ v / 2
+        power = v @ regressor(q, v, a, form=form) @ P
+        # the terms reach 1e4 W, so 1e-9 is rounding
+        np.testing.assert_allclose(power, energy_rate, rtol=1e-11, atol=1e-9)
+
+
+def test_printed_arm_invents_energy():
+    p3, p4 = PAPER_PARAMETERS[2:4]
+    for q, v, _ in states(50):
+        v1, v2 = v
+        expected = p4 * (v1**3 - v2**3) - p3 * v1 * v2 * (v1 - v2)
+        invented = invented_power(q, v, PAPER_PARAMETERS, "printed")
+        np.testing.assert_allclose(invented, np.sin(q[1]) * expected, rtol=1e-10, atol=1e-9)
+    # more than any rounding: 6.7 W at 1 and 2 rad/s
+    invented = invented_power(
+        np.array([0.0, 1.0]), np.array([1.0, 2.0]), PAPER_PARAMETERS, "printed"
+    )
+    assert abs(invented) > 5.0
+
+
+def test_five_parameters_conserve_energy_only_if_p3_equals_p4():
+    p3, p4 = PAPER_PARAMETERS[2:4]
+    for q, v, _ in states(50):
+        v1, v2 = v
+        invented = invented_power(q, v, PAPER_PARAMETERS, "corrected_five")
+        expected = (p4 - p3) * np.sin(q[1]) * v1 * v2 * (v1 - v2)
+        np.testing.assert_allclose(invented, expected, rtol=1e-10, atol=1e-9)
+
+
+# --- rank -------------------------------------------------------------------------------------
+
+
+def test_four_base_parameters_by_pinocchio():
+    model = pin.buildModelFromXML(urdf_text())
+    data = model.createData()
+    rows = [pin.computeJointTorqueRegressor(model, data, *state).copy() for state in states(50)]
+    assert rows[0].shape == (2, 20)
+    assert stacked_rank(rows) == 4
+
+
+def test_closed_form_columns_span_what_pinocchios_do():
+    model = pin.buildModelFromXML(urdf_text())
+    data = model.createData()
+    both = [
+        np.hstack([pin.computeJointTorqueRegressor(model, data, *state), regressor(*state)])
+        for state in states(50)
+    ]
+    assert stacked_rank(both) == 4
+
+
+@pytest.mark.parametrize(("form", "rank"), [("corrected", 4), ("corrected_five", 5)])
+def test_rank_of_the_corrected_forms(form, rank):
+    # Split, columns 3 (acceleration, v1 v2) and 4 (v1^2, v2^2) are independent of each other; only
+    # their sum is a direction of a rigid arm, so the five columns span one direction too many.
+    assert stacked_rank([regressor(*state, form=form) for state in states(50)]) == rank
+
+
+def test_columns_3_and_4_of_five_add_up_to_column_3_of_four():
+    for state in states(20):
+        five, four = regressor(*state, form="corrected_five"), regressor(*state)
+        np.testing.assert_array_equal(five[:, 2] + five[:, 3], four[:, 2])
+        np.testing.assert_array_equal(five[:, [0, 1, 4]], four[:, [0, 1, 3]])
+
+
+def test_five_columns_find_p3_equal_to_p4_on_a_rigid_arm():
+    model = pin.buildModelFromXML(urdf_text())
+    data = model.createData()
+    W = np.vstack([regressor(*state, form="corrected_five") for state in states(50)])
+    tau = np.concatenate([pin.rnea(model, data, *state).copy() for state in states(50)])
+    P = np.linalg.lstsq(W, tau, rcond=None)[0]
+    np.testing.assert_allclose(P, [22.0, 5.0, 3.0, 3.0, 0.1], rtol=1e-11)
+
+
+# --- URDF -------------------------------------------------------------------------------------
+
+
+def test_urdf_file_is_the_generated_text():
+    assert URDF.read_bytes() == urdf_text().encode()
+
+
+@ARMS
+def test_urdf_keeps_every_digit_and_moves_to_the_proximal_frames(links):
+    robot = ET.fromstring(urdf_text(links))
+    assert [link.get("name") for link in robot.iter("link")] == ["base_link", "link_1", "link_2"]
+    assert [joint.get("name") for joint in robot.iter("joint")] == ["joint_1", "joint_2"]
+    origins = [joint.find("origin").get("xyz").split() for joint in robot.iter("joint")]
+    assert [float(xyz[0]) for xyz in origins] == [0.0, links.L1]
+    coms = [
+        list(map(float, com.get("xyz").split())) for com in robot.iterfind("link/inertial/origin")
+    ]
+    assert coms[0] == [links.L1 + links.xbar1, links.ybar1, 0.0]
+    assert coms[1] == [links.L2 + links.xbar2, links.ybar2, 0.0]
+    assert [float(mass.get("value")) for mass in robot.iter("mass")] == [links.m1, links.m2]
+    assert [float(inertia.get("izz")) for inertia in robot.iter("inertia")] == list(links.central)
+
+
+def test_urdf_of_the_papers_arm_has_the_numbers_of_the_reading():
+    robot = ET.fromstring(urdf_text())
+    coms = [com.get("xyz").split() for com in robot.iterfind("link/inertial/origin")]
+    np.testing.assert_allclose(np.array(coms[0], float), [0.5, 0, 0])
+    np.testing.assert_allclose(np.array(coms[1], float), [1 + 1.1 / 1.9, 0.1 / 1.9, 0], rtol=1e-15)
+    np.testing.assert_allclose(PAPER_LINKS.central, [17.6, 0.25789473684], rtol=1e-10)
+
+
+@ARMS
+def test_urdf_bodies_are_physically_possible(links):
+    model = pin.buildModelFromXML(urdf_text(links))
+    pi = np.concatenate([inertia.toDynamicParameters() for inertia in list(model.inertias)[1:]])
+    for J in pseudo_inertia(pi):
+        assert np.linalg.eigvalsh(J)[0] > 1e-4  # [kg m^2], of 2e-3 and more
+
+
+def test_urdf_has_limits_around_the_program_motion():
+    model = pin.buildModelFromXML(urdf_text())
+    data = model.createData()
+    q, v, a = program_motion(np.linspace(0, 2, 201), np.array([1.0, 1.5]), 2.0)
+    tau = np.array([pin.rnea(model, data, *state).copy() for state in zip(q, v, a, strict=True)])
+    assert (np.abs(q) < model.upperPositionLimit).all()
+    assert (-np.abs(q) > model.lowerPositionLimit).all()
+    assert (np.abs(v) < model.velocityLimit).all()
+    assert (np.abs(tau) < model.effortLimit).all()
+
+
+# --- program motion ---------------------------------------------------------------------------
+
+
+def test_program_motion_goes_from_rest_to_rest():
+    A = np.array([1.0, -1.5])
+    q, v, a = program_motion(np.array([-1.0, 0.0, 1.0, 2.0, 3.0]), A, 2.0)
+    np.testing.assert_allclose(q, np.outer([0, 0, 0.5, 1, 1], A), atol=1e-15)
+    np.testing.assert_allclose(v, np.outer([0, 0, 15 / 16, 0, 0], A), atol=1e-15)
+    np.testing.assert_allclose(a, np.zeros((5, 2)), atol=1e-15)
+
+
+def test_program_motion_has_the_coefficients_of_equation_28():
+    A, T, t = np.array([0.7, 2.0]), 1.6, 0.45
+    shape = 6 / T**5 * t**5 - 15 / T**4 * t**4 + 10 / T**3 * t**3
+    np.testing.assert_allclose(program_motion(t, A, T)[0], A * shape, rtol=1e-14)
+
+
+def test_program_motion_derivatives_match_finite_differences():
+    A, T, h = np.array([1.0, 1.5]), 1.7, 1e-5
+    t = np.linspace(0.1, 1.6, 31)
+    _, v, a = program_motion(t, A, T)
+    (q0, v0, _), (q1, v1, _) = program_motion(t - h, A, T), program_motion(t + h, A, T)
+    # rounding 1e-16 / h and truncation h^2 are both near 1e-10
+    np.testing.assert_allclose((q1 - q0) / (2 * h), v, atol=1e-8)
+    np.testing.assert_allclose((v1 - v0) / (2 * h), a, atol=1e-8)
+
+
+def test_program_motion_takes_one_time_or_many():
+    for shape in ((), (4,), (3, 4)):
+        motion = program_motion(np.full(shape, 0.5), np.ones(2), 1.0)
+        assert [part.shape for part in motion] == [(*shape, 2)] * 3
+
+
+# --- errors -----------------------------------------------------------------------------------
+
+TWO, THREE = np.zeros(2), np.zeros(3)
+SHAPES = {
+    "q has shape (3,), wanted (2,)": lambda: regressor(THREE, TWO, TWO),
+    "v has shape (2, 1), wanted (2,)": lambda: regressor(TWO, np.zeros((2, 1)), TWO),
+    "a has shape (), wanted (2,)": lambda: regressor(TWO, TWO, np.array(0.0)),
+    "P has shape (5,), wanted (4,)": lambda: mass_matrix(TWO, PAPER_PARAMETERS),
+    "P has shape (4,), wanted (5,)": lambda: velocity_vector(
+        TWO, TWO, np.zeros(4), form="corrected_five"
+    ),
+    "q has shape (1,), wanted (2,)": lambda: printed_velocity_coefficient(np.zeros(1), PAPER_LINKS),
+    "amplitude has shape (3,), wanted (2,)": lambda: program_motion(0.0, THREE, 1.0),
+}
+
+
+@pytest.mark.parametrize("message", SHAPES)
+def test_wrong_shapes_are_named(message):
+    with pytest.raises(DataError, match=f"^{re.escape(message)}$"):
+        SHAPES[message]()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda form: parameters(PAPER_LINKS, form=form),
+        lambda form: regressor(TWO, TWO, TWO, form=form),
+        lambda form: mass_matrix(TWO, TWO, form=form),
+        lambda form: velocity_vector(TWO, TWO, TWO, form=form),
+    ],
+)
+def test_unknown_form_is_named(call):
+    message = "form is 'right', wanted one of ['printed', 'corrected_five', 'corrected']"
+    with pytest.raises(SettingsError, match=f"^{re.escape(message)}$"):
+        call("right")
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, np.nan, np.inf])
+def test_duration_must_be_positive(duration):
+    message = f"duration is {duration}, wanted a positive number"
+    with pytest.raises(SettingsError, match=f"^{re.escape(message)}$"):
+        program_motion(0.0, TWO, duration)
+
+
+@pytest.mark.parametrize(
+    "change", [{"L1": 0.0}, {"L2": np.inf}, {"m2": -1.0}, {"xbar1": np.nan}, {"Izz1": 2.5}]
+)
+def test_impossible_links_are_refused(change):
+    with pytest.raises(ModelError, match=r"^lengths, masses and inertias .* must be positive: Pla"):
+        replace(PAPER_LINKS, **change)
+
+
+def test_arguments_stay_unchanged():
+    q, v, a = next(states(1))
+    P = parameters(PAPER_LINKS, form="printed")
+    before = [array.copy() for array in (q, v, a, P)]
+    regressor(q, v, a, form="printed")
+    mass_matrix(q, P, form="printed")
+    velocity_vector(q, v, P, form="printed")
+    program_motion(q, v, 1.0)
+    for array, copy in zip((q, v, a, P), before, strict=True):
+        np.testing.assert_array_equal(array, copy)

@@ -1,0 +1,165 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError, ModelError
+from robotid.identification.pipeline import structural_mapping
+from robotid.paper.planar_2r import urdf_text
+from robotid.regressor.base_parameters import base_mapping
+from robotid.regressor.torque import random_regressor
+from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "base_counts.md"
+ARM = {"panda.urdf": [f"panda_joint{i}" for i in range(1, 8)]}
+COUNTS = {
+    "ur3_robot.urdf": (36, None),
+    "ur5_robot.urdf": (36, None),
+    "ur10_robot.urdf": (36, None),
+    "panda.urdf": (43, None),
+    "xarm7.urdf": (43, None),
+    "talos_full_v2.urdf": (290, 318),
+    "a1.urdf": (68, 94),
+    "go2.urdf": (68, 94),
+    "solo12.urdf": (68, 94),
+    "hyq_no_sensors.urdf": (68, 94),
+    "g1_29dof_rev_1_0.urdf": (189, 213),
+    "tiago_pro.urdf": (195, None),
+    "pr2.urdf": (182, None),
+    "so100.urdf": (36, None),  # two more only through rpy="1.5708" and the like
+}
+
+
+def count(path, **options):
+    model = RobotModel.from_urdf(path, terms=(), **options)
+    return len(structural_mapping(model).K)
+
+
+@pytest.mark.parametrize(("name", "expected"), COUNTS.items(), ids=COUNTS)
+def test_number_of_base_inertial_parameters(name, expected):
+    fixed, floating = expected
+    path = example_urdf(name)
+    assert count(path, joints=ARM.get(name)) == fixed
+    if floating is not None:
+        assert count(path, free_flyer=True) == floating
+
+
+def test_table_of_every_example_robot_is_the_one_in_the_docs():
+    lines = [
+        "| robot | joints | standard | base, fixed | base, floating |",
+        "|---|---|---|---|---|",
+    ]
+    for path in example_urdfs():
+        try:
+            model = RobotModel.from_urdf(path, terms=())
+        except ModelError:
+            continue
+        floating = RobotModel.from_urdf(path, terms=(), free_flyer=True)
+        counts = len(structural_mapping(model).K), len(structural_mapping(floating).K)
+        assert counts[0] <= counts[1] <= floating.layout.n_inertial
+        lines.append(
+            f"| {path.parent.parent.name}/{path.name} | {len(model.joints)} | "
+            f"{model.layout.n_inertial} | {counts[0]} | {counts[1]} |"
+        )
+    assert len(lines) == 2 + 66
+    table = "\n".join(lines) + "\n"
+    if os.environ.get("ROBOTID_WRITE_DOCS"):
+        DOCS.write_text(DOCS.read_text().split("| robot |")[0] + table)
+    assert table in DOCS.read_text()
+
+
+def test_tx40_with_drives_and_the_wrist_coupling(recordings):
+    coupling = Coupling("motor_6", (("joint_5", 1.0), ("joint_6", 1.0)))
+    model = RobotModel.from_urdf(recordings / "tx40" / "robot.urdf", couplings=(coupling,))
+    assert len(structural_mapping(model, inertial_only=True).K) == 36
+    assert len(structural_mapping(model).K) == 61
+
+
+def test_planar_arm_without_and_with_gravity(tmp_path):
+    path = tmp_path / "planar_2r.urdf"
+    path.write_text(urdf_text())
+    assert count(path) == 4
+    assert count(path, gravity=(-9.81, 0.0, 0.0)) == 6
+
+
+def test_armature_adds_what_the_literature_says(ur5, panda):
+    # UR: 36 + 4 = 40, Panda: 43 + 5 = 48, the rest is grouped with link inertias
+    for model, expected in ((ur5, 40), (panda, 48)):
+        arm = RobotModel.from_urdf(model.tree.path, joints=model.joints, terms=("armature",))
+        assert len(structural_mapping(arm).K) == expected
+
+
+def test_base_parameters_carry_all_the_torque(panda, rng):
+    mapping = structural_mapping(panda)
+    W = random_regressor(panda, 40, rng)  # states that the mapping never saw
+    pi = panda.standard_parameters() + rng.standard_normal(len(panda.layout.names))
+    tau = W @ pi
+    error = np.abs(W[:, mapping.independent] @ mapping.to_base(pi) - tau).max()
+    assert error < 1e-11 * np.abs(tau).max()
+
+
+def test_standard_parameters_come_back_from_base_ones(panda, rng):
+    mapping = structural_mapping(panda)
+    prior = panda.standard_parameters()
+    beta = mapping.to_base(prior) + rng.standard_normal(len(mapping.K))
+    for spread in (None, rng.uniform(0.1, 2.0, len(prior))):
+        pi = mapping.to_standard(beta, prior, spread)
+        np.testing.assert_allclose(mapping.to_base(pi), beta, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        mapping.to_standard(mapping.to_base(prior), prior), prior, atol=1e-12
+    )
+
+
+def test_the_choice_of_columns_does_not_depend_on_rounding(ur5):
+    first = structural_mapping(ur5)
+    samples = 2 * len(ur5.layout.names) // ur5.n_rows + 20
+    W = random_regressor(ur5, samples, np.random.default_rng(0))
+    noisy = W * (1 + 1e-14 * np.random.default_rng(1).standard_normal(W.shape))
+    second = base_mapping(
+        noisy,
+        ur5.layout.names,
+        scales=ur5.layout.scales(ur5.length),
+        preference=ur5.layout.preference(),
+    )
+    np.testing.assert_array_equal(first.independent, second.independent)
+
+
+def test_a_column_of_rounding_noise_is_no_parameter():
+    rng = np.random.default_rng(0)
+    W = rng.standard_normal((50, 3)) * [1.0, 1e-16, 2.0]
+    assert base_mapping(W, ("a.m", "b.m", "c.m")).base_names == ("a.m", "c.m")
+
+
+def test_groups_read_like_formulas():
+    rng = np.random.default_rng(0)
+    W = rng.standard_normal((50, 2))
+    W = np.column_stack([W, 0.5 * W[:, 0] - W[:, 1]])
+    mapping = base_mapping(W, ("a.Izz", "b.m", "c.m"), preference=np.array([1.0, 1.0, 0.1]))
+    assert mapping.expressions == ("a.Izz + 0.5 c.m", "b.m - c.m")
+
+
+def test_parameters_that_load_no_joint_are_named(ur5):
+    unidentifiable = structural_mapping(ur5, inertial_only=True).unidentifiable
+    assert "shoulder_link.m" in unidentifiable
+    assert "wrist_3_link.Izz" not in unidentifiable
+
+
+def test_a_regressor_of_another_width_is_refused():
+    with pytest.raises(DataError, match=r"W has shape \(5, 2\), wanted at least 3 rows of 3"):
+        base_mapping(np.ones((5, 2)), ("a", "b", "c"))
+
+
+def test_words_tell_what_stands_alone_in_sums_or_never():
+    # columns a, 2 a + b, 0: of the first and second only sums, of the third nothing
+    W = np.random.default_rng(0).standard_normal((40, 3))
+    columns = np.column_stack([W[:, 0], W[:, 1], W[:, 0] * 2, np.zeros(40), W[:, 2]])
+    mapping = base_mapping(columns, ("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
+    found = mapping.in_words(("l.m", "l.mcx", "l.Ixx", "l.Iyy", "l.Izz"))
+    assert found == {
+        "alone": ("l.mcx", "l.Izz"),
+        "in sums": ("l.m", "l.Ixx"),
+        "never": ("l.Iyy",),
+    }

@@ -1,0 +1,233 @@
+import numpy as np
+import pytest
+import scipy.linalg
+
+from robotid.exceptions import DataError
+from robotid.logs.data import Trajectory
+from robotid.regressor import lapack
+from robotid.regressor.factors import compress, compress_stretches, merge
+from robotid.regressor.problem import Problem, concatenate
+from robotid.regressor.torque import build_problem
+
+
+def make(rng, samples=300, n=3, c=5, block=64, weight=None, support=None):
+    W = rng.standard_normal((samples * n, c))
+    support = np.ones((n, c), dtype=bool) if support is None else support
+    W *= np.tile(support, (samples, 1))
+    tau = rng.standard_normal(samples * n)
+    weight = np.ones(samples * n) if weight is None else weight
+
+    def stream():
+        for k in range(0, samples * n, block * n):
+            part = slice(k, k + block * n)
+            yield W[part], tau[part], weight[part]
+
+    return Problem(stream, tuple("abcde"[:c]), n, support), W, tau
+
+
+def gram(R):
+    return R.T @ R
+
+
+def test_a_factor_has_the_gram_matrix_of_its_rows(rng):
+    problem, W, tau = make(rng)
+    factors = compress(problem)
+    for j in range(3):
+        A = np.column_stack([W, tau])[j::3]
+        np.testing.assert_allclose(gram(factors.R[j]), gram(A), atol=1e-11)
+        np.testing.assert_array_equal(factors.R[j], np.triu(factors.R[j]))
+    np.testing.assert_array_equal(factors.rows, [300, 300, 300])
+
+
+def test_columns_that_a_joint_never_sees_are_left_out(rng):
+    support = np.triu(np.ones((3, 5), dtype=bool))
+    problem, W, tau = make(rng, support=support)
+    factors = compress(problem)
+    for j in range(3):
+        A = np.column_stack([W, tau])[j::3]
+        np.testing.assert_allclose(gram(factors.R[j]), gram(A), atol=1e-11)
+        assert not factors.R[j][:, :5][:, ~support[j]].any()
+
+
+def test_factors_of_two_logs_merge_into_the_factor_of_both(rng):
+    first, second = make(rng)[0], make(rng)[0]
+    merged = merge([compress(first), compress(second)])
+    together = compress(concatenate([first, second]))
+    for a, b in zip(merged.R, together.R, strict=True):
+        np.testing.assert_allclose(gram(a), gram(b), atol=1e-11)
+    np.testing.assert_array_equal(merged.rows, together.rows)
+
+
+def test_selecting_columns_equals_reducing_the_problem(rng):
+    problem = make(rng)[0]
+    columns = np.array([0, 3])
+    selected = compress(problem).select(columns)
+    reduced = compress(problem.select(columns))
+    assert selected.names == reduced.names == ("a", "d")
+    for a, b in zip(selected.R, reduced.R, strict=True):
+        np.testing.assert_allclose(gram(a), gram(b), atol=1e-11)
+
+
+def test_rows_of_weight_zero_are_left_out_and_others_scaled(rng):
+    weight = rng.choice([0.0, 1.0, 4.0], 900)
+    problem, W, tau = make(rng, weight=weight)
+    factors = compress(problem)
+    A = np.column_stack([W, tau])
+    for j in range(3):
+        w = weight[j::3]
+        np.testing.assert_allclose(
+            gram(factors.R[j]), A[j::3].T @ (w[:, None] * A[j::3]), atol=1e-11
+        )
+        assert factors.rows[j] == np.sum(w > 0)
+
+
+def test_weighted_factor_divides_by_the_noise_of_each_joint(rng):
+    problem, W, tau = make(rng)
+    sigma = np.array([0.5, 2.0, 3.0])
+    A = np.column_stack([W, tau]) / np.tile(sigma, 300)[:, None]
+    np.testing.assert_allclose(gram(compress(problem).weighted(sigma)), gram(A), atol=1e-10)
+
+
+def test_residuals_need_no_second_pass(rng):
+    problem, W, tau = make(rng)
+    theta = rng.standard_normal(5)
+    squares = ((tau - W @ theta) ** 2).reshape(-1, 3).sum(axis=0)
+    np.testing.assert_allclose(compress(problem).residual_squares(theta), squares, rtol=1e-11)
+    np.testing.assert_allclose(
+        compress(problem).torque_squares(), (tau**2).reshape(-1, 3).sum(axis=0), rtol=1e-11
+    )
+
+
+def test_poor_excitation_keeps_its_digits(rng):
+    # columns that differ by 1e-7: a Gram matrix would lose their difference altogether
+    direction = rng.standard_normal(300)
+    A = np.column_stack([direction, direction + 1e-7 * rng.standard_normal(300)])
+    exact = Problem(
+        lambda: iter([(A, A @ [1.0, 2.0], np.ones(300))]), ("a", "b"), 1, np.ones((1, 2))
+    )
+    R = compress(exact).R[0]
+    np.testing.assert_allclose(np.linalg.solve(R[:2, :2], R[:2, 2]), [1.0, 2.0], rtol=1e-7)
+
+
+def test_many_blocks_keep_the_digits_of_one_full_qr_on_poor_excitation(rng):
+    # singular values from 1 to 1e-5, over 100 blocks
+    samples, c = 6400, 12
+    Q = np.linalg.qr(rng.standard_normal((samples, c)))[0]
+    A = Q * np.logspace(0, -5, c) @ np.linalg.qr(rng.standard_normal((c, c)))[0]
+    theta = rng.standard_normal(c)
+    tau = A @ theta
+    blocks = [(A[k : k + 64], tau[k : k + 64], np.ones(64)) for k in range(0, samples, 64)]
+    problem = Problem(lambda: iter(blocks), tuple("abcdefghijkl"), 1, np.ones((1, c), dtype=bool))
+    R = compress(problem).R[0]
+    size = np.linalg.norm(theta)
+    by_qr = scipy.linalg.solve_triangular(R[:c, :c], R[:c, c])
+    by_gram = np.linalg.solve(A.T @ A, A.T @ tau)
+    assert np.linalg.norm(by_qr - theta) < 5e-12 * size
+    assert np.linalg.norm(by_gram - theta) > 1e-8 * size  # why there are no Gram matrices
+
+
+def test_scipys_wrapper_gives_the_same_factors(rng, monkeypatch):
+    problem = make(rng, weight=rng.choice([0.0, 1.0], 900))[0]
+    R = compress(problem).R
+    monkeypatch.setattr(lapack, "_dtpqrt", lambda: None)
+    np.testing.assert_allclose(compress(problem).R, R, atol=1e-13)
+
+
+def test_lapack_is_called_by_address():
+    assert lapack._dtpqrt() is not None
+
+
+def test_a_row_that_is_not_finite_is_refused(rng):
+    problem, W, _ = make(rng)
+    W[17, 2] = np.nan
+    with pytest.raises(DataError, match="a row that is not finite"):
+        compress(problem)
+
+
+def test_problems_with_other_columns_do_not_mix(rng):
+    one, other = make(rng)[0], make(rng, c=4)[0]
+    with pytest.raises(DataError, match="problems differ in their columns"):
+        concatenate([one, other])
+    with pytest.raises(DataError, match="factors differ"):
+        merge([compress(one), compress(other)])
+    with pytest.raises(DataError, match="no factors were given"):
+        merge([])
+    with pytest.raises(DataError, match="no problem was given"):
+        concatenate([])
+
+
+def test_samples_are_the_rows_instant_by_instant(rng):
+    problem, W, tau = make(rng)
+    samples = list(problem.samples())
+    assert len(samples) == 300
+    np.testing.assert_array_equal(samples[7].Y, W[21:24])
+    np.testing.assert_array_equal(samples[7].tau, tau[21:24])
+
+
+def test_stretches_merge_into_the_factors_of_the_whole(ur5, rng):
+    t = np.arange(250) / 100.0
+    q, v, a, tau = rng.uniform(-1, 1, (4, 250, 6))
+    motion = Trajectory(t, q, v, a, tau, ur5.joints, 100.0, np.zeros(250, dtype=int))
+    weight = rng.integers(0, 2, (250, 6)).astype(float)
+    problem = build_problem(ur5, motion, weight).select(np.arange(3, 40))
+    stretches = compress_stretches(concatenate([problem, problem]), 100)
+    assert len(stretches) == 6
+    np.testing.assert_array_equal(stretches[1].rows, (weight[100:200] > 0).sum(axis=0))
+    whole, merged = compress(problem), merge(stretches[3:])
+    np.testing.assert_array_equal(merged.rows, whole.rows)
+    for a, b in zip(merged.R, whole.R, strict=True):
+        np.testing.assert_allclose(gram(a), gram(b), rtol=1e-11, atol=1e-9)
+
+
+def test_stretches_need_rows_that_can_be_cut(rng):
+    with pytest.raises(DataError, match="cannot be cut"):
+        compress_stretches(make(rng)[0], 10)
+
+
+def tree_support(kind):
+    """Support of a tree: each joint has the columns of all that it carries."""
+    tree = {
+        "chain": [[1, 1, 1, 1, 1], [0, 1, 1, 1, 1], [0, 0, 0, 1, 1]],
+        "two fingers on a palm": [[1, 1, 1, 1, 1], [0, 1, 1, 0, 0], [0, 0, 0, 1, 1]],
+        "apart": [[1, 1, 0, 0, 0], [0, 0, 1, 0, 1], [0, 0, 0, 1, 0]],
+        "overlapping": [[1, 1, 1, 0, 0], [0, 0, 1, 1, 1], [0, 0, 0, 0, 0]],
+        "alike": [[1, 0, 1, 1, 1]] * 3,
+    }
+    return np.array(tree[kind], dtype=bool)
+
+
+@pytest.mark.parametrize(
+    "kind", ["chain", "two fingers on a palm", "apart", "overlapping", "alike"]
+)
+def test_compact_factors_are_those_of_the_dense_rows(rng, kind):
+    problem, W, tau = make(rng, support=tree_support(kind))
+    factors, A = compress(problem), np.column_stack([W, tau])
+    assert [len(own) for own in factors.columns] == problem.support.sum(axis=1).tolist()
+    sigma = np.array([0.5, 2.0, 3.0])
+    R = factors.weighted(sigma)
+    np.testing.assert_array_equal(R, np.triu(R))
+    np.testing.assert_allclose(gram(R), gram(A / np.tile(sigma, 300)[:, None]), atol=1e-10)
+
+    columns = np.array([4, 0, 2])  # not in order
+    selected, kept = factors.select(columns), A[:, [4, 0, 2, 5]]
+    for j in range(3):
+        np.testing.assert_allclose(gram(selected.R[j]), gram(kept[j::3]), atol=1e-10)
+
+    by_joint = [W[j::3] for j in range(3)]
+    np.testing.assert_allclose(
+        factors.information(sigma),
+        sum(s * W_j.T @ W_j for s, W_j in zip(sigma, by_joint, strict=True)),
+        atol=1e-10,
+    )
+    C = gram(rng.standard_normal((5, 5)))
+    traces = [np.trace(W_j @ C @ W_j.T) for W_j in by_joint]
+    np.testing.assert_allclose(factors.leverages(C), traces, rtol=1e-10)
+
+
+def test_factors_with_other_columns_per_joint_merge(rng):
+    one, W, tau = make(rng, support=tree_support("chain"))
+    other, V, force = make(rng, support=tree_support("apart"))
+    merged = merge([compress(one), compress(other)])
+    for j in range(3):
+        A = np.vstack([np.column_stack([W, tau])[j::3], np.column_stack([V, force])[j::3]])
+        np.testing.assert_allclose(gram(merged.R[j]), gram(A), atol=1e-10)

@@ -1,0 +1,155 @@
+"""Results side by side: what is compared, what is refused, what is said to differ."""
+
+import copy
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.exceptions import DataError
+from robotid.export.result import read_result, write_json
+from robotid.logs.read import write_log
+from robotid.report.comparison import compare_results
+from robotid.report.comparison_page import write_comparison
+from robotid.robot.model import RobotModel
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a.json and b.json: the same logs, fitted as ``consistent`` and as ``wls``."""
+    rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("results")
+    urdf = ROOT / "urdf" / "planar_2r.urdf"
+    arm = RobotModel.from_urdf(urdf)
+    for name in ("first", "second"):
+        write_log(exact_log(arm, truth(arm), rng, samples=800, noise=0.1), path / f"{name}.csv")
+    words = ["identify", str(urdf), str(path / "first.csv"), "--validate", str(path / "second.csv")]
+    for name, estimator in (("a", "consistent"), ("b", "wls")):
+        assert main([*words, "--estimator", estimator, "--out", str(path / name)]) == 0
+        (path / f"{name}.json").write_bytes((path / name / "result.json").read_bytes())
+    return path
+
+
+@pytest.fixture
+def changed(folder, tmp_path):
+    """Return a function that writes b.json with a change and compares a.json with it."""
+
+    def compare(change):
+        result = copy.deepcopy(read_result(folder / "b.json"))
+        change(result)
+        write_json(result, tmp_path / "b.json")
+        return compare_results([folder / "a.json", tmp_path / "b.json"])
+
+    return compare
+
+
+def test_differences_are_in_combined_standard_errors(folder):
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    found = compare_results([folder / "a.json", folder / "b.json"])
+    assert len(found["base_parameters"]) == len(a["base_parameters"])
+    for one, other, entry in zip(
+        a["base_parameters"], b["base_parameters"], found["base_parameters"], strict=True
+    ):
+        s = math.sqrt(one["std_error"] ** 2 + other["std_error"] ** 2)
+        assert entry["differences"] == [pytest.approx((other["value"] - one["value"]) / s)]
+        assert entry["values"] == [one["value"], other["value"]]
+
+
+def test_errors_of_the_same_recording_stand_side_by_side(folder):
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    found = compare_results([folder / "a.json", folder / "b.json"])
+    assert found["remarks"] == []
+    assert found["fitted_alike"]
+    (entry,) = found["validation"]
+    for joint in entry["per_joint"]:
+        assert joint["relative_error_pct"] == [
+            r["validation"][0]["per_joint"][joint["joint"]]["relative_error_pct"] for r in (a, b)
+        ]
+    assert [r["verdict"] for r in found["results"]] == [a["verdict"], b["verdict"]]
+    names = [row["name"] for row in found["settings"]]
+    assert "estimator.name" in names
+    assert not {"identification", "validation", "urdf"} & set(names)
+    assert found["versions"] == []
+    assert all(all(row["in"]) for row in found["inputs"])
+
+
+def test_another_recording_is_not_compared(changed):
+    def other_log(result):
+        result["inputs"][-1]["sha256"] = "0" * 64
+
+    found = changed(other_log)
+    assert found["validation"] == []
+    assert "A was validated on second.csv, which not every result was" in found["remarks"][0]
+    assert "no validation recording is common to all results" in found["remarks"][-1]
+    assert [row["in"] for row in found["inputs"]][:2] == [[True, False], [False, True]]
+
+
+def test_another_window_of_the_same_file_is_another_recording(changed):
+    found = changed(lambda result: result["inputs"][-1].update(start=1.0))
+    assert found["validation"] == []
+
+
+def test_another_filter_is_said(changed):
+    def smoother(result):
+        result["inputs"][-1]["signals"]["cutoff"] = 3.0
+
+    (remark,) = changed(smoother)["remarks"]
+    assert remark.startswith("second.csv was prepared in other ways (cutoff 8 | 3)")
+
+
+def test_other_fitted_recordings_and_versions_are_said(changed):
+    def older(result):
+        result["inputs"][1]["sha256"] = "1" * 64
+        result["versions"]["numpy"] = "1.26.0"
+
+    found = changed(older)
+    assert not found["fitted_alike"]
+    assert [row["name"] for row in found["versions"]] == ["numpy"]
+
+
+def test_other_base_parameters_are_refused_by_name(changed):
+    with pytest.raises(DataError, match=r"a\.json has 1 base parameters that .*b\.json has not: "):
+        changed(lambda result: result["base_parameters"].pop())
+
+    def other_sum(result):
+        result["base_parameters"][0]["expression"] = "2 x"
+
+    with pytest.raises(DataError, match=r"1 base parameters stand for other sums in .* and 2 x; "):
+        changed(other_sum)
+
+
+def test_one_result_is_not_compared(folder):
+    with pytest.raises(DataError, match="compare takes at least two results, found 1"):
+        compare_results([folder / "a.json"])
+
+
+def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
+    folder, tmp_path, capsys
+):
+    paths = [str(folder / "a.json"), str(folder / "b.json")]
+    page = tmp_path / "compare.html"
+    assert main(["compare", *paths, "--out", str(page)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"A  \w+ +consistent .*a\.json\nB  \w+ +wls .*b\.json\n", printed)
+    assert "settings: estimator.name: consistent | wls" in printed
+    html = page.read_text(encoding="utf-8")
+    assert "2 results compared" in html
+    assert "://" not in html
+    assert [p.name for p in tmp_path.iterdir()] == ["compare.html"]
+    assert main(["compare", *paths, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == compare_results(paths)
+    assert main(["compare", paths[0]]) == 1
+    assert "at least two results" in capsys.readouterr().err
+
+
+def test_names_of_files_cannot_inject_markup(folder, tmp_path):
+    path = tmp_path / "<b>x.json"
+    write_json({**read_result(folder / "b.json"), "robot": "<i>r"}, path)
+    write_comparison([folder / "a.json", path], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert "<b>" not in html
+    assert "<i>" not in html

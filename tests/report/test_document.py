@@ -1,0 +1,350 @@
+import os
+import re
+from html import escape
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError
+from robotid.identification.information import information
+from robotid.identification.pipeline import identify
+from robotid.identification.verdict import Finding
+from robotid.logs.data import Log
+from robotid.logs.signals import SignalSettings
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.report.document import write_report
+from robotid.report.page import number, percent
+from robotid.report.plots import stretches, thin
+from robotid.robot.model import RobotModel
+from robotid.versions import versions
+
+NAME = '<b>x</b>"'
+URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;&quot;">
+  <link name="base"/>
+  <link name="upper &lt;arm&gt;"><inertial><origin xyz="0.2 0 0.01"/><mass value="2"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.05"/></inertial></link>
+  <link name="forearm"><inertial><origin xyz="0.1 0.02 0"/><mass value="1"/>
+    <inertia ixx="0.005" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/></inertial></link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper &lt;arm&gt;"/>
+    <axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="3" effort="50"/></joint>
+  <joint name="elbow &amp; &lt;i&gt;$x$" type="continuous"><parent link="upper &lt;arm&gt;"/>
+    <child link="forearm"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/></joint>
+</robot>"""
+VOID = {"meta", "br", "wbr", "link", "img", "input", "hr", "path", "use"}
+
+
+class Reader(HTMLParser):
+    """Collects elements and text, and complains about elements that are not closed."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.elements, self.words = [], [], []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join("".join(self.words).split())
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.elements if name == tag]
+
+
+def make_log(model, seed, *, gap=None, path=""):
+    """Return the exact torques of a sum of sines, with a little noise; rows of the gap missing."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(800) / 100.0
+    w = np.array([[1.0, 1.7], [2.3, 3.1], [4.1, 5.3]])  # [rad/s]
+    A = rng.uniform(0.2, 0.5, w.shape) / w
+    phase = np.einsum("t,hj->thj", t, w) + rng.uniform(0, 6, w.shape)
+    q, v, a = (
+        np.sum(x, axis=1)
+        for x in (A * np.sin(phase), A * w * np.cos(phase), -A * w**2 * np.sin(phase))
+    )
+    pi = model.standard_parameters()
+    pi[: model.layout.n_inertial] *= 1.2
+    pi[model.layout.n_inertial :] = [0.05, 0.4, 0.3, 0.1] * 2
+    tau = (joint_torque_regressor(model, q, v, a) @ pi).reshape(v.shape)
+    tau += 0.01 * rng.standard_normal(tau.shape)
+    kept = np.ones(len(t), dtype=bool)
+    if gap:
+        kept[slice(*gap)] = False
+    return Log(
+        t=t[kept],
+        q=q[kept],
+        tau=tau[kept],
+        v=v[kept],
+        a=a[kept],
+        joints=model.joints,
+        path=path,
+        notes=("column 'gripper <w>' is ignored",),
+    )
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("urdf") / "arm.urdf"
+    path.write_text(URDF)
+    return RobotModel.from_urdf(path)
+
+
+@pytest.fixture(scope="module")
+def found(model):
+    logs = [make_log(model, 1, path="runs/a&b.csv")]
+    kept = [make_log(model, 2, gap=(300, 420), path="runs/<kept>.csv")]
+    return identify(model, logs, validation=kept, signals=SignalSettings(cutoff=10.0))
+
+
+@pytest.fixture(scope="module")
+def html(found, tmp_path_factory):
+    findings = [
+        Finding("a", "note", "x.csv", "a small thing"),
+        Finding("b", "error", "shoulder", "a <grave> thing"),
+    ]
+    folder = tmp_path_factory.mktemp("report")
+    path = write_report(found, folder / "report.html", findings=findings)
+    assert path == folder / "report.html"
+    assert [p.name for p in folder.iterdir()] == ["report.html"]
+    return path.read_text(encoding="utf-8")
+
+
+def test_the_page_is_well_formed_and_fetches_nothing(html):
+    reader = Reader(html)
+    assert "http:" not in html
+    assert "https:" not in html
+    assert not {"script", "link", "img", "iframe", "object", "image"} & {
+        e for e, _ in reader.elements
+    }
+    for tag, attributes in reader.elements:
+        assert "src" not in attributes
+        assert attributes.get("href", "#").startswith("#"), tag
+    targets = re.findall(r"url\(([^)]*)\)", html)
+    assert targets
+    assert all(target.startswith("#") for target in targets)
+    assert len(html) < 3_000_000
+
+
+def test_ids_are_unique_and_every_reference_finds_one(html):
+    elements = Reader(html).elements
+    ids = [attributes["id"] for _, attributes in elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    used = [a["href"][1:] for _, a in elements if "href" in a]
+    used += [a["aria-labelledby"] for _, a in elements if "aria-labelledby" in a]
+    used += re.findall(r"url\(#([^)]*)\)", html)
+    assert set(used) <= set(ids)
+
+
+def test_names_cannot_inject_markup(html):
+    assert NAME not in html
+    for name in ("<b>", "<i>", "<kept>", "<arm>", "<grave>", "<w>"):
+        assert name not in html
+    text = Reader(html).text
+    for name in (NAME, "upper <arm>", "elbow & <i>$x$", "<kept>.csv", "a&b.csv", "gripper <w>"):
+        assert name in text
+
+
+def test_verdict_comes_first_then_how_it_was_made(html, found):
+    text = Reader(html).text
+    order = [f"Verdict: {found.verdict.status}", found.verdict.reasons[0], "cut-off 10 Hz, order 4"]
+    order += ["velocity measured", "Prediction errors", "Torques over time", "Drive parameters"]
+    order += ["Base parameters", "Standard parameters", "total", "Warnings and notes", "SHA-256"]
+    places = [text.index(order[0])]
+    for words in order[1:]:
+        assert words in text[places[-1] :], words
+        places.append(text.index(words, places[-1]))
+
+
+def test_every_joint_has_its_error_its_parameters_and_its_plot(html, found):
+    text = Reader(html).text
+    for joint in found.model.joints:
+        measured = found.validation[0].metrics["estimate"].per_joint[joint]
+        assert f"{joint}: error {percent(measured.relative_error_pct).html} %" in text
+        assert f"{joint}.coulomb" in text
+        assert f"predicted torque and residual of {joint} over time" in text
+    assert text.count("<kept>.csv 0-7.99 s: not fitted") == 2  # table and plots
+    for name in (*found.model.layout.names, *found.mapping.expressions):
+        assert name in text
+
+
+def test_tables_have_captions_scopes_and_a_box_to_scroll_in(html):
+    reader = Reader(html)
+    assert len(reader.all("table")) == len(reader.all("caption")) == html.count('class="scroll"')
+    assert all(attributes["scope"] in ("col", "row") for attributes in reader.all("th"))
+    assert len(reader.all("h1")) == 1
+    for svg in reader.all("svg"):
+        assert svg["role"] == "img"
+        assert svg["aria-labelledby"].endswith("-title")
+
+
+def test_findings_are_ranked_and_notes_of_the_logs_are_added(html):
+    text = Reader(html).text
+    assert text.index("a <grave> thing") < text.index("a small thing")
+    assert text.count("column 'gripper <w>' is ignored") == 2  # one per log
+
+
+def test_findings_stand_in_one_table_per_severity(html):
+    captions = re.findall(r"<caption>([^<]*)</caption>", html)
+    severities = [c for c in captions if re.fullmatch(r"(Errors|Warnings|Notes): \d+", c)]
+    assert severities == ["Errors: 1", "Notes: 3"]  # two of the notes are the logs' own
+
+
+def test_a_note_that_a_finding_tells_is_not_told_again(found, tmp_path):
+    known = [Finding("log_note", "note", "x", "x: column 'gripper <w>' is ignored")]
+    html = write_report(found, tmp_path / "r.html", findings=known).read_text(encoding="utf-8")
+    assert Reader(html).text.count("column 'gripper <w>' is ignored") == 1
+
+
+def test_every_joint_has_its_residual_its_friction_and_bars(html, found):
+    text = Reader(html).text
+    for joint in found.model.joints:
+        assert f"Spectrum and autocorrelation of the residual of {joint}, which falls" in text
+        assert f"Friction of {joint} against speed" in text
+    for term in found.model.layout.terms:
+        assert f"{term} of each drive with error bars" in text
+    assert "\\mathdefault" not in html  # formulas of a logarithmic axis are not set
+    assert "{" not in "".join(re.findall(r"<text[^>]*>([^<]*)</text>", html))
+
+
+def test_the_correlation_map_has_every_name_and_a_cell_per_pair(html, found):
+    figure = html[html.index('<svg class="map"') :].split("</svg>")[0]
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
+    names = [escape(name) for name in found.mapping.base_names]
+    assert texts[::2] == [f"{name} {i}" for i, name in enumerate(names, start=1)]
+    r = information(found).correlation
+    shown = np.abs(np.tril(r, -1)) >= 0.5 / 8  # a shade
+    assert figure.count("h-10z") == shown.sum()
+
+
+def test_excitation_names_the_condition_and_the_strongest_correlation(html, found):
+    text = Reader(html).text
+    assert f"Condition number {found.wls.condition:.3g}; singular values from" in text
+    assert "Correlation of errors" in text
+
+
+def test_the_audit_of_the_mass_matrix_is_shown(html):
+    assert "random poses" in Reader(html).text
+
+
+def test_versions_are_those_that_run(html):
+    text = Reader(html).text
+    for name in ("robotid", "pinocchio", "numpy", "scipy", "clarabel", "python", "platform"):
+        assert f"{name}{versions()[name]}" in text
+    assert versions()["numpy"] == np.__version__
+
+
+def test_a_joint_worse_than_the_urdf_is_flagged(model, tmp_path):
+    log = make_log(model, 1)
+    wrong = make_log(model, 2)
+    exact = joint_torque_regressor(model, wrong.q, wrong.v, wrong.a) @ model.standard_parameters()
+    wrong = Log(
+        t=wrong.t, q=wrong.q, v=wrong.v, tau=exact.reshape(wrong.q.shape), joints=model.joints
+    )
+    found = identify(model, [log], validation=[wrong])
+    text = Reader(write_report(found, tmp_path / "r.html").read_text(encoding="utf-8")).text
+    assert "Verdict: poor" in text
+    assert "worse than the URDF" in text[text.rindex("Prediction errors") :]
+
+
+def test_without_a_validation_log_the_fitted_rows_are_drawn(model, tmp_path):
+    found = identify(model, [make_log(model, 1, path="a.csv")])
+    text = Reader(write_report(found, tmp_path / "r.html").read_text(encoding="utf-8")).text
+    assert "No log was kept apart: these are the fitted logs." in text
+    assert "a.csv 0-7.99 s: fitted" in text
+
+
+def test_lines_are_not_joined_across_a_gap(html, found):
+    trajectory = found.validation[0].recording.trajectory
+    assert trajectory.segment[-1] == 1
+    after = np.flatnonzero(np.diff(trajectory.segment))[0] + 1
+    t, y = thin(trajectory.t, trajectory.tau[:, 0], stretches(trajectory.segment), 200)
+    between = (t > trajectory.t[after - 1]) & (t < trajectory.t[after])
+    assert not between.any()
+    assert np.isnan(t).sum() == np.isnan(y).sum() == 1
+    figure = html[html.index('<title id="tau0-0-title"') :].split("</svg>")[0]
+    measured = re.search(r'<path d="([^"]*)"[^>]*stroke: currentColor; stroke-opacity: 0.6', figure)
+    assert measured
+    assert measured[1].count("M ") == 2
+
+
+def test_rows_left_out_break_the_line():
+    segment = np.array([0, 0, 0, 0, 1, 1])
+    used = np.array([True, True, False, True, True, True])
+    assert stretches(segment, used) == [slice(0, 2), slice(3, 4), slice(4, 6)]
+    assert stretches(segment, ~used) == [slice(2, 3)]
+    assert stretches(segment, np.zeros(6, dtype=bool)) == []
+    t, y = thin(np.arange(6.0), np.arange(6.0), stretches(segment, used), 100)
+    np.testing.assert_array_equal(t, [0, 1, np.nan, 3, np.nan, 4, 5])
+    np.testing.assert_array_equal(y, t)
+
+
+def test_thinning_keeps_every_extreme_and_the_ends(rng):
+    t = np.linspace(0.0, 1.0, 100_000)
+    y = rng.standard_normal(len(t))
+    y[77_777], y[12_345] = 50.0, -50.0
+    short, thinned = thin(t, y, [slice(0, len(t))], 2000)
+    assert len(short) <= 2010
+    assert (thinned.max(), thinned.min()) == (50.0, -50.0)
+    assert (short[0], short[-1]) == (0.0, 1.0)
+    assert (np.diff(short) > 0).all()
+    assert np.isin(thinned, y).all()
+
+
+def test_long_recordings_stay_small(model, tmp_path):
+    log = make_log(model, 1)
+    repeated = Log(
+        t=np.arange(40 * 800) / 100.0,
+        q=np.tile(log.q, (40, 1)),
+        v=np.tile(log.v, (40, 1)),
+        tau=np.tile(log.tau, (40, 1)),
+        joints=model.joints,
+    )
+    signals = SignalSettings(cutoff=None, trim=0.0)
+    found = identify(model, [log], validation=[repeated] * 3, signals=signals)
+    assert write_report(found, tmp_path / "r.html").stat().st_size < 3_000_000
+
+
+def test_the_same_result_gives_the_same_file(found, tmp_path):
+    first = write_report(found, tmp_path / "1.html").read_text(encoding="utf-8")
+    assert write_report(found, tmp_path / "2.html").read_text(encoding="utf-8") == first
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_beside_it(found, tmp_path, monkeypatch):
+    target = tmp_path / "report.html"
+    target.write_text("old")
+
+    def refuse(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OSError, match="disk full"):
+        write_report(found, target)
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_a_missing_folder_is_named(found, tmp_path):
+    with pytest.raises(DataError, match=r"there is no folder '.*nowhere' to write r\.html in"):
+        write_report(found, tmp_path / "nowhere" / "r.html")
+
+
+def test_numbers_that_do_not_exist_are_dashes():
+    assert [number(x).html for x in (None, np.inf, np.nan)] == ["–", "–", "–"]
+    assert [percent(x).html for x in (0.123, 12.34, 1234.5, None)] == ["0.12", "12.3", "1234", "–"]

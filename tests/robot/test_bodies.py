@@ -1,0 +1,28 @@
+import numpy as np
+import pytest
+
+from robotid.robot.bodies import held_parameters, link_places
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+@pytest.mark.parametrize("free_flyer", [False, True])
+@pytest.mark.parametrize("name", ["panda.urdf", "talos_reduced.urdf", "tiago_no_hand.urdf"])
+def test_the_links_of_a_body_add_up_to_it(name, free_flyer):
+    model = RobotModel.from_urdf(example_urdf(name), free_flyer=free_flyer)
+    total = np.zeros((len(model.layout.bodies) + 1, 10))
+    for place in link_places(model):
+        total[place.body] += place.parameters
+    expected = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
+    np.testing.assert_allclose(total[:-1], expected, atol=1e-9)
+
+
+def test_links_behind_a_locked_joint_are_held(panda):
+    role = {place.link: place.role for place in link_places(panda)}
+    assert role["panda_link7"] == "moved"
+    assert role["panda_hand"] == "fixed"
+    assert role["panda_leftfinger"] == "held"
+    fingers = RobotModel.from_urdf(panda.tree.path).tree.inertials["panda_leftfinger"].mass
+    held = held_parameters(panda).reshape(-1, 10)
+    assert held[-1, 0] == pytest.approx(2 * fingers)
+    assert not held[:-1].any()

@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.exceptions import SettingsError
+from robotid.identification.pipeline import identify
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.signals import SignalSettings
+from robotid.robot.geometry import (
+    body_points,
+    box_half_spaces,
+    geometry_half_spaces,
+    hull_half_spaces,
+)
+from robotid.robot.model import RobotModel
+
+URDF = """<robot name="arm">
+<link name="base"/>
+<link name="one"><inertial><mass value="2"/><origin xyz="0 0 0.1"/>
+<inertia ixx=".02" iyy=".02" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>{one}</link>
+<link name="flange"><inertial><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>{flange}</link>
+<joint name="a" type="revolute"><parent link="base"/><child link="one"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+<joint name="b" type="fixed"><parent link="one"/><child link="flange"/>
+<origin xyz="0 0 1" rpy="0 1.5707963267948966 0"/></joint>
+</robot>"""
+BOX = '<collision><origin xyz="0 0 0.5"/><geometry><box size="0.2 0.4 1"/></geometry></collision>'
+CYLINDER = '<visual><geometry><cylinder radius="0.1" length="0.6"/></geometry></visual>'
+SPHERE = '<visual><geometry><sphere radius="0.3"/></geometry></visual>'
+MESH = '<collision><geometry><mesh filename="{}" scale="0.5 1 1"/></geometry></collision>'
+
+
+def arm(tmp_path, one="", flange=""):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF.format(one=one, flange=flange))
+    return RobotModel.from_urdf(path)
+
+
+def extent(model):
+    points = body_points(model)["one"]
+    return points.min(axis=0), points.max(axis=0)
+
+
+def test_shapes_of_links_that_are_fixed_to_each_other_make_one_body(tmp_path):
+    low, high = extent(arm(tmp_path, BOX, CYLINDER))
+    # the flange's cylinder lies along the body's x axis, one metre up
+    np.testing.assert_allclose([low[0], high[0]], [-0.3, 0.3], atol=1e-12)
+    np.testing.assert_allclose([low[1], high[1]], [-0.2, 0.2], atol=1e-12)
+    assert low[2] == pytest.approx(0.0, abs=1e-12)
+    assert 1.1 <= high[2] < 1.103  # a prism around the cylinder, which lies in it all around
+    points = body_points(arm(tmp_path, CYLINDER, CYLINDER))["one"]
+    turn = np.linspace(0.0, 2 * np.pi, 100)
+    around = np.column_stack([np.cos(turn), np.sin(turn)])
+    assert (around @ points[np.abs(points[:, 2]) < 0.4, :2].T).max(axis=1).min() >= 0.1 - 1e-12
+
+
+def test_a_body_whose_link_has_mass_but_no_shape_is_not_bounded(tmp_path):
+    assert body_points(arm(tmp_path, BOX)) == {}
+    with pytest.raises(SettingsError, match=r"no link has geometry in arm\.urdf"):
+        geometry_half_spaces(arm(tmp_path, BOX), "hull")
+    assert geometry_half_spaces(arm(tmp_path, BOX), "none") == {}
+
+
+def test_a_mesh_is_found_beside_the_urdf_and_scaled(tmp_path):
+    import trimesh
+
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([1.0, 2.0, 3.0]).export(tmp_path / "meshes" / "part.stl")
+    for name in ("meshes/part.stl", f"package://{tmp_path.name}/meshes/part.stl"):
+        low, high = extent(arm(tmp_path, MESH.format(name), SPHERE.replace("0.3", "0.01")))
+        np.testing.assert_allclose(high[:2], [0.25, 1.0], atol=1e-6)
+        np.testing.assert_allclose(low, [-0.25, -1.0, -1.5], atol=1e-6)
+    assert body_points(arm(tmp_path, MESH.format("lost.stl"), SPHERE)) == {}
+
+
+def test_half_spaces_hold_every_point_and_touch_the_hull(rng):
+    cube = np.array(np.meshgrid(*[[0.0, 1.0]] * 3)).reshape(3, -1).T
+    cloud = rng.standard_normal((3000, 3))
+    cloud /= np.linalg.norm(cloud, axis=1)[:, None]  # its hull has thousands of faces
+    for points in (cube, cloud):
+        for A, b in (box_half_spaces(points), hull_half_spaces(points)):
+            slack = b[:, None] - A @ points.T
+            assert slack.min() > -1e-9
+            np.testing.assert_allclose(slack.min(axis=1), 0.0, atol=1e-9)
+            assert len(b) <= 100
+    A, b = hull_half_spaces(cube)
+    assert len(b) == 6
+    A, b = hull_half_spaces(cube * [1.0, 1.0, 0.0])
+    assert len(b) == 6
+
+
+def test_the_centres_of_mass_of_a_real_arm_stay_in_its_meshes(ur5, rng):
+    noise = 20 * np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])
+    log = exact_log(ur5, truth(ur5), rng, noise=noise)
+    settings = EstimatorSettings(prior_weight=0.01, constraints={"com_within": "hull"})
+    exact = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+    found = identify(ur5, [log], signals=exact, estimator=settings)
+    free = identify(ur5, [log], signals=exact, estimator=EstimatorSettings(prior_weight=0.01))
+    spaces = geometry_half_spaces(ur5, "hull")
+    assert set(spaces) == set(ur5.layout.bodies)
+
+    def beyond(pi):
+        bodies = pi[:60].reshape(-1, 10)
+        return max(
+            float((A @ (bodies[i, 1:4] / bodies[i, 0]) - b).max())
+            for i, (A, b) in enumerate(spaces[name] for name in ur5.layout.bodies)
+        )
+
+    assert beyond(free.standard) > 0.02
+    assert beyond(found.standard) < 1e-6

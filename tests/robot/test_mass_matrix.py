@@ -1,0 +1,112 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.estimators.consistent.solvers import SOLVERS
+from robotid.export.result import build_result
+from robotid.identification.findings import consistency_findings
+from robotid.identification.pipeline import identify
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.signals import SignalSettings
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.examples import example_urdf
+from robotid.robot.mass_matrix import check_mass_matrix, joint_mass_matrices
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+
+
+def test_it_is_what_accelerations_cost_armatures_and_couplings_included(rng):
+    # tau(q, 0, a) - tau(q, 0, 0) = M a
+    coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -2.0)))
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), terms=("armature", "offset"), couplings=(coupling,)
+    )
+    pi, q = truth(model), rng.uniform(-2, 2, (3, 6))
+    pi[-1] = 0.3
+    M = joint_mass_matrices(model, pi, q)
+    still, a = np.zeros_like(q), rng.standard_normal(q.shape)
+    torque = [
+        (joint_torque_regressor(model, q, still, x) @ pi).reshape(q.shape) for x in (a, still)
+    ]
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", M, a), torque[0] - torque[1], atol=1e-10)
+
+
+def test_poses_stay_within_the_limits_and_the_share_is_counted(ur5):
+    pi = ur5.standard_parameters()
+    good = check_mass_matrix(ur5, pi, poses=300)
+    assert good.is_positive
+    assert good.positive_share == 1.0
+    oracle = []
+    rng = np.random.default_rng(0)
+    low, high = (np.array([getattr(j, side) for j in ur5.limits]) for side in ("lower", "upper"))
+    data = ur5.pin_model.createData()
+    for q in rng.uniform(low, high, (300, 6)):
+        M = pin.crba(ur5.pin_model, data, q)
+        oracle.append(np.linalg.eigvalsh(np.triu(M) + np.triu(M, 1).T)[0])
+    assert good.smallest_eigenvalue == pytest.approx(min(oracle))
+    pi[1:4] += 0.0
+    pi[10] = -5.0  # the upper arm lifts itself
+    pi[14:20] = 0.0
+    bad = check_mass_matrix(ur5, pi, poses=300)
+    assert bad.smallest_eigenvalue < 0
+    assert 0.0 <= bad.positive_share < 1.0
+    assert not bad.is_positive
+
+
+def test_a_floating_base_has_one_too():
+    model = RobotModel.from_urdf(example_urdf("solo12.urdf"), free_flyer=True)
+    assert check_mass_matrix(model, model.standard_parameters(), poses=20).is_positive
+
+
+def test_the_result_states_it_and_a_finding_says_if_it_fails(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100, noise=5 * NOISE)
+    consistent = identify(ur5, [log], signals=EXACT)
+    stated = build_result(consistent, {})["consistency"]["mass_matrix"]
+    assert stated["poses"] == 10_000
+    assert stated["positive_share"] == 1.0
+    assert stated["smallest_eigenvalue"] > 0
+    assert [f.code for f in consistency_findings(consistent)] == []
+    wls = identify(ur5, [log], signals=EXACT, estimator="wls")
+    (finding,) = consistency_findings(wls)
+    assert finding.code == "mass_matrix"
+    assert "not positive definite at" in finding.message
+
+
+def test_the_second_solver_and_active_bounds_are_reported(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
+    settings = EstimatorSettings(check=True, constraints={"mass": {"forearm_link": [9.0, 20.0]}})
+    found = identify(ur5, [log], signals=EXACT, estimator=settings)
+    check = found.estimate.details["check"]
+    assert check["solver"] == "scs"
+    assert check["torque_difference"] < 1e-4
+    assert abs(check["objective_difference"]) < 1e-5
+    (finding,) = consistency_findings(found)
+    # no motion shows a single mass: only the URDF minds
+    assert (finding.code, finding.severity) == ("bound_binds", "note")
+    assert "['mass forearm_link'] bind: the URDF's values lie beyond them" in finding.message
+
+
+def test_a_second_solver_that_fails_is_reported_with_its_status(ur5, rng, monkeypatch):
+    def stall(A, d, *rest):
+        return np.zeros(len(d)), "InsufficientProgress", 3
+
+    monkeypatch.setitem(SOLVERS, "scs", stall)
+    log = exact_log(ur5, truth(ur5), rng, noise=10 * NOISE)
+    found = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(check=True))
+    (finding,) = consistency_findings(found)
+    assert finding.code == "second_solver_failed"
+    assert "InsufficientProgress" in finding.message
+
+
+def test_both_solvers_lead_to_the_same_result(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, noise=10 * NOISE)
+    one, other = (
+        identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(solver=solver))
+        for solver in ("clarabel", "scs")
+    )
+    assert "SCS: Solved" in other.estimate.message
+    np.testing.assert_allclose(other.base, one.base, atol=1e-4 * np.abs(one.base).max())

@@ -1,0 +1,177 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.exceptions import ModelError
+from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.model import RobotModel
+
+TWO_JOINTS = """<robot name="two">
+  <link name="base"/>
+  <link name="upper"><inertial><mass value="2"/><origin xyz="0.1 0 0"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><mass value="1"/><origin xyz="0.2 0 0"/>
+    <inertia ixx="0.05" iyy="0.05" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="10" velocity="2"/></joint>
+  <joint name="elbow" type="{kind}"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0.5 0 0"/><axis xyz="{axis}"/>{more}</joint>
+</robot>"""
+
+
+def write(tmp_path, kind="revolute", axis="0 1 0", more="", change=lambda text: text):
+    path = tmp_path / "two.urdf"
+    path.write_text(change(TWO_JOINTS.format(kind=kind, axis=axis, more=more)))
+    return path
+
+
+def test_every_example_robot_with_a_joint_opens_and_the_others_are_refused():
+    refused = {}
+    for path in example_urdfs():
+        try:
+            RobotModel.from_urdf(path)
+            RobotModel.from_urdf(path, free_flyer=True)
+        except ModelError as error:
+            refused[path.name] = str(error)
+    assert len(example_urdfs()) - len(refused) == 66
+    assert set(refused) == {"ur3.urdf", "quadrotor_base.urdf", "iris_simple.urdf"}
+    assert "<robot> has no name" in refused["ur3.urdf"]
+    assert "has no movable joint" in refused["iris_simple.urdf"]
+
+
+def test_standard_parameters_are_pinocchios_inertias(ur5):
+    reference = pin.buildModelFromUrdf(ur5.tree.path)
+    expected = np.concatenate([i.toDynamicParameters() for i in list(reference.inertias)[1:]])
+    np.testing.assert_array_equal(ur5.standard_parameters()[:60], expected)
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis"),
+    [("revolute", "0 1 0"), ("continuous", "0 0 1"), ("prismatic", "1 2 3"), ("revolute", "1 2 3"),
+     ("continuous", "1 1 0")],
+)  # fmt: skip
+def test_every_kind_of_joint_has_one_coordinate(tmp_path, kind, axis):
+    model = RobotModel.from_urdf(write(tmp_path, kind, axis))
+    q = np.array([[0.3, 0.7], [0.1, -2.0]])
+    configurations = model.configurations(q)
+    assert configurations.shape == (2, model.pin_model.nq)
+    neutral = pin.neutral(model.pin_model)
+    for row, configuration in zip(q, configurations, strict=True):
+        np.testing.assert_allclose(
+            configuration, pin.integrate(model.pin_model, neutral, row), atol=1e-15
+        )
+
+
+def test_joints_come_in_the_order_asked_for(tmp_path):
+    path = write(tmp_path, more='<limit lower="-2" upper="3" effort="1" velocity="1"/>')
+    forward = RobotModel.from_urdf(path)
+    backward = RobotModel.from_urdf(path, joints=["elbow", "shoulder"])
+    assert backward.joints == ("elbow", "shoulder")
+    assert [limit.upper for limit in backward.limits] == [3, 1]
+    q = np.array([[0.3, 0.7]])
+    np.testing.assert_array_equal(forward.configurations(q), backward.configurations(q[:, ::-1]))
+
+
+def test_locked_joints_are_lumped_where_they_stand(tmp_path):
+    path = write(tmp_path)
+    model = RobotModel.from_urdf(path, joints=["shoulder"], locked={"elbow": np.pi / 2})
+    m, mcx, _, mcz = model.standard_parameters()[:4]
+    assert m == 3
+    assert mcx == pytest.approx(2 * 0.1 + 1 * 0.5)  # the lower link hangs straight down
+    assert mcz == pytest.approx(-0.2)
+    assert dict(model.locked) == {"elbow": np.pi / 2}
+
+
+def test_a_mimic_joint_moves_with_its_leader_when_coupled(tmp_path):
+    path = write(tmp_path, more='<mimic joint="shoulder" multiplier="-2" offset="0.5"/>')
+    independent = RobotModel.from_urdf(path)
+    coupled = RobotModel.from_urdf(path, mimic="coupled")
+    assert coupled.joints == ("shoulder",)
+    np.testing.assert_allclose(
+        coupled.configurations(np.array([[0.3]])),
+        independent.configurations(np.array([[0.3, -0.1]])),
+    )
+    with pytest.raises(ModelError, match="joint 'elbow' mimics another one and moves with it"):
+        RobotModel.from_urdf(path, mimic="coupled", joints=["elbow"])
+    with pytest.raises(ModelError, match="one cannot be locked while the other moves"):
+        RobotModel.from_urdf(path, joints=["shoulder"])
+
+
+def test_a_floating_base_comes_first(tmp_path):
+    model = RobotModel.from_urdf(write(tmp_path), free_flyer=True)
+    assert model.n_rows == 8
+    assert model.row_names[:6] == tuple(f"base.{c}" for c in ("fx", "fy", "fz", "mx", "my", "mz"))
+    assert model.layout.bodies == ("base", "upper", "lower")
+    assert model.row_units == ("N",) * 3 + ("N m",) * 5
+
+
+def test_changed_parameters_stay_out_of_the_original(ur5):
+    before = ur5.standard_parameters()
+    other = ur5.with_parameters(before * 1.5)
+    np.testing.assert_array_equal(ur5.standard_parameters(), before)
+    np.testing.assert_allclose(other.standard_parameters()[:60], 1.5 * before[:60])
+
+
+BAD = {
+    "no joint of that name": (
+        dict(joints=["elbow2"]),
+        "joint 'elbow2' is not in two.urdf; joints: ['shoulder', 'elbow']. Did you mean 'elbow'?",
+    ),
+    "identified and locked": (
+        dict(joints=["elbow"], locked={"elbow": 0.0}),
+        "joints ['elbow'] are both identified and locked",
+    ),
+    "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted 'independent' or 'coupled'"),
+    "gravity of two numbers": (dict(gravity=(0, 9.81)), "wanted three finite numbers"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), BAD.values(), ids=BAD)
+def test_a_wrong_request_names_what_is_wrong(tmp_path, options, message):
+    with pytest.raises(ModelError) as caught:
+        RobotModel.from_urdf(write(tmp_path), **options)
+    assert message in str(caught.value)
+
+
+FAULTS = {
+    "NaN mass": ('value="2"', 'value="nan"', "link 'upper': inertial mass is 'nan'"),
+    "negative mass": ('value="2"', 'value="-2"', "link 'upper': inertial mass is -2 kg, wanted"),
+    "text for a number": ('ixx="0.1"', 'ixx="0,1"', "link 'upper': inertial ixx is '0,1'"),
+    "two numbers in xyz": ('"0.5 0 0"', '"0.5 0"', "joint 'elbow': origin xyz is '0.5 0'"),
+    "no axis": ('axis xyz="0 1 0"', 'axis xyz="0 0 0"', "axis xyz is zero"),
+    "planar joint": ('type="revolute"', 'type="planar"', "has type 'planar'"),
+    "unknown link": ('parent link="upper"', 'parent link="uper"', "has the parent link 'uper'"),
+    "two roots": ('<link name="base"/>', '<link name="base"/><link name="x"/>', "one root link"),
+    "twice the same link": ('name="upper"', 'name="lower"', "two links are named 'lower'"),
+    "no mass": ('<mass value="2"/>', "", "needs both <mass> and <inertia>"),
+    "no XML": ("</robot>", "", "is not well-formed XML"),
+    "unknown encoding": ("<robot", '<?xml version="1.0" encoding="klingon"?><robot', "well-formed"),
+    "not a robot": ("robot", "sdf", "the top element is <sdf>, wanted <robot>"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "message"), FAULTS.values(), ids=FAULTS)
+def test_a_faulty_urdf_names_its_fault(tmp_path, old, new, message):
+    path = write(tmp_path, change=lambda text: text.replace(old, new))
+    with pytest.raises(ModelError) as caught:
+        RobotModel.from_urdf(path)
+    assert message in str(caught.value)
+
+
+def test_what_the_dynamics_do_not_use_cannot_stop_a_model(tmp_path):
+    def spoil(text):
+        more = '<dynamics friction="-1" damping="-2"/><visual><geometry><mesh filename="no"/>'
+        return text.replace("</joint>", more + "</geometry></visual></joint>", 1)
+
+    assert RobotModel.from_urdf(write(tmp_path, change=spoil)).joints == ("shoulder", "elbow")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ModelError, match=r"there is no URDF file '.*none.urdf'"):
+        RobotModel.from_urdf(tmp_path / "none.urdf")
+
+
+def test_an_example_robot_is_found_by_name():
+    assert example_urdf("panda.urdf").is_file()
+    with pytest.raises(ModelError, match=r"example-robot-data has no 'panda7.urdf'"):
+        example_urdf("panda7.urdf")

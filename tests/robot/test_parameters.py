@@ -1,0 +1,75 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from robotid.exceptions import DataError, SettingsError
+from robotid.robot.parameters import (
+    INERTIAL_TERMS,
+    Coupling,
+    ParameterLayout,
+    from_paper_order,
+    inertial_from_pseudo_inertia,
+    pseudo_inertia,
+    to_paper_order,
+)
+
+
+def test_order_is_pinocchios():
+    inertia = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([1.0, 1.1, 1.2]))
+    pi = dict(zip(INERTIAL_TERMS, inertia.toDynamicParameters(), strict=True))
+    moved = inertia.matrix()[3:, 3:]  # inertia about the frame's origin
+    assert pi["m"] == 2.0
+    assert pi["mcy"] == pytest.approx(0.4)
+    assert pi["Iyy"] == pytest.approx(moved[1, 1])
+    assert pi["Ixz"] == pytest.approx(moved[0, 2])
+
+
+def test_paper_order_is_that_of_equation_9():
+    pi = np.arange(20.0)
+    P = to_paper_order(pi)
+    # [Ixx Ixy Ixz Iyy Iyz Izz mx my mz m]
+    np.testing.assert_array_equal(P[:10], [4, 5, 7, 6, 8, 9, 1, 2, 3, 0])
+    np.testing.assert_array_equal(from_paper_order(P), pi)
+
+
+def test_pseudo_inertia_is_pinocchios(rng):
+    for _ in range(20):
+        inertia = pin.Inertia.Random()
+        pi = inertia.toDynamicParameters()
+        expected = pin.PseudoInertia.FromInertia(inertia).toMatrix()
+        np.testing.assert_allclose(pseudo_inertia(pi)[0], expected, atol=1e-14)
+        np.testing.assert_allclose(inertial_from_pseudo_inertia(expected), pi, atol=1e-14)
+
+
+def test_an_incomplete_body_is_refused():
+    with pytest.raises(DataError, match=r"10 per body, but the shape is \(13,\)"):
+        pseudo_inertia(np.zeros(13))
+
+
+def test_names_and_units_follow_the_layout():
+    layout = ParameterLayout(
+        bodies=("arm", "rod"),
+        joints=("elbow", "slide"),
+        couplings=(Coupling("motor", (("elbow", 1.0), ("slide", 2.0))),),
+        prismatic=frozenset({"slide"}),
+    )
+    assert len(layout.names) == 20 + 8 + 3
+    unit = dict(zip(layout.names, layout.units, strict=True))
+    assert unit["arm.m"] == "kg"
+    assert unit["arm.mcy"] == "kg m"
+    assert unit["rod.Ixy"] == "kg m^2"
+    assert unit["elbow.viscous"] == "N m s/rad"
+    assert unit["slide.armature"] == "kg"
+    assert unit["slide.coulomb"] == "N"
+    assert "motor.offset" not in unit
+    assert layout.is_nonnegative().sum() == 3 * 3
+
+
+def test_a_coupling_of_an_unknown_joint_is_refused():
+    with pytest.raises(SettingsError, match=r"coupling 'motor' names the joints \['wrist'\]"):
+        ParameterLayout(("a",), ("elbow",), couplings=(Coupling("motor", (("wrist", 1.0),)),))
+
+
+def test_an_unknown_drive_term_is_refused():
+    with pytest.raises(SettingsError, match=r"unknown drive terms \['stiction'\]"):
+        ParameterLayout(("a",), ("elbow",), terms=("stiction",))

@@ -1,0 +1,55 @@
+import re
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError, SettingsError
+from robotid.paper import planar_2r
+from robotid.simulation.program import ProgramMotion
+
+
+def test_a_motion_of_seven_joints_has_the_coefficients_of_equation_28():
+    A, q0, T, t = np.arange(1.0, 8.0), np.full(7, 0.3), 1.6, 0.45
+    shape = 6 / T**5 * t**5 - 15 / T**4 * t**4 + 10 / T**3 * t**3
+    np.testing.assert_allclose(ProgramMotion(A, T, q0).evaluate(t)[0], q0 + A * shape, rtol=1e-14)
+
+
+def test_its_derivatives_match_finite_differences():
+    motion, h = ProgramMotion(np.array([1.0, -2.0, 0.5]), 1.7), 1e-5
+    t = np.linspace(0.1, 1.6, 31)
+    _, v, a = motion.evaluate(t)
+    (q0, v0, _), (q1, v1, _) = motion.evaluate(t - h), motion.evaluate(t + h)
+    # rounding 1e-16 / h and truncation h^2 are both near 1e-10
+    np.testing.assert_allclose((q1 - q0) / (2 * h), v, atol=1e-8)
+    np.testing.assert_allclose((v1 - v0) / (2 * h), a, atol=1e-8)
+
+
+def test_many_motions_at_once_are_the_motions_one_by_one(rng):
+    A, T, t = rng.normal(size=(4, 3)), rng.uniform(1, 3, 4), rng.uniform(0, 1, 4)
+    together = ProgramMotion(A, T).evaluate(t)
+    for r in range(4):
+        alone = ProgramMotion(A[r], T[r]).evaluate(t[r])
+        for many, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(many[r], one)
+
+
+def test_the_planar_arm_has_the_same_program():
+    t, A = np.linspace(-1, 3, 9), np.array([1.0, 1.5])
+    for ours, planar in zip(
+        ProgramMotion(A, 2.0).evaluate(t), planar_2r.program_motion(t, A, 2.0), strict=True
+    ):
+        np.testing.assert_array_equal(ours, planar)
+
+
+ERRORS = {
+    "amplitude has shape (), wanted (n,) or (R, n), finite": (DataError, (np.array(1.0), 1.0)),
+    "duration has shape (3,), wanted () or (4,)": (DataError, (np.ones((4, 2)), np.ones(3))),
+    "duration is 0.0, wanted a positive number": (SettingsError, (np.ones(2), 0.0)),
+}
+
+
+@pytest.mark.parametrize("message", ERRORS)
+def test_what_cannot_be_a_motion_is_named(message):
+    error, arguments = ERRORS[message]
+    with pytest.raises(error, match=f"^{re.escape(message)}$"):
+        ProgramMotion(*arguments)

@@ -1,0 +1,256 @@
+import os
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.replay_data import shown
+
+from robotid.exceptions import DataError, SettingsError
+from robotid.robot.model import RobotModel
+from robotid.viewer.replays import Bands, Mark, Torques, replay, write_replay
+
+URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
+  <link name="base"/><link name="turner"/><link name="slider"/><link name="tip"/>
+  <joint name="turn/1" type="continuous"><parent link="base"/><child link="turner"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 0 1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="turner"/><child link="slider"/>
+    <origin xyz="0.4 0 0" rpy="0.3 0 0"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="1" velocity="1" effort="9"/></joint>
+  <joint name="mount" type="fixed"><parent link="slider"/><child link="tip"/>
+    <origin xyz="0 0 0.2"/></joint>
+</robot>"""
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    path = tmp_path_factory.mktemp("urdf") / "arm.urdf"
+    path.write_text(URDF)
+    return RobotModel.from_urdf(path)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    t = 5.0 + np.arange(201) / 100.0
+    return t, np.column_stack([4.0 * (t - 5.0), 0.5 * (t - 5.0) ** 2 / 4])
+
+
+@pytest.fixture(scope="module")
+def page(arm, motion, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("replay")
+    path = write_replay(arm, *motion, folder / "replay.html")
+    assert path == folder / "replay.html"
+    assert [p.name for p in folder.iterdir()] == ["replay.html"]
+    return path.read_text(encoding="utf-8")
+
+
+def world_poses(nodes, moved):
+    """Return the world pose of every node but the first, as the page's script poses them."""
+    poses = [pin.SE3.Identity()]
+    for node in nodes[1:]:
+        rest = pin.SE3(pin.Quaternion(np.array(node["quaternion"])), np.array(node["position"]))
+        axis, by = np.array(node["axis"]), float(moved[node["column"]])
+        if node["kind"] == "turn":
+            rest = rest * pin.SE3(pin.exp3(axis * by), np.zeros(3))
+        elif node["kind"] == "slide":
+            rest = rest * pin.SE3(np.eye(3), axis * by)
+        else:
+            turn = pin.Quaternion(np.array(moved[3:7], dtype=float)).normalized()
+            rest = pin.SE3(turn, np.array(moved[:3], dtype=float))
+        poses.append(poses[node["parent"]] * rest)
+    return poses[1:]
+
+
+def test_the_page_fetches_nothing_and_cannot_be_injected(page):
+    outside = re.sub(r"<(script|style)\b.*?</\1>", "", page, flags=re.DOTALL)
+    assert set(re.findall(r'(?:src|href)="([^"]*)"', outside)) == {"data:,"}
+    assert "connect-src" not in outside
+    assert "default-src 'none'" in outside
+    assert "<b>x</b>" not in page
+    assert "<title>&lt;b&gt;x&lt;/b&gt;: replay</title>" in outside
+    assert page.count("</script>") == 4
+    assert shown(page)["title"] == "<b>x</b>"
+    assert "MeshCat.Viewer" in page
+
+
+def test_text_from_files_stays_text(arm, motion):
+    bad = "</script><img src=x onerror=alert(1)>"
+    marks = [Mark(5.5, bad, "payload")]
+    html = replay(arm, *motion, marks=marks, notes=[bad], ghost=(bad, *motion)).html
+    assert "<img" not in html
+    assert html.count("</script>") == 4
+    data = shown(html)
+    assert (data["marks"][0]["label"], data["ghost"]["label"]) == (bad, bad)
+    assert data["marks"][0]["t"] == pytest.approx(0.5)
+
+
+def test_keyframes_have_the_true_times_at_the_rate(page):
+    times = shown(page)["motion"]["t"]
+    assert (times[0], times[-1]) == (0.0, pytest.approx(2.0))
+    assert np.diff(times).max() <= 1 / 30 + 0.0101
+    assert 55 <= len(times) <= 63
+
+
+def test_every_keyframe_is_the_robot_s_pose(arm, motion, page):
+    t, q = motion
+    data = shown(page)
+    times, moved = data["motion"]["t"], data["motion"]["q"]
+    pinned = arm.pin_model.createData()
+    for k in (0, 17, len(times) - 1):
+        row = int(np.argmin(np.abs(t - t[0] - times[k])))
+        pin.forwardKinematics(arm.pin_model, pinned, arm.configurations(q)[row])
+        poses = world_poses(data["scene"]["nodes"], moved[k])
+        for pose, true in zip(poses, list(pinned.oMi)[1:], strict=True):
+            # keyframes are single precision
+            np.testing.assert_allclose(pose.homogeneous, true.homogeneous, atol=1e-6)
+
+
+def test_a_joint_that_turns_freely_turns_on_between_keyframes(arm, motion):
+    t, q = motion
+    wrapped = q.copy()
+    wrapped[:, 0] = np.angle(np.exp(1j * q[:, 0]))
+    moved = shown(replay(arm, t, wrapped).html)["motion"]["q"]
+    np.testing.assert_allclose(moved[-1, 0] - moved[0, 0], 8.0, atol=1e-5)
+
+
+def test_links_reach_from_joint_to_joint_and_to_the_tip(page):
+    parts = shown(page)["scene"]["parts"]
+    links = [p for p in parts if p["shape"] == "cylinder" and p["colour"] in ("#9aa7b4", "#4a5560")]
+    tall = [p["size"][1] for p in links if p["size"][1] > 0.05]
+    np.testing.assert_allclose(tall, [0.3, 0.4, 0.2], atol=1e-6)
+
+
+def test_a_floating_base_moves(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    model = RobotModel.from_urdf(path, free_flyer=True)
+    t = np.linspace(0.0, 1.0, 11)
+    q = np.zeros((11, 9))
+    q[:, 0], q[:, 2], q[:, 7] = t, 0.5, 0.3
+    q[:, 5:7] = np.column_stack([np.sin(t / 2), np.cos(t / 2)])
+    q[5:, 3:7] *= -1  # the same turn, written in the other of two ways
+    data = shown(write_replay(model, t, q, tmp_path / "r.html").read_text(encoding="utf-8"))
+    base, turner, _ = world_poses(data["scene"]["nodes"], data["motion"]["q"][-1])
+    np.testing.assert_allclose(base.translation, [1.0, 0.0, 0.5], atol=1e-6)
+    np.testing.assert_allclose(pin.log3(base.rotation), [0.0, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(pin.log3(turner.rotation), [0.0, 0.0, 1.3], atol=1e-6)
+    steps = np.diff(data["motion"]["q"][:, 3:7], axis=0)
+    assert np.abs(steps).max() < 0.1
+
+
+def test_torques_are_plotted_with_gaps_and_by_the_name_of_who_predicts(arm, motion):
+    t, q = motion
+    t = np.where(t > 6.0, t + 1.0, t)
+    ours = Torques(t, q + 1.0, {"fit": q})
+    data = shown(replay(arm, t, q, torques=ours).html)["torques"]
+    assert data["labels"] == ["measured", "fit"]
+    assert [j["name"] for j in data["joints"]] == ["turn/1", "slide"]
+    assert [j["unit"] for j in data["joints"]] == ["N m", "N"]
+    assert [j["node"] for j in data["joints"]] == [1, 2]
+    holes = np.flatnonzero(np.isnan(data["values"][:, 0]))
+    assert len(holes) == 1
+    assert 1.0 < data["t"][holes[0]] < 2.0
+    residual = np.delete(data["values"][:, :2] - data["values"][:, 2:], holes, axis=0)
+    np.testing.assert_allclose(residual, 1.0, atol=1e-5)
+
+
+def test_a_gap_of_the_log_is_marked(arm, motion):
+    t, q = motion
+    t = np.where(t > 6.0, t + 1.0, t)
+    (mark,) = shown(replay(arm, t, q).html)["marks"]
+    assert (mark["kind"], mark["label"]) == ("gap", "gap of 1.01 s")
+    assert mark["t"] == pytest.approx(1.0)
+
+
+def test_masses_are_told_per_link_and_label(ur5):
+    pi = ur5.standard_parameters()
+    after = pi.copy()
+    after[:10] = 0.0
+    t = np.arange(3) / 10.0
+    page = replay(ur5, t, np.zeros((3, 6)), masses={"URDF": pi, "found": after}).html
+    before, found = shown(page)["masses"]
+    assert (before["label"], found["label"]) == ("URDF", "found")
+    assert [b["name"] for b in before["bodies"]] == list(ur5.layout.bodies)
+    assert [b["mass"] for b in before["bodies"]] == pytest.approx(pi[:60:10])
+    assert (found["bodies"][0]["fault"], found["bodies"][0]["semi_axes"]) == ("no mass", None)
+
+
+def test_parameters_over_time_come_with_their_errors(arm, motion):
+    t, q = motion
+    bands = Bands(t, ["turner.m", "slider.m"], ["kg", "kg"], q, 0.1 * q)
+    data = shown(replay(arm, t, q, bands=bands).html)["bands"]
+    assert data["names"] == ["turner.m", "slider.m"]
+    np.testing.assert_allclose(data["values"][-1], [*q[-1], *(0.1 * q[-1])], rtol=1e-6)
+
+
+def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(arm, motion):
+    from html import unescape
+
+    shown_as = replay(arm, *motion)
+    cell = shown_as._repr_html_()
+    assert 'sandbox="allow-scripts"' in cell
+    inside = re.search(r'srcdoc="([^"]*)"', cell)[1]
+    assert unescape(inside) == shown_as.html
+
+
+def test_a_long_motion_of_seven_joints_stays_below_20_mb(panda, tmp_path):
+    t = np.arange(200_000) / 100.0
+    q = np.sin(t)[:, None] * np.ones(7)
+    assert write_replay(panda, t, q, tmp_path / "r.html").stat().st_size < 20e6
+
+
+def test_no_process_no_socket_and_no_output_is_left(arm, motion, tmp_path, capfd, monkeypatch):
+    import subprocess
+
+    import zmq
+
+    def refuse(*_, **__):
+        raise AssertionError("a server was started")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    monkeypatch.setattr(zmq.Context, "socket", refuse)
+    write_replay(arm, *motion, tmp_path / "r.html")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_beside_it(arm, motion, tmp_path, monkeypatch):
+    target = tmp_path / "r.html"
+    target.write_text("old")
+
+    def refuse(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OSError, match="disk full"):
+        write_replay(arm, *motion, target)
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda t, q: (t[:5], q),
+            r"t has shape \(5,\) and q \(201, 2\), wanted \(N,\) and \(N, n\)",
+        ),
+        (lambda t, q: (t[:1], q[:1]), "the motion has 1 samples, wanted at least 2 to play"),
+        (lambda t, q: (t, q[:, :1]), r"q has shape \(201, 1\), wanted \(N, 2\)"),
+        (lambda t, q: (t, q * np.nan), "t or q holds values that are not finite"),
+        (lambda t, q: (np.r_[t[:9], t[8:-1]], q), r"t must increase, but t\[9\] = 5.08 s follows"),
+    ],
+)
+def test_what_does_not_fit_is_refused(arm, motion, tmp_path, change, message):
+    with pytest.raises(DataError, match=message):
+        write_replay(arm, *change(*motion), tmp_path / "r.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rate_that_is_not_positive_is_refused(arm, motion, tmp_path):
+    with pytest.raises(SettingsError, match=r"rate is 0\.0, wanted a positive number"):
+        write_replay(arm, *motion, tmp_path / "r.html", rate=0.0)
+
+
+def test_a_missing_folder_is_named(arm, motion, tmp_path):
+    with pytest.raises(DataError, match=r"there is no folder '.*nowhere' to write r\.html in"):
+        write_replay(arm, *motion, tmp_path / "nowhere" / "r.html")

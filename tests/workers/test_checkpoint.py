@@ -1,0 +1,109 @@
+"""Finished pieces are kept whole, found again by name, and never used for other inputs."""
+
+import logging
+
+import pytest
+from helpers.piecework import marks, pieces_in, reduce_all, same_bits
+
+from robotid.exceptions import DataError
+from robotid.workers.checkpoint import Checkpoint
+
+INPUTS = {"robotid": "0.1", "signals": {"cutoff": 8.0, "order": 4}, "logs": [{"size": 10}]}
+
+
+def interrupted(tmp_path, count=6, after=3):
+    """Return pieces of which the first few are in a checkpoint."""
+    pieces = pieces_in(tmp_path / "marks", count)
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
+    for k, reduction in enumerate(reduce_all(pieces[:after])):
+        checkpoint.save(k, pieces[k].name, reduction)
+    return pieces
+
+
+def test_only_missing_pieces_are_reduced_and_progress_starts_where_it_stood(tmp_path):
+    pieces = interrupted(tmp_path)
+    calls = []
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
+    found = reduce_all(pieces, checkpoint=checkpoint, progress=lambda *call: calls.append(call[1]))
+    assert calls == [303, 406, 510, 615]
+    assert marks(tmp_path / "marks") == dict.fromkeys(range(6), 1)
+    assert all(map(same_bits, found, reduce_all(pieces_in(tmp_path / "other", 6))))
+    checkpoint.remove()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["marks", "other"]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "words"),
+    [
+        (INPUTS | {"signals": {"cutoff": 6.0, "order": 4}}, "signals.cutoff was 8.0, is 6.0"),
+        (INPUTS | {"logs": [{"size": 11}]}, r"logs\[0\].size was 10, is 11"),
+        (INPUTS | {"robotid": "0.2"}, "robotid was '0.1', is '0.2'"),
+        (INPUTS | {"gravity": 9.8}, "gravity was None, is 9.8"),
+    ],
+)
+def test_a_checkpoint_of_other_inputs_is_refused_by_name(tmp_path, inputs, words):
+    pieces = interrupted(tmp_path)
+    with pytest.raises(DataError, match=words) as caught:
+        Checkpoint.open(tmp_path, inputs, pieces, resume=True)
+    assert "run without --resume" in str(caught.value)
+    assert len(Checkpoint.open(tmp_path, INPUTS, pieces, resume=True).finished()) == 3
+
+
+def test_other_pieces_are_other_inputs(tmp_path):
+    pieces = interrupted(tmp_path)
+    with pytest.raises(DataError, match="checkpoint of other inputs: pieces was"):
+        Checkpoint.open(tmp_path, INPUTS, pieces[:-1], resume=True)
+
+
+def test_a_file_of_another_run_is_refused(tmp_path):
+    pieces = interrupted(tmp_path)
+    other = Checkpoint.open(tmp_path / "elsewhere", INPUTS | {"x": 1}, pieces)
+    other.save(4, pieces[4].name, reduce_all(pieces[4:5])[0])
+    (other.folder / "piece-000004.npz").rename(
+        tmp_path / ".robotid-checkpoint" / "piece-000004.npz"
+    )
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
+    with pytest.raises(DataError, match=r"piece-000004.npz belongs to other inputs; delete it"):
+        reduce_all(pieces, checkpoint=checkpoint)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip"])
+def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
+    pieces = interrupted(tmp_path)
+    path = tmp_path / ".robotid-checkpoint" / "piece-000001.npz"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 255
+    path.write_bytes(content if damage == "flip" else content[: len(content) // 2])
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
+    with pytest.raises(DataError, match=r"piece-000001.npz cannot be read .* delete it"):
+        reduce_all(pieces, checkpoint=checkpoint)
+
+
+def test_half_a_file_is_never_taken_for_a_piece(tmp_path):
+    pieces = interrupted(tmp_path)
+    folder = tmp_path / ".robotid-checkpoint"
+    (folder / "piece-000005.partial").write_bytes(b"PK")
+    assert sorted(Checkpoint.open(tmp_path, INPUTS, pieces, resume=True).finished()) == [0, 1, 2]
+
+
+def test_without_resume_an_unfinished_run_is_replaced_and_that_is_said(tmp_path, caplog):
+    pieces = interrupted(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
+    assert "holds an unfinished run, which is replaced" in caplog.text
+    assert checkpoint.finished() == frozenset()
+    assert [path.name for path in checkpoint.folder.iterdir()] == ["inputs.json"]
+
+
+def test_nothing_to_resume_is_said(tmp_path, caplog):
+    pieces = pieces_in(tmp_path / "marks", 2)
+    with caplog.at_level(logging.WARNING):
+        Checkpoint.open(tmp_path / "new", INPUTS, pieces, resume=True)
+    assert "nothing to resume, starting anew" in caplog.text
+
+
+def test_a_kept_piece_has_the_same_bits(tmp_path):
+    pieces = interrupted(tmp_path)
+    kept = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
+    fresh = reduce_all(pieces[:3])
+    assert all(same_bits(kept.load(k), fresh[k]) for k in range(3))

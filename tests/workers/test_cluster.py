@@ -1,0 +1,98 @@
+"""A real Dask cluster with worker processes: the same bits, also when workers are killed."""
+
+import os
+
+import pytest
+from helpers.piecework import marks, pieces_in, reduce_all, reduced, same_bits, workers_of
+
+from robotid.exceptions import DataError, WorkerError
+from robotid.workers import cluster
+from robotid.workers.cluster import ClusterBackend
+from robotid.workers.pieces import join
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def address():
+    """The address of a cluster with two workers, each a process of its own."""
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        silence_logs=50,
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def test_a_cluster_reduces_to_the_same_bits(address, tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 12, pause=0.02)
+    calls = []
+    with ClusterBackend(address) as backend:
+        found = reduce_all(pieces, backend=backend, progress=lambda *call: calls.append(call))
+    assert marks(tmp_path / "marks") == dict.fromkeys(range(12), 1)
+    assert len(workers_of(tmp_path / "marks") - {os.getpid()}) == 2
+    serial = reduce_all(pieces)
+    assert all(map(same_bits, found, serial))
+    assert same_bits(join(found), join(serial))
+    total = sum(piece.samples for piece in pieces)
+    assert (calls[0][1], calls[-1][1]) == (0, total)
+
+
+def test_a_worker_killed_in_the_middle_loses_nothing_and_counts_nothing_twice(address, tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 12, pause=0.05, faults={5: "kill once"}.items())
+    with ClusterBackend(address) as backend:
+        found = reduce_all(pieces, backend=backend)
+    assert len(reduced(pieces[5])) == 2
+    assert join(found).samples == sum(piece.samples for piece in pieces)
+    serial = reduce_all(pieces_in(tmp_path / "other", 12))
+    assert all(map(same_bits, found, serial))
+    assert same_bits(join(found), join(serial))
+
+
+def test_an_error_of_the_data_comes_home_with_piece_and_host(address, tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 4, faults={2: "data"}.items())
+    with pytest.raises(DataError, match="row 7 is not finite") as caught:
+        reduce_all(pieces, backend=ClusterBackend(address))
+    assert caught.value.code == "not_finite"
+    assert "while working on random rows 2" in caught.value.__notes__
+
+
+def test_a_worker_that_cannot_read_says_so_with_host_and_path(address, tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 2, faults={1: "missing"}.items())
+    with pytest.raises(FileNotFoundError, match=r"/no/such/log\.csv") as caught:
+        reduce_all(pieces, backend=ClusterBackend(address))
+    host = reduced(pieces[1])[0].read_text()
+    assert any(f"worker's host {host!r}" in note for note in caught.value.__notes__)
+    assert any("under the same path" in note for note in caught.value.__notes__)
+
+
+def test_workers_with_another_robotid_are_refused(address, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "__version__", "99.0.0")
+    with pytest.raises(WorkerError, match=r"workers must run robotid 99.0.0, but .* has 0\."):
+        reduce_all(pieces_in(tmp_path / "marks", 2), backend=ClusterBackend(address))
+    assert marks(tmp_path / "marks") == {}
+
+
+def allow_failures(address, number):
+    with distributed.Client(address, set_as_default=False) as client:
+        client.run_on_scheduler(
+            lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", number)
+        )
+
+
+def test_a_piece_that_kills_every_worker_is_named(address, tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 2, faults={1: "kill"}.items())
+    allow_failures(address, 0)
+    try:
+        with pytest.raises(WorkerError, match="lost every worker that worked on random rows 1"):
+            reduce_all(pieces, backend=ClusterBackend(address))
+    finally:
+        allow_failures(address, 3)
+
+
+def test_no_scheduler_is_said(tmp_path):
+    backend = ClusterBackend("tcp://127.0.0.1:9", patience=0.2)
+    with pytest.raises(WorkerError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'"):
+        reduce_all(pieces_in(tmp_path / "marks", 2), backend=backend)

@@ -1,0 +1,190 @@
+"""Who reduces pieces never shows in the result; what goes wrong is said by name."""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.piecework import marks, pieces_in, reduce_all, same_bits, workers_of
+
+from robotid.exceptions import (
+    DataError,
+    MissingDependencyError,
+    NotConvergedError,
+    RankDeficientError,
+    SettingsError,
+    WorkerError,
+)
+from robotid.regressor.factors import available_cores
+from robotid.workers.pieces import Reduction, join
+from robotid.workers.processes import ProcessBackend, choose_workers
+
+SCRIPT = Path(__file__).with_name("piecework.py")
+
+
+def is_running(pid):
+    """Return whether a process lives; one that only waits to be reaped does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def eventually(condition, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def start(folder, workers, *words):
+    command = [sys.executable, str(SCRIPT), str(folder), str(workers), *words]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def kept(folder):
+    return sorted((folder / ".robotid-checkpoint").glob("*.npz"))
+
+
+def test_the_number_of_workers_does_not_show_in_the_bits(tmp_path):
+    pieces = pieces_in(tmp_path / "marks")
+    calls = []
+    serial = reduce_all(pieces, progress=lambda *call: calls.append(call))
+    for workers in (1, 2):
+        with ProcessBackend(workers) as backend:
+            found = reduce_all(pieces, backend=backend)
+        assert all(map(same_bits, found, serial))
+        assert same_bits(join(found), join(serial))
+    assert marks(tmp_path / "marks") == dict.fromkeys(range(10), 3)
+    assert os.getpid() in workers_of(tmp_path / "marks")
+    total = sum(piece.samples for piece in pieces)
+    assert calls[0] == ("reducing", 0, total, "samples")
+    assert calls[-1] == ("reducing", total, total, "samples")
+    assert len(calls) == 11
+
+
+def test_two_workers_work_at_the_same_time(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 2, faults={0: "meet", 1: "meet"}.items())
+    with ProcessBackend(2) as backend:
+        reduce_all(pieces, backend=backend)
+
+
+def test_workers_wait_for_more_work_and_end_when_they_are_let_go(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 4)
+    with ProcessBackend(1) as backend:
+        once, again = (reduce_all(pieces, backend=backend) for _ in range(2))
+        (worker,) = workers_of(tmp_path / "marks")
+        assert is_running(worker)
+    assert not is_running(worker)
+    assert all(map(same_bits, once, again))
+
+
+def test_reductions_come_back_in_the_order_of_the_pieces(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 4)
+    late = [type(pieces[0])(0, pieces[0].marks, pause=0.5), *pieces[1:]]
+    with ProcessBackend(2) as backend:
+        found = reduce_all(late, backend=backend)
+    assert [r.samples for r in found] == [100, 101, 102, 103]
+
+
+@pytest.mark.parametrize("backend", [None, ProcessBackend(2)])
+def test_an_error_of_the_data_keeps_its_type_and_names_the_piece(tmp_path, backend):
+    pieces = pieces_in(tmp_path / "marks", faults={3: "data"}.items())
+    with pytest.raises(DataError, match="row 7 is not finite") as caught:
+        reduce_all(pieces, backend=backend)
+    assert caught.value.code == "not_finite"
+    assert "while working on random rows 3" in caught.value.__notes__
+
+
+def test_a_worker_that_is_killed_is_an_error_that_names_what_was_under_way(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", faults={2: "kill"}.items())
+    with pytest.raises(WorkerError, match="worker process ended in the middle") as caught:
+        reduce_all(pieces, backend=ProcessBackend(2))
+    assert "random rows 2" in str(caught.value)
+    assert eventually(lambda: not any(map(is_running, workers_of(tmp_path / "marks"))))
+
+
+def test_what_stops_the_caller_ends_the_workers(tmp_path):
+    def stop(what, done, total, unit):
+        if done:
+            raise KeyboardInterrupt
+
+    pieces = pieces_in(tmp_path / "marks", 40, pause=0.1)
+    with pytest.raises(KeyboardInterrupt):
+        reduce_all(pieces, backend=ProcessBackend(2), progress=stop)
+    done = len(marks(tmp_path / "marks"))
+    assert done < 10
+    assert not any(map(is_running, workers_of(tmp_path / "marks")))
+
+
+@pytest.mark.parametrize(
+    ("number", "workers"), [(signal.SIGKILL, 1), (signal.SIGKILL, 2), (signal.SIGINT, 2)]
+)
+def test_a_run_that_was_killed_resumes_to_the_same_bits(tmp_path, number, workers):
+    run = start(tmp_path, workers)
+    assert eventually(lambda: len(kept(tmp_path)) >= 3)
+    run.send_signal(number)
+    run.communicate(timeout=10)
+    assert eventually(lambda: not any(map(is_running, workers_of(tmp_path / "marks"))))
+    assert not (tmp_path / "joined.npz").exists()
+    finished = {int(path.stem[-6:]) for path in kept(tmp_path)}
+    assert 3 <= len(finished) < 10
+    before = marks(tmp_path / "marks")
+    again = start(tmp_path, 1, "resume")
+    assert again.communicate(timeout=20)[1] == ""
+    after = marks(tmp_path / "marks")
+    assert {seed for seed in after if after[seed] > before.get(seed, 0)} == set(
+        range(10)
+    ) - finished
+    with np.load(tmp_path / "joined.npz") as arrays:
+        resumed = Reduction.from_arrays(arrays)
+    assert same_bits(resumed, join(reduce_all(pieces_in(tmp_path / "other"))))
+    assert not (tmp_path / ".robotid-checkpoint").exists()
+
+
+def test_ctrl_c_in_a_terminal_reaches_the_workers_too_and_shows_one_traceback(tmp_path):
+    run = start(tmp_path, 2)
+    assert eventually(lambda: len(kept(tmp_path)) >= 1)
+    os.killpg(run.pid, signal.SIGINT)
+    error = run.communicate(timeout=10)[1]
+    assert error.count("Traceback") == 1  # of the script; workers say nothing
+    assert "KeyboardInterrupt" in error
+    assert error.strip().endswith(".robotid-checkpoint: --resume uses them")
+
+
+def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
+    short = pieces_in(tmp_path / "marks")
+    assert choose_workers(short) == 1
+    assert choose_workers(short, 3) == 3
+    assert choose_workers(short, 30) == 10
+    assert choose_workers(short * 500) == available_cores()
+    with pytest.raises(SettingsError, match="workers is 0, wanted at least 1"):
+        choose_workers(short, 0)
+    with pytest.raises(SettingsError, match="workers is 0, wanted at least 1"):
+        ProcessBackend(0)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        DataError("no", "gap"),
+        RankDeficientError(3, ["a.m"], 4),
+        NotConvergedError("no", "stalled"),
+        MissingDependencyError("reading", "pyarrow", "parquet"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_errors_travel_between_processes_with_their_facts(error):
+    error.add_note("while reducing a")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)
