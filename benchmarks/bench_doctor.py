@@ -26,8 +26,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
 
+from robotid.commands.doctor import examine
 from robotid.commands.job import Job, LogEntry, read_job
-from robotid.doctor.diagnosis import diagnose, examine
+from robotid.doctor.diagnosis import diagnose
 from robotid.logs.formats import write_columns
 from robotid.logs.signals import SignalSettings
 from robotid.robot.examples import example_urdf

@@ -21,7 +21,7 @@ import numpy as np
 from bench_figaroh import compare
 from setting import ROBOTS, full_qr, identify, machine, motion, peak_memory, robot, side_by_side
 
-from robotid.identification.pipeline import structural_mapping
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.compiled import is_installed
 
 README = Path(__file__).parents[1] / "README.md"

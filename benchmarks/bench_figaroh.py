@@ -170,10 +170,10 @@ def robotid(compiled):
     """Return robotid's identification, its prediction and its version."""
     from setting import identify, robot
 
-    from robotid import __version__
-    from robotid.identification.pipeline import structural_mapping
     from robotid.logs.data import Trajectory
+    from robotid.regressor.base_parameters import structural_mapping
     from robotid.regressor.torque import joint_torque_regressor
+    from robotid.versions import __version__
 
     model = robot("panda")
 

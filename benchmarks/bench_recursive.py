@@ -21,9 +21,9 @@ import scipy
 import robotid
 from robotid.estimators import PRX, RLS, Kalman, NormalisedGradient, fold
 from robotid.estimators.recursive.descent import column_scale
-from robotid.identification.pipeline import structural_mapping
 from robotid.logs.data import Trajectory
 from robotid.online.identifier import OnlineIdentifier
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.problem import Problem, Sample
 from robotid.regressor.torque import (
     InstantRegressor,

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from setting import ROBOTS, machine, motion, robot, rows_of, side_by_side
 
-from robotid.identification.pipeline import structural_mapping
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.lapack import Triangle
 from robotid.regressor.torque import build_problem
 

@@ -23,7 +23,8 @@ import scipy.signal
 
 from robotid.logs.data import Log
 from robotid.simulation.motions import random_fourier
-from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.pipeline import identify
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.logs.signals import SignalSettings

@@ -14,8 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.estimators import WLS
-from robotid.identification.pipeline import structural_mapping
 from robotid.logs.data import Trajectory
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem
 from robotid.robot.examples import example_urdf

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from robotid.report.document import write_report
     from robotid.robot.model import RobotModel
     from robotid.robot.parameters import Coupling
+    from robotid.versions import __version__
     from robotid.viewer.replays import replay
-
-__version__ = "0.1.0"
 
 __all__ = [
     "OLS",
@@ -69,6 +68,7 @@ _HOMES = {
     "logs.signals": ["SignalSettings"],
     "logs.units": ["LogUnits"],
     "export.urdf": ["write_urdf"],
+    "versions": ["__version__"],
     "viewer.replays": ["replay"],
 }
 

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from robotid import __version__
 from robotid.commands.console import (
     print_comparison,
     print_error,
@@ -28,6 +27,7 @@ from robotid.commands.flags import (
 from robotid.commands.progress import terminal_progress
 from robotid.commands.work_flags import add_progress_flags, add_verbose_flag, add_work_flags
 from robotid.exceptions import RobotIdError, SettingsError
+from robotid.versions import __version__
 
 if TYPE_CHECKING:
     from robotid.commands.job import Job
@@ -224,7 +224,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _track(options: argparse.Namespace) -> None:
-    from robotid.online.tracking import run_track
+    from robotid.commands.track import run_track
 
     job = job_from_flags(options)
     if options.serve is not None:
@@ -272,7 +272,7 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
-    from robotid.viewer.server import serve_track
+    from robotid.commands.track import serve_track
 
     def announce(url: str) -> None:
         print(f"live: {url}  (Ctrl-C ends it)", file=sys.stderr, flush=True)
@@ -290,7 +290,8 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from robotid.doctor.diagnosis import alarming, examine, findings_to_dict
+    from robotid.commands.doctor import examine
+    from robotid.doctor.diagnosis import alarming, findings_to_dict
 
     job = job_from_flags(options)
     findings = examine(job)

@@ -3,9 +3,9 @@
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-from robotid import __version__
+__all__ = ["__version__", "versions"]
 
-__all__ = ["versions"]
+__version__ = "0.1.0"
 
 _PACKAGES = {"pinocchio": "pin", "numpy": "numpy", "scipy": "scipy", "clarabel": "clarabel"}
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from robotid._files import file_sha256
 from robotid.commands.job import Job
-from robotid.export.result import file_sha256
 from robotid.workers.task import versions
 
 __all__ = ["checkpoint_inputs"]

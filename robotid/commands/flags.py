@@ -72,10 +72,10 @@ def add_source_flags(flags: "argparse._ActionsContainer") -> None:
 
 
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of a :class:`robotid.logs.table.LogSource` that were given.
+    """Return the settings of a ``LogSource`` that were given.
 
     Args:
-        options: The flags, those of :func:`add_source_flags` among them.
+        options: The flags, those of ``add_source_flags`` among them.
 
     Returns:
         The settings by name.
@@ -88,7 +88,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
     """Return the job that a command line names or describes.
 
     Args:
-        options: The flags, those of :func:`add_job_flags` among them.
+        options: The flags, those of ``add_job_flags`` among them.
 
     Returns:
         The job.
@@ -146,7 +146,7 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
     """Refuse the flags that say how logs are read.
 
     Args:
-        options: The flags, those of :func:`add_log_flags` among them.
+        options: The flags, those of ``add_log_flags`` among them.
         why: What is in their place.
 
     Raises:

@@ -10,21 +10,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from robotid._files import write_json
 from robotid.commands.checkpoint_inputs import checkpoint_inputs
 from robotid.commands.job import Job
-from robotid.commands.logs import is_long, survey_logs
+from robotid.commands.logs import examine_locked, is_long, survey_logs
 from robotid.doctor.diagnosis import alarming, diagnose
-from robotid.doctor.locked_joints import check_locked
 from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
-from robotid.export.result import build_result, write_json
+from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
+from robotid.findings import Finding
 from robotid.identification.doubts import doubts_of
 from robotid.identification.findings import consistency_findings
 from robotid.identification.long_recordings import LongRecordings
-from robotid.identification.pipeline import Identification, conclude, identify, structural_mapping
-from robotid.identification.verdict import Doubt, Finding
+from robotid.identification.pipeline import Identification, conclude, identify
+from robotid.identification.verdict import Doubt
 from robotid.logs.data import Log
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.report.document import write_report
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
@@ -118,7 +120,7 @@ def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding
     """Identify from logs in memory."""
     logs = [job.read(entry, model) for entry in job.identification]
     kept = [job.read(entry, model) for entry in job.validation]
-    held = check_locked(job, model, [*job.identification, *job.validation])
+    held = examine_locked(job, model, [*job.identification, *job.validation])
     diagnosis = (*held, *diagnose(model, logs, kept, job.signals))
     alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.robust != "none")
     with _explained(diagnosis):

@@ -1,25 +1,16 @@
 """Progress of long work on a terminal: how far, how fast, how long it will still take."""
 
+from __future__ import annotations
+
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TypeAlias
+from typing import TYPE_CHECKING
 
-__all__ = ["ProgressCallback", "ignore_progress", "terminal_progress"]
+if TYPE_CHECKING:
+    from robotid._typing import ProgressCallback
 
-#: Called with what is being done, how many units are done, how many there are, and their name.
-ProgressCallback: TypeAlias = Callable[[str, int, int, str], None]
-
-
-def ignore_progress(what: str, done: int, total: int, unit: str) -> None:
-    """Take a report of progress and show nothing.
-
-    Args:
-        what: What is being done.
-        done: How many units are done.
-        total: How many there are.
-        unit: Their name.
-    """
+__all__ = ["terminal_progress"]
 
 
 @contextmanager

@@ -4,18 +4,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import is_long, survey_logs
 from robotid.doctor.diagnosis import alarming, diagnose
-from robotid.export.result import file_sha256, read_result, recording_metrics, stated_parameters
+from robotid.export.result import read_result, recording_metrics, stated_parameters
 from robotid.export.sidecar import load_identified
+from robotid.findings import Finding
 from robotid.identification.doubts import doubts_of
 from robotid.identification.evaluation import Evaluation, evaluate, prepare, shares_rows
 from robotid.identification.long_recordings import evaluate_long
 from robotid.identification.metrics import Metrics
-from robotid.identification.pipeline import structural_mapping
-from robotid.identification.verdict import Doubt, Finding, Verdict, judge
+from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
 __all__ = ["validate_result"]

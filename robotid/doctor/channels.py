@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 from robotid.logs.data import Log
 from robotid.logs.signals import velocity_lag
 

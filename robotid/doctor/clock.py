@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 from robotid.logs.data import Log
 
 __all__ = ["check_clock", "check_gaps", "check_stale_rows", "check_standstill", "check_static"]

@@ -6,12 +6,9 @@ unless its code is ignored.
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import is_long, survey_logs
 from robotid.doctor.channels import (
     check_clipping,
     check_noise,
@@ -28,20 +25,19 @@ from robotid.doctor.clock import (
     check_standstill,
     check_static,
 )
-from robotid.doctor.locked_joints import check_locked
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import Finding, by_severity
 from robotid.identification.doubts import DOUBTFUL, is_outvoted
-from robotid.identification.pipeline import structural_mapping
-from robotid.identification.verdict import Finding
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.signals import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
-__all__ = ["CODES", "alarming", "diagnose", "examine", "findings_to_dict"]
+__all__ = ["CODES", "alarming", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
@@ -49,30 +45,6 @@ CODES = (
     "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
     "velocity_scale",
 )  # fmt: skip
-_RANK = {"error": 0, "warning": 1, "note": 2}
-
-
-def examine(job: Job) -> tuple[Finding, ...]:
-    """Examine the logs of a job.
-
-    Args:
-        job: The job. A log that cannot be read gives a finding, not an error.
-
-    Returns:
-        The findings, errors first.
-
-    Raises:
-        ModelError: If the URDF cannot be used.
-        SettingsError: If a setting does not fit, or a code to ignore is unknown.
-    """
-    alarming([], job.ignore)
-    model = job.model()
-    findings: list[Finding] = []
-    read = _look if is_long(job, (*job.identification, *job.validation)) else _read
-    fitted, kept = (
-        read(job, model, entries, findings) for entries in (job.identification, job.validation)
-    )
-    return _sorted([*findings, *diagnose(model, fitted, kept, job.signals)])
 
 
 def diagnose(
@@ -103,7 +75,7 @@ def diagnose(
         names = ", ".join(_name(log) for log in fitted)
         moving = [probe.motion for probe in probes]
         findings += check_excitation(model, structural_mapping(model), moving, signals, names)
-    return _sorted(findings)
+    return by_severity(findings)
 
 
 def alarming(
@@ -155,37 +127,6 @@ def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     }
 
 
-def _read(
-    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
-) -> list[Log]:
-    """Return the logs that can be read; why the others cannot goes to the findings."""
-    logs = []
-    for entry in entries:
-        try:
-            logs.append(job.read(entry, model))
-            findings += check_locked(job, model, [entry])
-        except DataError as error:
-            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
-    return logs
-
-
-def _look(
-    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
-) -> list[Log]:
-    """Return windows of logs that are too long to be in memory."""
-    mapping, looks = structural_mapping(model), []
-    for entry in entries:
-        try:
-            (log,) = survey_logs(job, [entry], model, mapping)
-        except DataError as error:
-            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
-            continue
-        notes, name = log.head.notes, entry.path.name
-        findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
-        looks += [replace(look, notes=()) for look in log.looks]
-    return looks
-
-
 def _examine_log(
     model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
 ) -> tuple[Trajectory | None, Probe | None]:
@@ -219,10 +160,6 @@ def _examine_log(
     if not any(finding.severity == "error" for finding in torques):
         findings += check_torque_delay(model, motion, signals, name)
     return motion, probe
-
-
-def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    return tuple(sorted(findings, key=lambda finding: _RANK[finding.severity]))
 
 
 def _name(log: Log) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 
 __all__ = ["LoadModel", "check_loads", "load_model"]
 

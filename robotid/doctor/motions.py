@@ -9,10 +9,10 @@ from robotid._typing import Array
 from robotid.estimators import WLS
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
+from robotid.findings import Finding
 from robotid.identification.evaluation import row_mask
 from robotid.identification.prior import spread_of
 from robotid.identification.recordings import base_problem, independent_share
-from robotid.identification.verdict import Finding
 from robotid.logs.data import Trajectory
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
@@ -74,7 +74,7 @@ def check_excitation(
 ) -> Iterator[Finding]:
     """Yield which base parameters the fitted motions determine.
 
-    By :func:`robotid.estimators.determination.determine`, as an identification does; of long logs a share of
+    By ``determine``, as an identification does; of long logs a share of
     the rows stands for all.
 
     Args:

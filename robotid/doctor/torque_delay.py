@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 from robotid.logs.data import Trajectory
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor

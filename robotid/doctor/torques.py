@@ -8,7 +8,7 @@ import numpy as np
 from robotid.doctor.hypotheses import Explanation, explanations
 from robotid.doctor.loads import check_loads
 from robotid.doctor.sample import Probe
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 
 __all__ = ["check_torques"]
 
@@ -34,7 +34,7 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
 
     Yields:
         Errors "torque_sign", "torque_order", "joint_order", "joint_axis", "position_order",
-        "position_sign", "position_offset" or "gravity", or else what :func:`check_loads` yields;
+        "position_sign", "position_offset" or "gravity", or else what ``check_loads`` yields;
         and "unexplained_torque".
     """
     stated, loaded, others = explanations(probe)

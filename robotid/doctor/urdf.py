@@ -12,14 +12,12 @@ import numpy as np
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
-from robotid.export.urdf import read_with_yourdfpy
-from robotid.identification.pipeline import structural_mapping
-from robotid.identification.verdict import Finding
-from robotid.regressor.base_parameters import BaseMapping
+from robotid.findings import Finding
+from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import Joint, Tree
+from robotid.robot.tree import Joint, Tree, read_with_yourdfpy
 
 __all__ = ["Inspection", "Structure", "inspect_urdf"]
 

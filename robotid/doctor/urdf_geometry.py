@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 from robotid.robot.geometry import body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia

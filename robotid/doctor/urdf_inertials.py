@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial

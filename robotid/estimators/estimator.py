@@ -3,17 +3,26 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from html import escape
 from typing import Any
 
 import numpy as np
 
+from robotid._html import code, number, table
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.identification.summary import estimate_html, estimate_line, estimate_text
 from robotid.regressor.factors import Factors, compress
 from robotid.regressor.problem import Problem
 
-__all__ = ["Estimate", "Estimator", "as_factors", "require_rows"]
+__all__ = [
+    "Estimate",
+    "Estimator",
+    "as_factors",
+    "estimate_html",
+    "estimate_line",
+    "estimate_text",
+    "require_rows",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +77,7 @@ class Estimate:
 
 
 class Estimator(ABC):
-    """Settings go into the constructor, data only into :meth:`fit`."""
+    """Settings go into the constructor, data only into ``fit``."""
 
     @abstractmethod
     def fit(self, data: Problem | Factors) -> Estimate:
@@ -123,3 +132,58 @@ def require_rows(rows: int, columns: int, n_joints: int) -> None:
             f"{rows} torque rows for {columns} parameters: too few rows to fit; record at least "
             f"{-(-10 * columns // n_joints)} samples, or loosen min_velocity and trim"
         )
+
+
+def estimate_line(estimate: Estimate) -> str:
+    """Return an estimate in one line.
+
+    Args:
+        estimate: The estimate.
+
+    Returns:
+        One line.
+    """
+    state = "converged" if estimate.converged else "not converged"
+    return (
+        f"<Estimate: {len(estimate.names)} parameters, rank {estimate.rank}, condition "
+        f"{estimate.condition:.3g}, {state}>"
+    )
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """Return an estimate as text: one parameter a line.
+
+    Args:
+        estimate: The estimate.
+
+    Returns:
+        Lines.
+    """
+    width = max(len(name) for name in estimate.names)
+    lines = [estimate_line(estimate)[1:-1], estimate.message]
+    lines += [
+        f"  {name:{width}} {value:12.4g} +- {error:.2g}"
+        for name, value, error in zip(
+            estimate.names, estimate.theta, estimate.std_error, strict=True
+        )
+    ]
+    return "\n".join(lines)
+
+
+def estimate_html(estimate: Estimate) -> str:
+    """Return an estimate as HTML.
+
+    Args:
+        estimate: The estimate.
+
+    Returns:
+        A table of the parameters.
+    """
+    rows = [
+        [code(name), number(float(value)), number(float(error), ".2g")]
+        for name, value, error in zip(
+            estimate.names, estimate.theta, estimate.std_error, strict=True
+        )
+    ]
+    head = escape(f"{estimate_line(estimate)[1:-1]}; {estimate.message}")
+    return f"<p>{head}</p>\n" + table("Parameters", ["name", "value", "standard error"], rows)

@@ -1,35 +1,32 @@
 """result.json: what an identification found, in the schema that other programs read."""
 
 import dataclasses
-import hashlib
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robotid import __version__
+from robotid._files import file_sha256
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import Metrics
-from robotid.identification.pipeline import Identification, structural_mapping
-from robotid.identification.verdict import Finding
+from robotid.identification.pipeline import Identification
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.versions import versions
+from robotid.versions import __version__, versions
 
 __all__ = [
     "build_result",
-    "file_sha256",
     "read_result",
     "recording_metrics",
     "stated_parameters",
-    "write_json",
 ]
 
 SCHEMA_VERSION = 1
@@ -162,38 +159,6 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
     if missing:
         raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
     return np.array([stated[name] for name in model.layout.names])
-
-
-def write_json(content: Mapping[str, Any], target: str | Path) -> None:
-    """Write JSON beside its target, then put it in place.
-
-    Args:
-        content: What to write; non-finite numbers are refused.
-        target: The file.
-    """
-    path = Path(target)
-    text = json.dumps(content, indent=1, allow_nan=False)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_text(text + "\n", encoding="utf-8")
-    os.replace(beside, path)
-
-
-def file_sha256(path: str | Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
-
-    Args:
-        path: The file, or the folder of a bag.
-
-    Returns:
-        64 hexadecimal digits.
-    """
-    source = Path(path)
-    if source.is_dir():
-        files = sorted(file for file in source.iterdir() if file.is_file())
-        listing = "".join(f"{file_sha256(file)}  {file.name}\n" for file in files)  # as sha256sum
-        return hashlib.sha256(listing.encode()).hexdigest()
-    with source.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _inputs(identification: Identification) -> list[dict[str, Any]]:

@@ -11,11 +11,9 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from robotid import __version__
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export.sidecar import SCHEMA_VERSION, digest, load_identified, sidecar_facts
@@ -33,9 +31,10 @@ from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.tree import read_tree
+from robotid.robot.tree import read_tree, read_with_yourdfpy
+from robotid.versions import __version__
 
-__all__ = ["read_with_yourdfpy", "write_urdf"]
+__all__ = ["write_urdf"]
 
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over them
@@ -97,28 +96,6 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     finally:
         shutil.rmtree(partial)
     return sidecar
-
-
-def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
-    """Read a URDF with yourdfpy, a reader that shares no line with this package's.
-
-    Args:
-        path: The URDF file. Meshes are not loaded.
-
-    Returns:
-        yourdfpy's ``Robot``: its damping and friction are text, and None what is not stated.
-
-    Raises:
-        ModelError: If yourdfpy cannot read the file.
-    """
-    import yourdfpy
-
-    try:
-        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    # it checks nothing by itself, so a fault of the file comes out as one of these
-    except (AttributeError, IndexError, KeyError, SyntaxError, TypeError, ValueError) as error:
-        fault = f"{type(error).__name__}: {error}"
-        raise ModelError(f"yourdfpy cannot read {Path(path).name}: {fault}") from error
 
 
 def _check_parameters(model: RobotModel, pi: Array) -> None:

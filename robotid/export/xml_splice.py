@@ -185,7 +185,7 @@ def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
     Args:
         document: The file.
         parent: Where it goes.
-        lines: The new element, as for :func:`replace`.
+        lines: The new element, as for ``replace``.
 
     Returns:
         The change.

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
-from robotid.identification.verdict import Doubt, Finding
+from robotid.findings import Finding
+from robotid.identification.verdict import Doubt
 
 __all__ = ["DOUBTFUL", "doubts_of", "is_outvoted"]
 

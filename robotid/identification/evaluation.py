@@ -155,7 +155,7 @@ def shares_rows(one: Log, other: Log) -> bool:
 
 
 def sampled_every(rows: int) -> int:
-    """Return how far apart the rows are that :func:`shares_rows` looks for.
+    """Return how far apart the rows are that ``shares_rows`` looks for.
 
     Args:
         rows: Rows of the log that they are of.
@@ -256,7 +256,7 @@ def predict_all(
         trajectory: N samples.
         parameters: Standard parameters by name, each of shape (p,).
         prior: Those of the URDF, shape (p,).
-        compiled: As of :func:`robotid.regressor.prediction.predict`.
+        compiled: As of ``predict``.
 
     Returns:
         Torques by name, each of shape (N, n_rows): those of the parameters, "urdf" and
@@ -282,7 +282,7 @@ def torque_sums(
     Args:
         trajectory: N samples.
         mask: Rows used, shape (N, n_rows), bool.
-        torques: As of :func:`predict_all`.
+        torques: As of ``predict_all``.
         names: Which of them to measure.
 
     Returns:

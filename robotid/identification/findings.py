@@ -1,7 +1,7 @@
 """What is worth a word about the physical side of a fit: mass matrix, solvers, active bounds."""
 
+from robotid.findings import Finding
 from robotid.identification.pipeline import Identification
-from robotid.identification.verdict import Finding
 
 __all__ = ["consistency_findings"]
 

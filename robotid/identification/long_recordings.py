@@ -60,11 +60,11 @@ class LongRecordings(Recordings):
 
     @property
     def share(self) -> float:
-        """See :attr:`robotid.identification.recordings.Recordings.share`."""
+        """See ``Recordings.share``."""
         return min(independent_share(log.header.signals) for log in self.fitted)
 
     def reduce(self, mapping: BaseMapping) -> tuple[Reduction, ...]:
-        """See :meth:`robotid.identification.recordings.Recordings.reduce`.
+        """See ``Recordings.reduce``.
 
         Args:
             mapping: Standard to base parameters; that which the logs were surveyed with.
@@ -89,7 +89,7 @@ class LongRecordings(Recordings):
         return tuple(reductions)
 
     def problem(self, mapping: BaseMapping, *, with_mass: bool = False) -> Problem:
-        """See :meth:`robotid.identification.recordings.Recordings.problem`.
+        """See ``Recordings.problem``.
 
         Args:
             mapping: Standard to base parameters.
@@ -124,7 +124,7 @@ class LongRecordings(Recordings):
     def evaluate(
         self, parameters: Mapping[str, Array], prior: Array
     ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-        """See :meth:`robotid.identification.recordings.Recordings.evaluate`.
+        """See ``Recordings.evaluate``.
 
         Args:
             parameters: Standard parameters by name, each of shape (p,).

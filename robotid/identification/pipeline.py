@@ -39,9 +39,8 @@ from robotid.identification.summary import (
 from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
 from robotid.logs.signals import SignalSettings
-from robotid.regressor.base_parameters import BaseMapping, base_mapping
+from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
-from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
@@ -54,7 +53,6 @@ __all__ = [
     "Identification",
     "conclude",
     "identify",
-    "structural_mapping",
 ]
 
 _GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
@@ -337,27 +335,6 @@ def conclude(
         errors=errors,
         factors=factors,
         determination=determination,
-    )
-
-
-def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
-    """Return the base parameters that any motion of a robot can show.
-
-    Args:
-        model: The robot.
-        inertial_only: Whether to leave the drive terms out.
-
-    Returns:
-        The mapping; always the same for the same robot.
-    """
-    columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
-    samples = 2 * columns // model.n_rows + 20
-    W = random_regressor(model, samples, np.random.default_rng(0))
-    return base_mapping(
-        W[:, :columns],
-        model.layout.names[:columns],
-        scales=model.layout.scales(model.length)[:columns],
-        preference=model.layout.preference()[:columns],
     )
 
 

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
+from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -66,7 +66,7 @@ def _inertial_spread(model: RobotModel) -> Array:
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
     first = model.n_rows - len(model.joints)
     tau, v, a = (_positive(row[first:]) for row in rms)
-    carried = _carried_inertia(model)
+    carried = carried_inertia(model)
     spread = {
         "armature": np.maximum(carried, tau / a),
         "viscous": tau / v,
@@ -86,13 +86,3 @@ def _positive(rms: Array) -> Array:
     floor = 1e-3 * rms.max() if rms.max() > 0 else 1.0
     bounded: Array = np.maximum(rms, floor)
     return bounded
-
-
-def _carried_inertia(model: RobotModel) -> Array:
-    """Return the inertia each joint carries at the neutral posture, shape (n,)."""
-    pin_model = model.pin_model
-    M = pin.crba(pin_model, pin_model.createData(), pin.neutral(pin_model))
-    M = np.triu(M) + np.triu(M, 1).T
-    G = model.velocity_map
-    diagonal = np.diag(G.T @ M @ G)[model.n_rows - len(model.joints) :]
-    return np.maximum(diagonal, 0.0)

@@ -101,11 +101,11 @@ class LoadedRecordings(Recordings):
 
     @property
     def share(self) -> float:
-        """See :attr:`Recordings.share`."""
+        """See ``Recordings.share``."""
         return min(independent_share(recording.signals) for recording in self.fitted)
 
     def reduce(self, mapping: BaseMapping) -> tuple[Reduction, ...]:
-        """See :meth:`Recordings.reduce`.
+        """See ``Recordings.reduce``.
 
         Args:
             mapping: Standard to base parameters.
@@ -126,7 +126,7 @@ class LoadedRecordings(Recordings):
         return tuple(reductions)
 
     def problem(self, mapping: BaseMapping, *, with_mass: bool = False) -> Problem:
-        """See :meth:`Recordings.problem`.
+        """See ``Recordings.problem``.
 
         Args:
             mapping: Standard to base parameters.
@@ -145,7 +145,7 @@ class LoadedRecordings(Recordings):
     def evaluate(
         self, parameters: Mapping[str, Array], prior: Array
     ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-        """See :meth:`Recordings.evaluate`.
+        """See ``Recordings.evaluate``.
 
         Args:
             parameters: Standard parameters by name, each of shape (p,).
@@ -181,8 +181,8 @@ def base_problem(
         mapping: Standard to base parameters.
         trajectory: N samples.
         weight: Weight of each row, shape (N, n_rows); or which rows are used, bool.
-        with_mass: As of :func:`robotid.regressor.torque.build_problem`.
-        compiled: As of :func:`robotid.regressor.torque.build_problem`.
+        with_mass: As of ``build_problem``.
+        compiled: As of ``build_problem``.
 
     Returns:
         The problem.

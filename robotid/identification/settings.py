@@ -81,7 +81,7 @@ class EstimatorSettings:
         check: Of the same: whether the other solver solves it, too.
         draws: Of the same: fits to redrawn data and prior that tell the standard errors where
             bounds bind; 0 leaves the bounds out of them.
-        constraints: Of the same: see :class:`robotid.identification.constraint_settings.ConstraintSettings`.
+        constraints: Of the same: see ``ConstraintSettings``.
         starts: Of "log_cholesky": random starts beside the one from the cone programme.
         forgetting: Of "rls": weight of a sample relative to the next one [-].
         walk: Of "kalman": random walk per sample, as a share of the prior's spread [-].

@@ -166,7 +166,7 @@ def _bounded(
 ) -> tuple[Estimate, StandardErrors]:
     """Return the estimate with the mean square distance of redrawn fits as its covariance.
 
-    The meat is that of the rows as :meth:`Consistent.rows` has them, of which a share counts.
+    The meat is that of the rows as ``Consistent.rows`` has them, of which a share counts.
     """
     rows = redraws.fit.rows(factors, sigma)
     found, failures = redraws.fit.redrawn(rows, estimate.theta, meat, redraws.draws, redraws.rng)

@@ -5,76 +5,17 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING
 
-from robotid.report.page import code, number, percent, table, text
+from robotid._html import code, number, percent, table, text
 
 if TYPE_CHECKING:
-    from robotid.estimators import Estimate
     from robotid.identification.metrics import Metrics
     from robotid.identification.pipeline import Identification
 
 __all__ = [
-    "estimate_html",
-    "estimate_line",
-    "estimate_text",
     "identification_html",
     "identification_line",
     "identification_text",
 ]
-
-
-def estimate_line(estimate: Estimate) -> str:
-    """Return an estimate in one line.
-
-    Args:
-        estimate: The estimate.
-
-    Returns:
-        One line.
-    """
-    state = "converged" if estimate.converged else "not converged"
-    return (
-        f"<Estimate: {len(estimate.names)} parameters, rank {estimate.rank}, condition "
-        f"{estimate.condition:.3g}, {state}>"
-    )
-
-
-def estimate_text(estimate: Estimate) -> str:
-    """Return an estimate as text: one parameter a line.
-
-    Args:
-        estimate: The estimate.
-
-    Returns:
-        Lines.
-    """
-    width = max(len(name) for name in estimate.names)
-    lines = [estimate_line(estimate)[1:-1], estimate.message]
-    lines += [
-        f"  {name:{width}} {value:12.4g} +- {error:.2g}"
-        for name, value, error in zip(
-            estimate.names, estimate.theta, estimate.std_error, strict=True
-        )
-    ]
-    return "\n".join(lines)
-
-
-def estimate_html(estimate: Estimate) -> str:
-    """Return an estimate as HTML.
-
-    Args:
-        estimate: The estimate.
-
-    Returns:
-        A table of the parameters.
-    """
-    rows = [
-        [code(name), number(float(value)), number(float(error), ".2g")]
-        for name, value, error in zip(
-            estimate.names, estimate.theta, estimate.std_error, strict=True
-        )
-    ]
-    head = escape(f"{estimate_line(estimate)[1:-1]}; {estimate.message}")
-    return f"<p>{head}</p>\n" + table("Parameters", ["name", "value", "standard error"], rows)
 
 
 def identification_line(found: Identification) -> str:

@@ -132,10 +132,10 @@ class LogPiece(Piece):
         return row_mask(self.header.model, trajectory, self.header.signals.min_velocity)
 
     def reduce(self, *, threads: int | None = None) -> Reduction:
-        """Read the piece and reduce it; see :meth:`robotid.workers.pieces.Piece.reduce`.
+        """Read the piece and reduce it; see ``Piece.reduce``.
 
         Args:
-            threads: As of :func:`robotid.regressor.factors.compress`.
+            threads: As of ``compress``.
 
         Returns:
             The reduction.
@@ -280,11 +280,11 @@ class _WholeTable(RowReader):
         return len(next(iter(self._columns.values())))
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column; see :meth:`RowReader.scan`."""
+        """Yield one column; see ``RowReader.scan``."""
         yield self._columns[name], Place()
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows; see :meth:`RowReader.read`."""
+        """Return some rows; see ``RowReader.read``."""
         return {name: self._columns[name][first:stop] for name in wanted}
 
     @cached_property
@@ -310,7 +310,7 @@ def _near(places: Sequence[Place], row: int) -> Place:
 def _window(
     stamps: TimeStamps, layout: LogLayout, start: float | None, end: float | None
 ) -> tuple[int, int]:
-    """Return the rows from start to end; see :meth:`robotid.logs.data.Log.window`."""
+    """Return the rows from start to end; see ``Log.window``."""
     where = Path(layout.path).name
     if len(stamps) < 2:
         raise DataError(f"{where} has {len(stamps)} rows, wanted at least 2")

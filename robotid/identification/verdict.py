@@ -6,7 +6,7 @@ from typing import Any
 
 from robotid.identification.metrics import JointMetrics, Metrics
 
-__all__ = ["NOT_EVALUATED", "Doubt", "Finding", "JointVerdict", "Verdict", "judge"]
+__all__ = ["NOT_EVALUATED", "Doubt", "JointVerdict", "Verdict", "judge"]
 
 #: Status of a joint that no kept recording moves: never a pass.
 NOT_EVALUATED = "not evaluated"
@@ -14,25 +14,6 @@ NOT_EVALUATED = "not evaluated"
 _GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
 _POOR = 50.0  # [%] a joint predicted worse than this is not usable
 _OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something a user must know.
-
-    Attributes:
-        code: A fixed word for programs.
-        severity: "note", "warning" or "error".
-        where: What it is about: a link, a joint, a parameter or a file.
-        message: What was found, what was wanted, what to do.
-        evidence: The figures it rests on, by name.
-    """
-
-    code: str
-    severity: str
-    where: str
-    message: str
-    evidence: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def write_csv(table: Mapping[str, Array], path: Path) -> None:
 
 @dataclass(frozen=True)
 class _CsvRows(RowReader):
-    """Rows of a CSV file; see :class:`robotid.logs.table.RowReader`."""
+    """Rows of a CSV file; see ``RowReader``."""
 
     path: Path
     names: list[str]
@@ -65,12 +65,12 @@ class _CsvRows(RowReader):
             return sum(block.count(b"\n") for block in blocks) - 1
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column; see :meth:`RowReader.scan`."""
+        """Yield one column; see ``RowReader.scan``."""
         for lines, place, rows in self._blocks(Place(), None):
             yield self._parse(lines, [name], place, 0, rows)[name], place
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows; see :meth:`RowReader.read`."""
+        """Return some rows; see ``RowReader.read``."""
         parts = []
         for lines, place, rows in self._blocks(near, stop):
             start, end = max(first - place.row, 0), min(stop - place.row, rows)

@@ -120,7 +120,7 @@ class Trajectory:
         rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
         segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
         direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
-            shape (N, c) [-], in the order of :func:`robotid.regressor.columns.friction_speeds`; None: the
+            shape (N, c) [-], in the order of ``friction_speeds``; None: the
             sign of the speed itself.
     """
 

@@ -75,7 +75,7 @@ def load_pyarrow(purpose: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class _ParquetRows(RowReader):
-    """Rows of a Parquet file; see :class:`robotid.logs.table.RowReader`."""
+    """Rows of a Parquet file; see ``RowReader``."""
 
     path: Path
 
@@ -85,7 +85,7 @@ class _ParquetRows(RowReader):
             return int(file.metadata.num_rows)
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column; see :meth:`RowReader.scan`."""
+        """Yield one column; see ``RowReader.scan``."""
         row = 0
         with _open(self.path, _BUFFER) as file:
             _check_types(file, [name], self.path.name)
@@ -95,7 +95,7 @@ class _ParquetRows(RowReader):
                     row += batch.num_rows
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows; see :meth:`RowReader.read`."""
+        """Return some rows; see ``RowReader.read``."""
         values = {name: np.empty(stop - first) for name in wanted}
         with _open(self.path, _BUFFER) as file:
             _check_types(file, wanted, self.path.name)

@@ -163,11 +163,11 @@ def lay_out(
     Args:
         path: The file.
         joints: Names of the joints wanted, in the order wanted.
-        gains: As of :func:`read_log`.
-        columns: As of :func:`read_log`.
-        units: As of :func:`read_log`.
-        prismatic: As of :func:`read_log`.
-        source: As of :func:`read_log`.
+        gains: As of ``read_log``.
+        columns: As of ``read_log``.
+        units: As of ``read_log``.
+        prismatic: As of ``read_log``.
+        source: As of ``read_log``.
 
     Returns:
         The layout and the opened table.

@@ -77,7 +77,7 @@ def decide(
         lag: Returns how late the measured velocity is [s]; called if that matters.
 
     Returns:
-        The settings, as of :func:`resolve`.
+        The settings, as of ``resolve``.
 
     Raises:
         DataError: If measured velocity or acceleration is asked for and the log has none.
@@ -121,7 +121,7 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
     Args:
         log: The log.
         settings: The settings; what is automatic in them is resolved first.
-        speeds: As of :func:`robotid.logs.smoothing.process_stretches`; a model with Coulomb friction
+        speeds: As of ``process_stretches``; a model with Coulomb friction
             needs them wherever a filter smears its torque.
 
     Returns:

@@ -59,7 +59,7 @@ def process_stretches(
     """Return the smooth motion of uninterrupted stretches, or of a part of them.
 
     A part is as smooth as if the whole had been processed, if the log has the rows of its
-    stretches that are within :func:`filter_reach` of its own rows.
+    stretches that are within ``filter_reach`` of its own rows.
 
     Args:
         log: Rows of the stretches, all of them or a part.
@@ -68,7 +68,7 @@ def process_stretches(
         first: Row number that the log's first row has in the stretches.
         own: Rows wanted, numbered as in the stretches; the log must have the row that follows.
         speeds: Ratios of the speeds that Coulomb friction follows to those of the joints, shape
-            (c, n), as of :func:`robotid.regressor.columns.friction_speeds`.
+            (c, n), as of ``friction_speeds``.
 
     Returns:
         The trajectory, of no samples if no stretch is long enough; the segment numbers of its

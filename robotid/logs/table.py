@@ -87,7 +87,7 @@ class RowReader(ABC):
             wanted: Names of the columns.
             first: First row.
             stop: Row after the last one.
-            near: A place that :meth:`scan` told, at or before the first row.
+            near: A place that ``scan`` told, at or before the first row.
 
         Returns:
             The columns by name, each of shape (stop - first,); a missing value is NaN.

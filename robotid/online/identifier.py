@@ -9,7 +9,6 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators import Estimate, Kalman, KalmanState
 from robotid.exceptions import DataError
-from robotid.identification.pipeline import structural_mapping
 from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
 from robotid.online.change_detection import (
@@ -21,6 +20,7 @@ from robotid.online.change_detection import (
 )
 from robotid.online.settings import Change, OnlineSettings, Reading
 from robotid.online.signals import Instant, LiveSignals
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.problem import Sample
 from robotid.regressor.torque import InstantRegressor
 from robotid.robot.model import RobotModel

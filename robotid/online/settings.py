@@ -22,7 +22,7 @@ class OnlineSettings:
         walk: Random walk of the parameters, as a share of their prior spread per square root of a
             second [s^-1/2].
         noise_memory: Time over which the noise level of each joint is averaged [s].
-        threshold: Evidence at which a change is flagged; see :class:`ChangeDetector`.
+        threshold: Evidence at which a change is flagged; see ``ChangeDetector``.
         drift: Squared innovation, in variances, that is no evidence of a change [-].
         model_error: Share of each joint's torque that the model may miss without a change [-].
     """

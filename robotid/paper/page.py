@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from robotid import __version__
+from robotid._html import Cell, code, figure, number, page, table, text
 from robotid.paper.study import CASES
-from robotid.report.page import Cell, code, figure, number, page, table, text
+from robotid.versions import __version__
 
 __all__ = ["paper_page"]
 

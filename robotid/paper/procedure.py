@@ -136,7 +136,7 @@ def random_torque(
         rng: Source of the disturbance.
 
     Returns:
-        A function for :class:`Influences`.
+        A function for ``Influences``.
 
     References:
         Tzvetkova, (2) and (11).

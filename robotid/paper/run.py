@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid import __version__
-from robotid._typing import Array
-from robotid.commands.progress import ProgressCallback, ignore_progress
+from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.paper import plots
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
 from robotid.paper.page import paper_page
@@ -30,6 +28,7 @@ from robotid.paper.study import (
     study_model,
 )
 from robotid.report.plots import STYLE, svg_element
+from robotid.versions import __version__
 
 __all__ = ["run_paper"]
 

@@ -15,8 +15,10 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.regressor.problem import Problem
+from robotid.regressor.torque import random_regressor
+from robotid.robot.model import RobotModel
 
-__all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping"]
+__all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping", "structural_mapping"]
 
 #: Pivots below this share of the largest are no structure. Over example-robot-data, every pivot
 #: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
@@ -171,10 +173,10 @@ def base_mapping(
         W: Regressor at enough random states, shape (m, p), m >= p.
         names: Names of the columns.
         scales: Magnitude of each parameter, shape (p,); 1 if None. See
-            :meth:`robotid.robot.parameters.ParameterLayout.scales`.
+            ``ParameterLayout.scales``.
         preference: Factor by which each column is favoured when the columns to keep are chosen,
             shape (p,); 1 if None. It changes which groups are formed, not how many. See
-            :meth:`robotid.robot.parameters.ParameterLayout.preference`.
+            ``ParameterLayout.preference``.
         rtol: Pivots below this share of the largest count as 0.
 
     Returns:
@@ -226,3 +228,24 @@ def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
         size = f"{abs(row[i]):.6g}"
         text += f" {sign} {names[i]}" if size == "1" else f" {sign} {size} {names[i]}"
     return text
+
+
+def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
+    """Return the base parameters that any motion of a robot can show.
+
+    Args:
+        model: The robot.
+        inertial_only: Whether to leave the drive terms out.
+
+    Returns:
+        The mapping; always the same for the same robot.
+    """
+    columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
+    samples = 2 * columns // model.n_rows + 20
+    W = random_regressor(model, samples, np.random.default_rng(0))
+    return base_mapping(
+        W[:, :columns],
+        model.layout.names[:columns],
+        scales=model.layout.scales(model.length)[:columns],
+        preference=model.layout.preference()[:columns],
+    )

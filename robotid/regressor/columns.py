@@ -40,7 +40,7 @@ class DriveColumn:
         Args:
             v: Velocities, shape (N, n_rows) [rad/s, m/s].
             a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-            direction: Signs of the speeds, shape (N, c), as of :func:`friction_directions`.
+            direction: Signs of the speeds, shape (N, c), as of ``friction_directions``.
 
         Returns:
             Values, shape (N,).

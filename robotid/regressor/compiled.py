@@ -1,6 +1,6 @@
 """The compiled way to the inertial columns of the regressor, where Numba is installed.
 
-A robot's tree is flattened to arrays that :mod:`robotid.regressor.lanes` works on. Any joint's placement is
+A robot's tree is flattened to arrays that ``lanes`` works on. Any joint's placement is
 R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis measured from Pinocchio's own joint, so
 that aligned and unaligned, turning and sliding joints are one case.
 """
@@ -31,7 +31,7 @@ __all__ = [
     "work_per_sample",
 ]
 
-#: Work, samples times :func:`work_per_sample`, from which the compiled path pays its start of about
+#: Work, samples times ``work_per_sample``, from which the compiled path pays its start of about
 #: half a second in every process (importing Numba, reading the compiled code). For seven joints in
 #: a row that is 1e5 samples. Compiling it takes some 10 s, once per installation.
 LONG_ENOUGH = 3_500_000
@@ -83,7 +83,7 @@ class CompiledWriter:
         """Prepare the work space.
 
         Args:
-            model: The robot; :func:`why_not` must return None for it.
+            model: The robot; ``why_not`` must return None for it.
             tree: The robot as arrays.
             plan: What the rows consist of.
             out: Block written to, shape (C, k); k a multiple of 64.
@@ -146,7 +146,7 @@ class CompiledWriter:
 
 @dataclass(frozen=True)
 class Tree:
-    """A robot as arrays over its bodies, the world first; see :func:`robotid.regressor.lanes.inertial_rows`.
+    """A robot as arrays over its bodies, the world first; see ``inertial_rows``.
 
     Attributes:
         parents: Body that carries each body, shape (B,), int.
@@ -169,7 +169,7 @@ def flatten(model: "RobotModel") -> Tree:
     """Return a robot as arrays.
 
     Args:
-        model: The robot; :func:`why_not` must return None for it.
+        model: The robot; ``why_not`` must return None for it.
 
     Returns:
         The arrays.

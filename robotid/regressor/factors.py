@@ -192,7 +192,7 @@ def compress_stretches(
     Args:
         problem: The rows, of one log or several; not one that comes in blocks only.
         length: Samples per stretch, at least 1; the last stretch of each log may have fewer.
-        threads: As of :func:`compress`.
+        threads: As of ``compress``.
 
     Returns:
         The factors of each stretch, in order; merged they are those of the whole problem.

@@ -21,7 +21,7 @@ from numba import njit
 __all__ = ["KINDS", "LANES", "finish_rows", "inertial_rows", "state_size"]
 
 LANES = 64
-#: What :func:`finish_rows` writes, by number.
+#: What ``finish_rows`` writes, by number.
 KINDS = ("armature", "viscous", "coulomb", "offset", "torque")
 _STATE = 12  # w, v, dw, a of a body
 _SHARED = 9 + 3 + 18 + 10 + 5  # placement, what rows of a body share, ten columns, joint's motion

@@ -33,7 +33,7 @@ def predict(
         model: The robot.
         parameters: Vectors of standard parameters, each of shape (p,), possible ones or not.
         trajectory: N samples of q, v, a and, if the torque was filtered, direction.
-        compiled: As of :func:`robotid.regressor.torque.build_problem`.
+        compiled: As of ``build_problem``.
 
     Returns:
         Torques, one array of shape (N, n_rows) per vector [N m, N].

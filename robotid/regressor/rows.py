@@ -71,7 +71,7 @@ def _engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryRows(RowSource):
-    """Rows of a robot's trajectory; see :class:`robotid.regressor.problem.RowSource`.
+    """Rows of a robot's trajectory; see ``RowSource``.
 
     Attributes:
         model: The robot.
@@ -135,7 +135,7 @@ class TrajectoryRows(RowSource):
         return replace(self, kept=self.kept[columns])
 
     def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
-        """Yield the rows of samples start to stop; see :meth:`RowSource.blocks`.
+        """Yield the rows of samples start to stop; see ``RowSource.blocks``.
 
         Args:
             start: First sample.
@@ -187,7 +187,7 @@ def trajectory_rows(
         model: The robot; the trajectory's joints must be its joints, in its order.
         trajectory: N samples.
         weight: Weight of each row, shape (N, n_rows); None: all 1.
-        compiled: As of :func:`choose_engine`.
+        compiled: As of ``choose_engine``.
 
     Returns:
         The rows.
@@ -232,12 +232,12 @@ class _PinocchioWriter:
     def load(
         self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks; see :meth:`CompiledWriter.load`."""
+        """Take the samples of the next blocks; see ``CompiledWriter.load``."""
         self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
         self._direction = direction
 
     def write(self, start: int, stop: int) -> None:
-        """Write the rows of samples start to stop; see :meth:`CompiledWriter.write`."""
+        """Write the rows of samples start to stop; see ``CompiledWriter.write``."""
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
         out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]

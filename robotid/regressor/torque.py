@@ -126,7 +126,7 @@ class InstantRegressor:
             a: Accelerations, shape (n,) [rad/s^2, m/s^2].
 
         Returns:
-            Regressor, shape (n, c); the same as that of :func:`joint_torque_regressor`.
+            Regressor, shape (n, c); the same as that of ``joint_torque_regressor``.
         """
         model, layout, Y = self._model, self._model.layout, self._Y
         x = q if self._is_plain else model.configurations(q[None])[0]
@@ -146,7 +146,7 @@ class InstantRegressor:
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
-        """Return the regressor of the mass matrix; see :func:`mass_regressor`.
+        """Return the regressor of the mass matrix; see ``mass_regressor``.
 
         Args:
             q: Joint coordinates, shape (n,) [rad, m].

@@ -6,9 +6,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.report.comparison import compare_results
-from robotid.report.page import Cell, code, number, page, percent, table, text
 
 __all__ = ["comparison_page", "write_comparison"]
 
@@ -23,7 +23,7 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
         target: The HTML file to write; made beside it and then put in place.
 
     Returns:
-        What :func:`robotid.report.comparison.compare_results` returns.
+        What ``compare_results`` returns.
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
@@ -45,7 +45,7 @@ def comparison_page(content: Mapping[str, Any]) -> str:
     """Return the page.
 
     Args:
-        content: What :func:`robotid.report.comparison.compare_results` returns.
+        content: What ``compare_results`` returns.
 
     Returns:
         HTML that fetches nothing.

@@ -5,6 +5,7 @@ from html import escape
 
 import numpy as np
 
+from robotid._html import code, figure, number, table, text
 from robotid._typing import Array
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.information import Information, information
@@ -16,7 +17,6 @@ from robotid.report.diagnosis_plots import (
     plot_residual,
     plot_singular,
 )
-from robotid.report.page import code, figure, number, table, text
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
 from robotid.versions import versions
 

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from robotid import __version__
+from robotid._html import code, figure, number, page, percent, table, text
 from robotid.exceptions import DataError
+from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
-from robotid.identification.verdict import Finding
 from robotid.logs.signals import SignalSettings
 from robotid.report.consistency import consistency_notes
 from robotid.report.diagnosis import (
@@ -20,7 +20,6 @@ from robotid.report.diagnosis import (
     residual_section,
     version_table,
 )
-from robotid.report.page import code, figure, number, page, percent, table, text
 from robotid.report.plots import plot_body, plot_torque
 from robotid.report.tables import (
     base_table,
@@ -32,6 +31,7 @@ from robotid.report.tables import (
     standard_table,
 )
 from robotid.robot.parameters import INERTIAL_TERMS
+from robotid.versions import __version__
 
 __all__ = ["write_report"]
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from robotid.export.result import file_sha256
+from robotid._files import file_sha256
+from robotid._html import Cell, code, number, percent, table, text
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import Identification
 from robotid.identification.settings import KEYS
-from robotid.report.page import Cell, code, number, percent, table, text
 from robotid.robot.parameters import pseudo_inertia
 
 __all__ = [

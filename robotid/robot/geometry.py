@@ -27,7 +27,7 @@ def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array
 
     Returns:
         Half-spaces A c <= b in the frame of each body's moved link, by its name; see
-        :func:`body_points` for the bodies that have none.
+        ``body_points`` for the bodies that have none.
 
     Raises:
         SettingsError: If geometry is asked for and no body has any that can be read.

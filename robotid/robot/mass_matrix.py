@@ -8,7 +8,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.robot.model import RobotModel
 
-__all__ = ["MassMatrixCheck", "check_mass_matrix", "joint_mass_matrices"]
+__all__ = ["MassMatrixCheck", "carried_inertia", "check_mass_matrix", "joint_mass_matrices"]
 
 POSES = 10_000
 
@@ -101,3 +101,20 @@ def _armatures(model: RobotModel, pi: Array) -> Array:
                 w[first + model.joints.index(joint)] = ratio
             added += value * np.outer(w, w)
     return added
+
+
+def carried_inertia(model: RobotModel) -> Array:
+    """Return the inertia that each joint carries at the neutral posture.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Inertias, shape (n,), at least 0 [kg m^2, or kg].
+    """
+    pin_model = model.pin_model
+    M = pin.crba(pin_model, pin_model.createData(), pin.neutral(pin_model))
+    M = np.triu(M) + np.triu(M, 1).T
+    G = model.velocity_map
+    diagonal = np.diag(G.T @ M @ G)[model.n_rows - len(model.joints) :]
+    return np.maximum(diagonal, 0.0)

@@ -26,7 +26,7 @@ class RobotModel:
 
     Joint coordinates q are one angle or length per joint, in the order of ``joints``; for a
     floating base they start with its pose [x y z qx qy qz qw], and v with its twist in the base
-    frame. Continuous joints are angles here too; :meth:`configuration` gives Pinocchio's form.
+    frame. Continuous joints are angles here too; ``configuration`` gives Pinocchio's form.
 
     Attributes:
         tree: The URDF it was built from.

@@ -205,7 +205,7 @@ def to_paper_order(pi: Array) -> Array:
 
 
 def from_paper_order(P: Array) -> Array:
-    """Return inertial parameters in Pinocchio's order; the inverse of :func:`to_paper_order`.
+    """Return inertial parameters in Pinocchio's order; the inverse of ``to_paper_order``.
 
     Args:
         P: Inertial parameters in the paper's order (9), (10), shape (10 n,).
@@ -269,7 +269,7 @@ def pseudo_inertia(pi: Array) -> Array:
 
 
 def inertial_from_pseudo_inertia(J: Array) -> Array:
-    """Return the ten inertial parameters of one body; the inverse of :func:`pseudo_inertia`.
+    """Return the ten inertial parameters of one body; the inverse of ``pseudo_inertia``.
 
     Args:
         J: Pseudo-inertia, shape (4, 4).

@@ -15,7 +15,7 @@ from typing import Any
 
 from robotid.exceptions import ModelError
 
-__all__ = ["Inertial", "Joint", "Tree", "read_tree"]
+__all__ = ["Inertial", "Joint", "Tree", "read_tree", "read_with_yourdfpy"]
 
 _MOVABLE = ("revolute", "continuous", "prismatic")
 
@@ -293,3 +293,25 @@ def _present(element: ET.Element, tags: tuple[str, ...]) -> Iterator[ET.Element]
         child = element.find(tag)
         if child is not None:
             yield child
+
+
+def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
+    """Read a URDF with yourdfpy, a reader that shares no line with this package's.
+
+    Args:
+        path: The URDF file. Meshes are not loaded.
+
+    Returns:
+        yourdfpy's ``Robot``: its damping and friction are text, and None what is not stated.
+
+    Raises:
+        ModelError: If yourdfpy cannot read the file.
+    """
+    import yourdfpy
+
+    try:
+        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    # it checks nothing by itself, so a fault of the file comes out as one of these
+    except (AttributeError, IndexError, KeyError, SyntaxError, TypeError, ValueError) as error:
+        fault = f"{type(error).__name__}: {error}"
+        raise ModelError(f"yourdfpy cannot read {Path(path).name}: {fault}") from error

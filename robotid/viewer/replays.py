@@ -202,7 +202,7 @@ def write_replay(
         t: Times, shape (N,), strictly increasing [s].
         q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
         target: The HTML file to write.
-        options: Those of :func:`replay`.
+        options: Those of ``replay``.
 
     Returns:
         Path of the file.
@@ -228,7 +228,7 @@ def live_page(
         masses: Standard parameters of the URDF, shape (p,).
 
     Returns:
-        The HTML. An event is a JSON list of objects with ``t``, ``q`` as :func:`coordinates`
+        The HTML. An event is a JSON list of objects with ``t``, ``q`` as ``coordinates``
         gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
     """
     empty = np.zeros((0, 0))

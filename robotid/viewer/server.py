@@ -1,29 +1,17 @@
-"""A live page: a server on this machine alone, and a tracker that tells it what it sees."""
+"""A live page: a server on this machine alone, which tells it what is sent."""
 
 import json
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Self
 
-import numpy as np
+__all__ = [
+    "LivePage",
+]
 
-from robotid.commands.job import Job
-from robotid.exceptions import SettingsError
-from robotid.identification.pipeline import structural_mapping
-from robotid.logs.data import Log
-from robotid.online.identifier import OnlineIdentifier
-from robotid.online.tracking import run_track
-from robotid.robot.model import RobotModel
-from robotid.viewer.replays import live_page
-from robotid.viewer.scene import coordinates
-
-__all__ = ["LivePage", "serve_track"]
-
-_RATE = 25.0  # [Hz] messages per second of the log
 _KEPT = 20_000  # messages that a page opened late still gets
 _ALIVE = 10.0  # [s] between signs of life when there is nothing to tell
 
@@ -148,89 +136,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *_: object) -> None:
         """Say nothing of each request."""
-
-
-def serve_track(
-    job: Job,
-    folder: str | None,
-    *,
-    port: int = 0,
-    speed: float = 1.0,
-    announce: Callable[[str], None],
-    finished: Callable[[dict[str, Any]], None] | None = None,
-    linger: bool = True,
-) -> dict[str, Any]:
-    """Track the one log of a job and show it in a live page as it goes.
-
-    Args:
-        job: The robot, the log and the signals' settings.
-        folder: Where the history is written; nowhere if None.
-        port: Port of the page on 127.0.0.1; any free one if 0.
-        speed: How fast the log passes, 1 is true time; 0 is as fast as the tracker can.
-        announce: Called with the address of the page.
-        finished: Called with the content of track.json when the log has ended.
-        linger: Whether the page is served on after the end, until KeyboardInterrupt.
-
-    Returns:
-        The content of track.json.
-
-    Raises:
-        DataError: If the log cannot be used.
-        KeyboardInterrupt: If the user ends it.
-        ModelError: If the URDF cannot be used.
-        OSError: If the port is taken.
-        SettingsError: If a setting does not fit.
-    """
-    if not speed >= 0:
-        raise SettingsError(f"speed is {speed}, wanted 0 or more")
-    model = job.model()
-    log = job.read(job.identification[0], model)
-    mapping = structural_mapping(model)
-    units = [model.layout.units[i] for i in mapping.independent]
-    html = live_page(model, mapping.base_names, units, log.q, model.standard_parameters())
-    with LivePage(html, port) as live:
-        announce(live.url)
-        content = run_track(job, folder, observer=_Teller(live, model, log, speed))
-        live.finish()
-        if finished is not None:
-            finished(content)
-        while linger:
-            time.sleep(3600.0)
-    return content
-
-
-class _Teller:
-    """Tells a live page what a tracker sees, no faster than the log's time passes."""
-
-    def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
-        self._live, self._model, self._log, self._speed = live, model, log, speed
-        self._due, self._marks = -np.inf, 0
-        self._began = time.monotonic()
-
-    def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
-        t, start = float(self._log.t[k]), float(self._log.t[0])
-        if t < self._due:
-            return
-        self._due = t + 1.0 / _RATE
-        if self._speed > 0:
-            ahead = (t - start) / self._speed - (time.monotonic() - self._began)
-            time.sleep(max(ahead, 0.0))
-        message = {
-            "t": t - start,
-            "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist(),
-        }
-        if identifier.is_ready:
-            reading, (tau, predicted) = identifier.reading, identifier.compared
-            message |= {
-                "at": reading.t - start,
-                "tau": tau.tolist(),
-                "predicted": predicted.tolist(),
-                "theta": reading.theta.tolist(),
-                "std_error": reading.std_error.tolist(),
-            }
-        self._live.send(message)
-        for change in identifier.changes[self._marks :]:
-            label = f"step change, flagged at {change.flagged - start:.2f} s"
-            mark = {"t": change.onset - start, "label": label, "kind": "payload"}
-            self._live.send({"mark": mark})
-        self._marks = len(identifier.changes)

@@ -7,8 +7,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from robotid import __version__
 from robotid.exceptions import MissingDependencyError, WorkerError
+from robotid.versions import __version__
 from robotid.workers.processes import Backend
 from robotid.workers.task import Outcome, Work, Workload, run_task, versions
 

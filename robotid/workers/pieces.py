@@ -42,7 +42,7 @@ class Reduction:
         Args:
             problem: The base problem of the trajectory, rows weighted.
             trajectory: The trajectory.
-            threads: As of :func:`robotid.regressor.factors.compress`.
+            threads: As of ``compress``.
 
         Returns:
             The reduction.
@@ -65,7 +65,7 @@ class Reduction:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
-        """Return the reduction that arrays hold; see :meth:`to_arrays`.
+        """Return the reduction that arrays hold; see ``to_arrays``.
 
         Args:
             arrays: The arrays by name.
@@ -101,7 +101,7 @@ class Piece(ABC):
         """Read the piece and reduce it to the factors of its base problem.
 
         Args:
-            threads: As of :func:`robotid.regressor.factors.compress`; they do not change the result.
+            threads: As of ``compress``; they do not change the result.
 
         Returns:
             The reduction; one of no samples if no sample of the piece is left.

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from robotid.commands.progress import ProgressCallback
+from robotid._typing import ProgressCallback
 from robotid.exceptions import SettingsError
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
@@ -82,7 +82,7 @@ class WorkPlan:
     def reduce(
         self, pieces: Sequence[Piece], *, checkpoint: Checkpoint | None = None
     ) -> Iterator[Reduction]:
-        """Reduce pieces; see :func:`robotid.workers.processes.reduce_pieces`.
+        """Reduce pieces; see ``reduce_pieces``.
 
         Args:
             pieces: The pieces.
@@ -101,7 +101,7 @@ class WorkPlan:
             )
 
     def map(self, work: Work, pieces: Sequence[Workload], what: str) -> Iterator[Any]:
-        """Do the same with every piece; see :func:`robotid.workers.processes.map_pieces`.
+        """Do the same with every piece; see ``map_pieces``.
 
         Args:
             work: What to do with a piece.

@@ -21,7 +21,7 @@ from typing import Any, Self
 
 from threadpoolctl import threadpool_limits
 
-from robotid.commands.progress import ProgressCallback, ignore_progress
+from robotid._typing import ProgressCallback, ignore_progress
 from robotid.exceptions import SettingsError, WorkerError
 from robotid.regressor.factors import available_cores
 from robotid.workers.checkpoint import Checkpoint
@@ -89,7 +89,7 @@ class SerialBackend(Backend):
         return "this process"
 
     def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
-        """Work on pieces; see :meth:`Backend.run`.
+        """Work on pieces; see ``Backend.run``.
 
         Args:
             work: What to do with a piece.
@@ -107,7 +107,7 @@ class SerialBackend(Backend):
 class ProcessBackend(Backend):
     """Works on pieces in worker processes, started anew, with one BLAS thread each.
 
-    The workers wait for more work until :meth:`close`; an error or the end of the process that
+    The workers wait for more work until ``close``; an error or the end of the process that
     started them, however it ends, ends them at once.
 
     Args:
@@ -130,7 +130,7 @@ class ProcessBackend(Backend):
         return f"{self.workers} worker processes, one BLAS thread each"
 
     def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
-        """Work on pieces, at most two per worker under way; see :meth:`Backend.run`.
+        """Work on pieces, at most two per worker under way; see ``Backend.run``.
 
         Args:
             work: What to do with a piece.
@@ -191,7 +191,7 @@ def reduce_pieces(
         progress: Called with ("reducing", samples done, samples in all, "samples").
 
     Yields:
-        One reduction per piece, in order; :func:`robotid.workers.pieces.join` gives the whole.
+        One reduction per piece, in order; ``join`` gives the whole.
 
     Raises:
         DataError: If a row cannot be used.

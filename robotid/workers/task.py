@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeAlias
 
 from threadpoolctl import threadpool_limits
 
-from robotid import __version__
+from robotid.versions import __version__
 from robotid.workers.pieces import Piece, Reduction
 
 __all__ = ["Outcome", "Work", "Workload", "reduce_piece", "run_task", "versions"]
@@ -65,7 +65,7 @@ def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
 
     Args:
         piece: The piece.
-        threads: As of :meth:`robotid.workers.pieces.Piece.reduce`.
+        threads: As of ``Piece.reduce``.
 
     Returns:
         The reduction.

@@ -10,10 +10,11 @@ from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, robot, table_of
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
+from robotid.commands.doctor import examine
 from robotid.commands.job import Job, LogEntry, read_job
-from robotid.doctor.diagnosis import alarming, diagnose, examine, findings_to_dict
+from robotid.doctor.diagnosis import alarming, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
-from robotid.identification.verdict import Finding
+from robotid.findings import Finding
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.logs.signals import SignalSettings

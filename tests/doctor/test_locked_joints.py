@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
-from robotid.doctor.diagnosis import examine
 from robotid.logs.read import write_log
 from robotid.logs.units import LogUnits
 from robotid.robot.examples import example_urdf

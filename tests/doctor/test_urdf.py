@@ -6,8 +6,8 @@ import pytest
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import ModelError
-from robotid.export.urdf import read_with_yourdfpy
 from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.tree import read_with_yourdfpy
 
 CLEAN = """<robot name="two">
   <link name="base"/>
@@ -300,7 +300,7 @@ def test_what_yourdfpy_cannot_read_is_a_finding(tmp_path):
 
 
 def test_the_condition_number_is_that_of_unit_columns(tmp_path):
-    from robotid.identification.pipeline import structural_mapping
+    from robotid.regressor.base_parameters import structural_mapping
     from robotid.regressor.torque import random_regressor
     from robotid.robot.model import RobotModel
 

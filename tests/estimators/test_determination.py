@@ -10,9 +10,10 @@ from robotid.doctor.motions import check_excitation
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RankDeficientError
 from robotid.export.result import build_result
-from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.signals import SignalSettings, process, resolve
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.tables import open_section
 

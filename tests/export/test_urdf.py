@@ -8,12 +8,12 @@ import pytest
 from robotid.exceptions import DataError, ModelError
 from robotid.export import urdf
 from robotid.export.sidecar import load_identified, read_sidecar
-from robotid.export.urdf import read_with_yourdfpy, write_urdf
+from robotid.export.urdf import write_urdf
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.robot.tree import read_tree
+from robotid.robot.tree import read_tree, read_with_yourdfpy
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>

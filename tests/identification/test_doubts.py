@@ -5,8 +5,9 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings
 from robotid.commands.validate import validate_result
+from robotid.findings import Finding
 from robotid.identification.doubts import doubts_of, is_outvoted
-from robotid.identification.verdict import Doubt, Finding
+from robotid.identification.verdict import Doubt
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry, job_from_settings, read_job
 from robotid.commands.logs import is_long, survey_logs
 from robotid.commands.validate import validate_result
-from robotid.doctor.diagnosis import examine
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.long_recordings import evaluate_long
-from robotid.identification.pipeline import structural_mapping
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
 from robotid.logs.signals import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 
 HELD = 1024  # rows in memory, so that pieces have 256
 

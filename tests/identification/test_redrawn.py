@@ -10,10 +10,11 @@ from robotid.estimators import Consistent
 from robotid.estimators.consistent.cones import Cone, svec, unsvec
 from robotid.estimators.consistent.solvers import nearest
 from robotid.exceptions import NotConvergedError, SettingsError
-from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.base_parameters import structural_mapping
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]

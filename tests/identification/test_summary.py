@@ -8,11 +8,11 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid._html import percent
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
-from robotid.report.page import percent
 from robotid.robot.model import RobotModel
 
 

@@ -13,7 +13,6 @@ from robotid.estimators import WLS
 from robotid.exceptions import DataError
 from robotid.identification import survey as long_logs
 from robotid.identification.evaluation import prepare
-from robotid.identification.pipeline import structural_mapping
 from robotid.identification.recordings import LoadedRecordings
 from robotid.identification.survey import survey
 from robotid.logs.data import Log
@@ -22,6 +21,7 @@ from robotid.logs.read import lay_out, read_log, write_log
 from robotid.logs.signals import SignalSettings
 from robotid.logs.time_stamps import TimeStamps
 from robotid.logs.units import LogUnits
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -10,12 +10,13 @@ from scipy.signal import butter, sosfiltfilt
 from robotid.exceptions import DataError
 from robotid.identification.bands import torque_band
 from robotid.identification.evaluation import prepare
-from robotid.identification.pipeline import conclude, identify, structural_mapping
+from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import LoadedRecordings
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_directions, friction_speeds
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 from robotid.robot.examples import example_urdf

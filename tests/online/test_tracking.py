@@ -60,7 +60,7 @@ def test_without_pyarrow_the_history_is_csv(panda, log_file, tmp_path, monkeypat
     def missing(purpose):
         raise MissingDependencyError(purpose, "pyarrow", "parquet")
 
-    monkeypatch.setattr("robotid.online.tracking.load_pyarrow", missing)
+    monkeypatch.setattr("robotid.commands.track.load_pyarrow", missing)
     monkeypatch.setattr(parquet_files, "load_pyarrow", missing)
     assert main(words(panda, tmp_path / "short.csv", str(tmp_path / "out"))) == 0
     lines = (tmp_path / "out" / "track.csv").read_text().splitlines()

@@ -5,7 +5,6 @@ import pytest
 from helpers.synthetic import truth
 
 from robotid.exceptions import DataError, RankDeficientError, SettingsError
-from robotid.identification.pipeline import structural_mapping
 from robotid.paper import planar_2r
 from robotid.paper.closed_loop import run_procedure
 from robotid.paper.dynamics import (
@@ -17,6 +16,7 @@ from robotid.paper.dynamics import (
 )
 from robotid.paper.formulas import Bounds, recursive_update
 from robotid.paper.procedure import Influences, LoopSettings, random_torque
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.simulation.plant import RobotPlant
 from robotid.simulation.program import ProgramMotion

@@ -4,7 +4,6 @@ import pytest
 from helpers.synthetic import truth
 
 from robotid.exceptions import DataError
-from robotid.identification.pipeline import structural_mapping
 from robotid.paper import planar_2r
 from robotid.paper.dynamics import (
     BaseDynamics,
@@ -14,6 +13,7 @@ from robotid.paper.dynamics import (
     smallest_eigenvalue,
     torque,
 )
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.simulation.plant import RobotPlant
 

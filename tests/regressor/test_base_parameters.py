@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, ModelError
-from robotid.identification.pipeline import structural_mapping
 from robotid.paper.planar_2r import urdf_text
-from robotid.regressor.base_parameters import base_mapping
+from robotid.regressor.base_parameters import base_mapping, structural_mapping
 from robotid.regressor.torque import random_regressor
 from robotid.robot.examples import example_urdf, example_urdfs
 from robotid.robot.model import RobotModel

@@ -7,9 +7,9 @@ import pytest
 
 from robotid.estimators import WLS
 from robotid.exceptions import DataError, MissingDependencyError
-from robotid.identification.pipeline import structural_mapping
 from robotid.logs.data import Trajectory
 from robotid.regressor import compiled, rows
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import compress
 from robotid.regressor.problem import concatenate

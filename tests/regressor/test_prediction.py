@@ -5,8 +5,8 @@ import pytest
 from regressor.test_compiled import ROBOTS, motion
 
 from robotid.exceptions import DataError
-from robotid.identification.pipeline import structural_mapping
 from robotid.regressor import prediction
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.compiled import is_installed
 from robotid.regressor.prediction import predict

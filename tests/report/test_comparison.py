@@ -10,9 +10,10 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid._files import write_json
 from robotid.cli import main
 from robotid.exceptions import DataError
-from robotid.export.result import read_result, write_json
+from robotid.export.result import read_result
 from robotid.logs.read import write_log
 from robotid.report.comparison import compare_results
 from robotid.report.comparison_page import write_comparison

@@ -6,15 +6,15 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from robotid._html import number, percent
 from robotid.exceptions import DataError
+from robotid.findings import Finding
 from robotid.identification.information import information
 from robotid.identification.pipeline import identify
-from robotid.identification.verdict import Finding
 from robotid.logs.data import Log
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.document import write_report
-from robotid.report.page import number, percent
 from robotid.report.plots import stretches, thin
 from robotid.robot.model import RobotModel
 from robotid.versions import versions

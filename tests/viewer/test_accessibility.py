@@ -9,9 +9,10 @@ from helpers.browsing import visit
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.export.result import build_result, write_json
+from robotid._files import write_json
+from robotid.export.result import build_result
+from robotid.findings import Finding
 from robotid.identification.pipeline import identify
-from robotid.identification.verdict import Finding
 from robotid.report.comparison_page import write_comparison
 from robotid.report.document import write_report
 from robotid.robot.model import RobotModel

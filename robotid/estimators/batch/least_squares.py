@@ -42,7 +42,7 @@ class OLS(Estimator):
     independent_share: float = 1.0
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the parameters; see :meth:`Estimator.fit`.
+        """Estimate the parameters; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters, or its factors.
@@ -83,7 +83,7 @@ class WLS(Estimator):
     independent_share: float = 1.0
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the parameters; see :meth:`Estimator.fit`.
+        """Estimate the parameters; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters, or its factors.

@@ -33,7 +33,7 @@ class TLS(Estimator):
     Attributes:
         regressor_noise: Noise of the columns over their root mean square [-].
         exact: Columns without noise, by the last word of their names.
-        independent_share: As of :class:`robotid.estimators.WLS`.
+        independent_share: As of ``WLS``.
 
     References:
         Golub, Hoffman, Stewart (1987), A generalization of the Eckart-Young-Mirsky matrix
@@ -45,7 +45,7 @@ class TLS(Estimator):
     independent_share: float = 1.0
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the parameters; see :meth:`Estimator.fit`.
+        """Estimate the parameters; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters, or its factors.

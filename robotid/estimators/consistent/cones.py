@@ -183,7 +183,7 @@ def svec(S: Array) -> Array:
 
 
 def unsvec(vector: Array) -> Array:
-    """Return the 4 x 4 matrices of stacked vectors; the inverse of :func:`svec`.
+    """Return the 4 x 4 matrices of stacked vectors; the inverse of ``svec``.
 
     Args:
         vector: Vectors of 10 entries, one after the other, shape (10 m,).

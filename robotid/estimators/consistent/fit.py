@@ -65,7 +65,7 @@ class Consistent(Estimator):
         independent_share: Share of the rows that count as independent, 2 cutoff / rate.
         max_iterations: Bound on the iterations of the cone solver.
         metric: How the distance from the prior is measured: "euclidean",
-            "riemannian" or "entropic"; see :func:`robotid.estimators.consistent.penalties.make_penalty`.
+            "riemannian" or "entropic"; see ``make_penalty``.
         constraints: Bounds beside physical consistency.
         solver: "clarabel" or "scs".
         choice: How ``prior_weight`` was chosen, if it was.
@@ -113,14 +113,14 @@ class Consistent(Estimator):
         check_constraints(self.constraints, self.layout, self.prior, self._held)
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the standard parameters; see :meth:`Estimator.fit`.
+        """Estimate the standard parameters; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters, or its factors.
 
         Returns:
             The estimate over the p standard parameters. The covariance is that of the fit without
-            the inequalities; :meth:`redrawn` tells that with them. Rank, condition number and the
+            the inequalities; ``redrawn`` tells that with them. Rank, condition number and the
             names of undetermined parameters are those of the base parameters.
 
         Raises:
@@ -154,7 +154,7 @@ class Consistent(Estimator):
         """Return the possible standard parameters nearest to an estimate of the base parameters.
 
         Nearest in the metric of its covariance C, the prior beside it, with the constraints of
-        :meth:`fit`: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi).
+        ``fit``: minimises (K pi - beta)^T C^-1 (K pi - beta) + prior_weight penalty(pi).
 
         Args:
             estimate: Base parameters, as a recursive estimator has them at any moment. Those of
@@ -195,7 +195,7 @@ class Consistent(Estimator):
             sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
 
         Returns:
-            Noise levels, shape (n,) [N m or N]; see :meth:`Programme.noise`.
+            Noise levels, shape (n,) [N m or N]; see ``Programme.noise``.
         """
         start = self._wls(factors).sigma if sigma is None else sigma
         return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
@@ -216,7 +216,7 @@ class Consistent(Estimator):
         """Minimise |rows [K pi; -1]|^2 and the weighted penalty over the cone.
 
         Args:
-            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+            rows: Information, shape (k, b + 1), as of ``rows``.
 
         Returns:
             The solution, its x being pi, shape (p,); and the covariance without the inequalities.
@@ -232,19 +232,19 @@ class Consistent(Estimator):
         """Return how fits lie about this one whose data and prior are drawn anew.
 
         Args:
-            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+            rows: Information, shape (k, b + 1), as of ``rows``.
             pi: The fit, shape (p,).
             meat: Covariance of the score of the rows, shape (b, b).
             draws: How many.
             rng: Source of the noise.
 
         Returns:
-            See :meth:`Programme.redrawn`.
+            See ``Programme.redrawn``.
         """
         return self.programme.redrawn(rows, self.prior_weight, pi, meat, draws, rng)
 
     def objective(self, rows: Array, pi: Array) -> float:
-        """Return what :meth:`minimise` minimises.
+        """Return what ``minimise`` minimises.
 
         Args:
             rows: Information, shape (k, b + 1).
@@ -296,10 +296,10 @@ class Consistent(Estimator):
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the base parameters that the data do not determine by themselves.
 
-        See :func:`robotid.estimators.determination.determine`; whatever metric and weight the prior has.
+        See ``determine``; whatever metric and weight the prior has.
 
         Args:
-            rows: Information, shape (k, b + 1), as of :meth:`rows`.
+            rows: Information, shape (k, b + 1), as of ``rows``.
             base_names: Names of the base parameters.
 
         Returns:

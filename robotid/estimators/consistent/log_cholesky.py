@@ -35,7 +35,7 @@ _SPREAD = 1.0  # of random starts, in log-Cholesky parameters
 
 @dataclass(frozen=True, eq=False)
 class LogCholesky(Estimator):
-    """The fit of :class:`Consistent`, over coordinates in which every point is possible.
+    """The fit of ``Consistent``, over coordinates in which every point is possible.
 
     Beside its held share and its margin, a body's pseudo-inertia is U U^T with U an upper
     triangle whose diagonal is exponential, and a drive's coefficient an exponential. The problem
@@ -65,7 +65,7 @@ class LogCholesky(Estimator):
             )
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the standard parameters; see :meth:`Estimator.fit`.
+        """Estimate the standard parameters; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters, or its factors.
@@ -125,7 +125,7 @@ class LogCholesky(Estimator):
         """Return gradient and Hessian of the objective with respect to the coordinates.
 
         Args:
-            rows: Information, shape (k, b + 1), as of :meth:`Consistent.rows`.
+            rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
 
         Returns:
@@ -212,7 +212,7 @@ def from_log_cholesky(z: Array) -> Array:
 
 
 def to_log_cholesky(J: Array) -> Array:
-    """Return the log-Cholesky parameters of matrices; the inverse of :func:`from_log_cholesky`.
+    """Return the log-Cholesky parameters of matrices; the inverse of ``from_log_cholesky``.
 
     Args:
         J: Positive definite matrices, shape (n, 4, 4).

@@ -116,7 +116,7 @@ class Quadratic(Penalty):
         return True
 
     def value(self, pi: Array) -> float:
-        """Return the penalty; see :meth:`Penalty.value`.
+        """Return the penalty; see ``Penalty.value``.
 
         Args:
             pi: Standard parameters, shape (p,).
@@ -210,7 +210,7 @@ def make_penalty(
     * "euclidean": |(pi - prior) / prior_std|^2;
     * "entropic": twice the Bregman divergence of -log det between the pseudo-inertias of each
       body and its prior;
-    * "riemannian": delta^T g delta with g of :func:`pull_back_metric` at the prior, half the
+    * "riemannian": delta^T g delta with g of ``pull_back_metric`` at the prior, half the
       Hessian of the entropic one there.
 
     The latter two do not depend on the frame a body is stated in; the drives stay Euclidean. A

@@ -22,9 +22,9 @@ _STEPS = (0.5, 0.25)  # decades by which the best one is refined
 def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> WeightChoice:
     """Return the weight of the prior that the fitted data speak for.
 
-    * "cv": the heaviest weight whose :func:`held_out_errors` are within two standard errors of the
+    * "cv": the heaviest weight whose ``held_out_errors`` are within two standard errors of the
       smallest ones, stretch by stretch: a weight that wins by chance follows the noise.
-    * "evidence": the weight with the largest :func:`log_evidence`.
+    * "evidence": the weight with the largest ``log_evidence``.
 
     Weights are tried from 1 down to 1e-4 (entropic: 0.1) at most, by decades until two in a row
     are worse than those before, then around the best one. None is heavier than 1: a good
@@ -97,7 +97,7 @@ def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
 
     Args:
         fit: The fit, whose own weight does not matter.
-        rows: Information, shape (k, b + 1), as of :meth:`Consistent.rows`.
+        rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
         weight: Weight of the prior.
 
     Returns:

@@ -25,8 +25,8 @@ StateT = TypeVar("StateT")
 class RecursiveEstimator(Estimator, Generic[StateT]):
     """Settings go into the constructor, everything learnt into a state that is never changed.
 
-    A state is a frozen dataclass of arrays and numbers: :func:`save_state` and
-    :func:`load_state` keep every bit of it.
+    A state is a frozen dataclass of arrays and numbers: ``save_state`` and
+    ``load_state`` keep every bit of it.
     """
 
     @abstractmethod

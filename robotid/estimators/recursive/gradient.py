@@ -69,7 +69,7 @@ class NormalisedGradient(RecursiveEstimator[DescentState]):
                 raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
 
     def init(self, c: int) -> DescentState:
-        """Return the state before any sample; see :meth:`RecursiveEstimator.init`.
+        """Return the state before any sample; see ``RecursiveEstimator.init``.
 
         Args:
             c: Number of parameters.
@@ -80,7 +80,7 @@ class NormalisedGradient(RecursiveEstimator[DescentState]):
         return start_state(c, len(self.sigma), self.prior, self.scale)
 
     def update(self, state: DescentState, sample: Sample) -> DescentState:
-        """Return the state after one more sample; see :meth:`RecursiveEstimator.update`.
+        """Return the state after one more sample; see ``RecursiveEstimator.update``.
 
         Args:
             state: The state before.
@@ -102,7 +102,7 @@ class NormalisedGradient(RecursiveEstimator[DescentState]):
         )
 
     def estimate(self, state: DescentState, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds; see :meth:`RecursiveEstimator.estimate`.
+        """Return the estimate that a state holds; see ``RecursiveEstimator.estimate``.
 
         Args:
             state: The state.
@@ -114,7 +114,7 @@ class NormalisedGradient(RecursiveEstimator[DescentState]):
         return descent_estimate(state, self.scale, names, self.eps1)
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Visit the samples of a problem, until the gradient is 0; see :meth:`Estimator.fit`.
+        """Visit the samples of a problem, until the gradient is 0; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters.

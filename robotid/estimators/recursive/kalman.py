@@ -89,7 +89,7 @@ class Kalman(RecursiveEstimator[KalmanState]):
             raise DataError(f"gate is {self.gate}, wanted at least 0.5 and below 1, or None")
 
     def init(self, c: int) -> KalmanState:
-        """Return the state before any sample; see :meth:`RecursiveEstimator.init`.
+        """Return the state before any sample; see ``RecursiveEstimator.init``.
 
         Args:
             c: Number of parameters.
@@ -111,7 +111,7 @@ class Kalman(RecursiveEstimator[KalmanState]):
         return KalmanState(self.prior, P, np.zeros(n), none, none, none, 0)
 
     def update(self, state: KalmanState, sample: Sample) -> KalmanState:
-        """Return the state after one more sample; see :meth:`RecursiveEstimator.update`.
+        """Return the state after one more sample; see ``RecursiveEstimator.update``.
 
         Args:
             state: The state before.
@@ -154,7 +154,7 @@ class Kalman(RecursiveEstimator[KalmanState]):
         )
 
     def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds; see :meth:`RecursiveEstimator.estimate`.
+        """Return the estimate that a state holds; see ``RecursiveEstimator.estimate``.
 
         Args:
             state: The state.
@@ -185,7 +185,7 @@ class Kalman(RecursiveEstimator[KalmanState]):
         )
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Fold all samples of a problem; see :meth:`Estimator.fit`.
+        """Fold all samples of a problem; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters.

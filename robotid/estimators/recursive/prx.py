@@ -90,7 +90,7 @@ class PRX(RecursiveEstimator[DescentState]):
                 raise DataError(f"{name} is {value}, wanted a positive number")
 
     def init(self, c: int) -> DescentState:
-        """Return the state before any sample; see :meth:`RecursiveEstimator.init`.
+        """Return the state before any sample; see ``RecursiveEstimator.init``.
 
         Args:
             c: Number of parameters.
@@ -101,7 +101,7 @@ class PRX(RecursiveEstimator[DescentState]):
         return start_state(c, len(self.sigma), self.prior, self.scale)
 
     def update(self, state: DescentState, sample: Sample) -> DescentState:
-        """Return the state after one more sample; see :meth:`RecursiveEstimator.update`.
+        """Return the state after one more sample; see ``RecursiveEstimator.update``.
 
         Args:
             state: The state before.
@@ -130,7 +130,7 @@ class PRX(RecursiveEstimator[DescentState]):
         return moved if self.bounds is None else self._bounded(moved)
 
     def estimate(self, state: DescentState, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds; see :meth:`RecursiveEstimator.estimate`.
+        """Return the estimate that a state holds; see ``RecursiveEstimator.estimate``.
 
         Args:
             state: The state.
@@ -142,7 +142,7 @@ class PRX(RecursiveEstimator[DescentState]):
         return descent_estimate(state, self.scale, names, self.eps1)
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Visit the samples of a problem, until PRX = 0; see :meth:`Estimator.fit`.
+        """Visit the samples of a problem, until PRX = 0; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters.

@@ -84,7 +84,7 @@ class RLS(RecursiveEstimator[RLSState]):
             )
 
     def init(self, c: int) -> RLSState:
-        """Return the state before any sample; see :meth:`RecursiveEstimator.init`.
+        """Return the state before any sample; see ``RecursiveEstimator.init``.
 
         Args:
             c: Number of parameters.
@@ -99,7 +99,7 @@ class RLS(RecursiveEstimator[RLSState]):
         return RLSState(R, 0.0, 0)
 
     def update(self, state: RLSState, sample: Sample) -> RLSState:
-        """Return the state after one more sample; see :meth:`RecursiveEstimator.update`.
+        """Return the state after one more sample; see ``RecursiveEstimator.update``.
 
         Args:
             state: The state before.
@@ -124,7 +124,7 @@ class RLS(RecursiveEstimator[RLSState]):
         return RLSState(R, count, state.steps + 1)
 
     def estimate(self, state: RLSState, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds; see :meth:`RecursiveEstimator.estimate`.
+        """Return the estimate that a state holds; see ``RecursiveEstimator.estimate``.
 
         Args:
             state: The state.
@@ -157,7 +157,7 @@ class RLS(RecursiveEstimator[RLSState]):
         )
 
     def fit(self, data: Problem | Factors) -> Estimate:
-        """Fold all samples of a problem; see :meth:`Estimator.fit`.
+        """Fold all samples of a problem; see ``Estimator.fit``.
 
         Args:
             data: A problem in base parameters.

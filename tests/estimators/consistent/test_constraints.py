@@ -10,10 +10,11 @@ from robotid.estimators import Consistent
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.identification.constraint_settings import ConstraintSettings
-from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem
 

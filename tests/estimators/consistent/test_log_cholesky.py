@@ -17,10 +17,11 @@ from robotid.estimators.consistent.log_cholesky import (
     to_log_cholesky,
 )
 from robotid.exceptions import SettingsError
-from robotid.identification.pipeline import identify, structural_mapping
+from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import SignalSettings, process
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem
 from robotid.robot.parameters import inertial_from_pseudo_inertia

@@ -4,8 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from helpers.synthetic import truth
 from estimators.test_all_estimators import NOISE, Case, consistent
+from helpers.synthetic import truth
 
 from robotid.estimators import (
     OLS,
@@ -23,7 +23,7 @@ from robotid.estimators import (
 )
 from robotid.estimators.recursive.descent import column_scale
 from robotid.exceptions import DataError, RankDeficientError
-from robotid.identification.pipeline import structural_mapping
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.problem import Problem, Sample
 from robotid.regressor.torque import build_problem, joint_torque_regressor, mass_regressor

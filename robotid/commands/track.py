@@ -1,0 +1,222 @@
+"""Track a recorded log as if it came in live: history in files, or a live page."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._files import file_sha256, write_json
+from robotid.commands.job import Job
+from robotid.exceptions import MissingDependencyError, SettingsError
+from robotid.logs.data import Log
+from robotid.logs.formats import write_columns
+from robotid.logs.parquet_files import load_pyarrow
+from robotid.online.identifier import OnlineIdentifier
+from robotid.online.settings import OnlineSettings
+from robotid.online.tracking import Observer, Track, track
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.versions import __version__
+from robotid.viewer.replays import live_page
+from robotid.viewer.scene import coordinates
+from robotid.viewer.server import LivePage
+
+__all__ = ["run_track", "serve_track"]
+
+
+_SCHEMA = 1
+_RATE = 25.0  # [Hz] messages per second of the log
+
+
+def run_track(
+    job: Job, folder: str | Path | None, *, observer: Observer | None = None
+) -> dict[str, Any]:
+    """Track the one log of a job; write the history and track.json.
+
+    Args:
+        job: The robot, the log and the signals' settings.
+        folder: Where to write; made if it is missing. Nothing is written if None.
+        observer: Called after each sample with its row of the log and the identifier.
+
+    Returns:
+        The content of track.json.
+
+    Raises:
+        DataError: If the log cannot be used.
+        ModelError: If the URDF cannot be used.
+        SettingsError: If a setting does not fit.
+    """
+    model = job.model()
+    if len(job.identification) != 1:
+        raise SettingsError(f"track takes one log, found {len(job.identification)}")
+    log = job.read(job.identification[0], model)
+    if job.signals.cutoff is None:
+        raise SettingsError("tracking differentiates positions as they come: it needs a cutoff")
+    step = float(np.median(np.diff(log.t)))
+    settings = OnlineSettings(
+        rate=job.signals.rate or 1.0 / step,
+        cutoff=job.signals.cutoff,
+        min_velocity=job.signals.min_velocity,
+    )
+    found = track(model, log, settings, observer=observer)
+    history = _history_name()
+    content = _summary(found, job, log, history)
+    if folder is not None:
+        target = Path(folder)
+        target.mkdir(parents=True, exist_ok=True)
+        write_columns(found.columns(), target / history)
+        write_json(content, target / "track.json")
+    return content
+
+
+def _history_name() -> str:
+    try:
+        load_pyarrow("writing Parquet")
+    except MissingDependencyError:
+        return "track.csv"
+    return "track.parquet"
+
+
+def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
+    identifier = found.identifier
+    model, mapping = identifier.model, identifier.mapping
+    converged = np.flatnonzero(found.converged)
+    last = identifier.reading
+    return {
+        "schema_version": _SCHEMA,
+        "robotid": __version__,
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": job.to_settings(),
+        "inputs": [
+            {"role": "urdf", "path": str(job.urdf), "sha256": file_sha256(job.urdf)},
+            {"role": "log", "path": log.path, "sha256": file_sha256(log.path)},
+        ],
+        "samples": len(log.t),
+        "delay": identifier.delay,
+        "first_estimate": float(found.t[0]),
+        "converged_at": float(found.t[converged[0]]) if len(converged) else None,
+        "excitation": last.excitation,
+        "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
+        "base_parameters": [
+            {
+                "name": name,
+                "expression": expression,
+                "value": float(value),
+                "std_error": float(error),
+                "unit": model.layout.units[i],
+            }
+            for name, expression, value, error, i in zip(
+                mapping.base_names,
+                mapping.expressions,
+                last.theta,
+                last.std_error,
+                mapping.independent,
+                strict=True,
+            )
+        ],
+        "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
+        "history": history,
+    }
+
+
+def _change(identifier: OnlineIdentifier, index: int) -> dict[str, Any]:
+    """Return a change, and the load that would explain it, by the end of the log."""
+    change, load = identifier.changes[index], identifier.payload(index)
+    return {
+        "flagged": change.flagged,
+        "onset": change.onset,
+        "payload": {
+            "body": identifier.model.layout.bodies[-1],
+            "mass": load.mass,
+            "std_error": load.mass_std_error,
+        },
+    }
+
+
+def serve_track(
+    job: Job,
+    folder: str | None,
+    *,
+    port: int = 0,
+    speed: float = 1.0,
+    announce: Callable[[str], None],
+    finished: Callable[[dict[str, Any]], None] | None = None,
+    linger: bool = True,
+) -> dict[str, Any]:
+    """Track the one log of a job and show it in a live page as it goes.
+
+    Args:
+        job: The robot, the log and the signals' settings.
+        folder: Where the history is written; nowhere if None.
+        port: Port of the page on 127.0.0.1; any free one if 0.
+        speed: How fast the log passes, 1 is true time; 0 is as fast as the tracker can.
+        announce: Called with the address of the page.
+        finished: Called with the content of track.json when the log has ended.
+        linger: Whether the page is served on after the end, until KeyboardInterrupt.
+
+    Returns:
+        The content of track.json.
+
+    Raises:
+        DataError: If the log cannot be used.
+        KeyboardInterrupt: If the user ends it.
+        ModelError: If the URDF cannot be used.
+        OSError: If the port is taken.
+        SettingsError: If a setting does not fit.
+    """
+    if not speed >= 0:
+        raise SettingsError(f"speed is {speed}, wanted 0 or more")
+    model = job.model()
+    log = job.read(job.identification[0], model)
+    mapping = structural_mapping(model)
+    units = [model.layout.units[i] for i in mapping.independent]
+    html = live_page(model, mapping.base_names, units, log.q, model.standard_parameters())
+    with LivePage(html, port) as live:
+        announce(live.url)
+        content = run_track(job, folder, observer=_Teller(live, model, log, speed))
+        live.finish()
+        if finished is not None:
+            finished(content)
+        while linger:
+            time.sleep(3600.0)
+    return content
+
+
+class _Teller:
+    """Tells a live page what a tracker sees, no faster than the log's time passes."""
+
+    def __init__(self, live: LivePage, model: RobotModel, log: Log, speed: float) -> None:
+        self._live, self._model, self._log, self._speed = live, model, log, speed
+        self._due, self._marks = -np.inf, 0
+        self._began = time.monotonic()
+
+    def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
+        t, start = float(self._log.t[k]), float(self._log.t[0])
+        if t < self._due:
+            return
+        self._due = t + 1.0 / _RATE
+        if self._speed > 0:
+            ahead = (t - start) / self._speed - (time.monotonic() - self._began)
+            time.sleep(max(ahead, 0.0))
+        message = {
+            "t": t - start,
+            "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist(),
+        }
+        if identifier.is_ready:
+            reading, (tau, predicted) = identifier.reading, identifier.compared
+            message |= {
+                "at": reading.t - start,
+                "tau": tau.tolist(),
+                "predicted": predicted.tolist(),
+                "theta": reading.theta.tolist(),
+                "std_error": reading.std_error.tolist(),
+            }
+        self._live.send(message)
+        for change in identifier.changes[self._marks :]:
+            label = f"step change, flagged at {change.flagged - start:.2f} s"
+            mark = {"t": change.onset - start, "label": label, "kind": "payload"}
+            self._live.send({"mark": mark})
+        self._marks = len(identifier.changes)

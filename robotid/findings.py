@@ -1,0 +1,39 @@
+"""What a user should know of logs, of a robot or of a result."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+__all__ = ["Finding", "by_severity"]
+
+_RANK = {"error": 0, "warning": 1, "note": 2}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something a user must know.
+
+    Attributes:
+        code: A fixed word for programs.
+        severity: "note", "warning" or "error".
+        where: What it is about: a link, a joint, a parameter or a file.
+        message: What was found, what was wanted, what to do.
+        evidence: The figures it rests on, by name.
+    """
+
+    code: str
+    severity: str
+    where: str
+    message: str
+    evidence: Mapping[str, float] = field(default_factory=dict)
+
+
+def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings with the errors first, then warnings, then notes.
+
+    Args:
+        findings: The findings; those of one severity keep their order.
+
+    Returns:
+        The same, sorted.
+    """
+    return tuple(sorted(findings, key=lambda finding: _RANK[finding.severity]))
