@@ -24,7 +24,14 @@ class Motion(Protocol):
     """A motion that a controller can track."""
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return q, v, a, each of shape (N, n), at the times t, shape (N,) [s]."""
+        """Return positions, velocities and accelerations.
+
+        Args:
+            t: Times, shape (N,) [s].
+
+        Returns:
+            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
+        """
 
 
 @dataclass(frozen=True)

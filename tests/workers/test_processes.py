@@ -24,7 +24,7 @@ from robotid.regressor.factors import available_cores
 from robotid.workers.pieces import Reduction, join
 from robotid.workers.processes import ProcessBackend, choose_workers
 
-SCRIPT = Path(__file__).with_name("piecework.py")
+SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
 
 
 def is_running(pid):
