@@ -133,7 +133,7 @@ def version_table() -> str:
 
 def _shown(found: Identification) -> Evaluation:
     """Return the recording that is looked into: the first one that was not fitted."""
-    return (found.validation or found.identification)[0]
+    return (found.validation or found.fitted)[0]
 
 
 def _residual_figure(e: Evaluation, row: int, name: str, unit: str) -> str:
