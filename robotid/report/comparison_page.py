@@ -1,13 +1,12 @@
 """The page that shows several results side by side."""
 
-import os
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from robotid._files import write_text
 from robotid._html import Cell, code, number, page, percent, table, text
-from robotid.exceptions import DataError
 from robotid.report.comparison import compare_results
 
 __all__ = ["comparison_page", "write_comparison"]
@@ -29,15 +28,7 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
         DataError: If the results cannot be compared, or the folder of the target is missing.
     """
     content = compare_results(paths)
-    path = Path(target)
-    if not path.parent.is_dir():
-        raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(comparison_page(content), encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_text(comparison_page(content), target)
     return content
 
 

@@ -1,12 +1,11 @@
 """The report: one HTML file that reads without a network, on a screen, a phone or paper."""
 
-import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from robotid._files import write_text
 from robotid._html import code, figure, number, page, percent, table, text
-from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
@@ -86,9 +85,6 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    path = Path(target)
-    if not path.parent.is_dir():
-        raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
     contents = {
         "errors": _errors(identification),
         "torques": _torques(identification),
@@ -113,13 +109,7 @@ def write_report(
     )
     title = f"{identification.model.name}: identified parameters"
     html = page(title, f"{_summary(identification)}{nav}\n{sections}")
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(html, encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
-    return path
+    return write_text(html, target)
 
 
 def _summary(found: Identification) -> str:
