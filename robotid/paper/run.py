@@ -24,7 +24,7 @@ from robotid.paper.study import (
     paper_arm,
     study_model,
 )
-from robotid.report.plots import STYLE, svg_element
+from robotid.report.svg import STYLE, svg_element
 from robotid.versions import __version__
 
 __all__ = ["run_paper"]
