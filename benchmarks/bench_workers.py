@@ -22,8 +22,8 @@ from setting import ROBOTS, machine
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import survey_logs
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.reduction import join
 from robotid.robot.examples import example_urdf
-from robotid.workers.pieces import join
 from robotid.workers.plan import WorkPlan
 
 WRITE = Path(bench_memory.__file__)

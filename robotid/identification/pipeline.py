@@ -41,11 +41,11 @@ from robotid.logs.data import Log
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
+from robotid.regressor.reduction import join
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.workers.pieces import join
 
 __all__ = [
     "ESTIMATORS",

@@ -15,8 +15,8 @@ from robotid.identification.recordings import LoadedRecordings, Recordings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import drive_columns
 from robotid.regressor.prediction import predict
+from robotid.regressor.reduction import Reduction, join
 from robotid.robot.model import RobotModel
-from robotid.workers.pieces import Reduction, join
 
 __all__ = [
     "LOSSES",

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from robotid.exceptions import DataError
-from robotid.workers.pieces import Piece, Reduction
+from robotid.regressor.reduction import Reduction
+from robotid.workers.pieces import Piece
 
 __all__ = ["FOLDER", "Checkpoint"]
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors
+from robotid.regressor.reduction import Reduction, join
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Piece, Reduction, join
+from robotid.workers.pieces import Piece
 from robotid.workers.processes import ProcessBackend, SerialBackend, reduce_pieces
 
 NAMES = ("a", "b", "c", "d", "e")

@@ -6,9 +6,9 @@ import pytest
 from helpers.piecework import marks, pieces_in, reduce_all, reduced, same_bits, workers_of
 
 from robotid.exceptions import DataError, WorkerError
+from robotid.regressor.reduction import join
 from robotid.workers import cluster
 from robotid.workers.cluster import ClusterBackend
-from robotid.workers.pieces import join
 
 distributed = pytest.importorskip("distributed")
 

@@ -1,7 +1,6 @@
 """Who reduces pieces never shows in the result; what goes wrong is said by name."""
 
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -14,14 +13,11 @@ from helpers.piecework import marks, pieces_in, reduce_all, same_bits, workers_o
 
 from robotid.exceptions import (
     DataError,
-    MissingDependencyError,
-    NotConvergedError,
-    RankDeficientError,
     SettingsError,
     WorkerError,
 )
 from robotid.regressor.factors import available_cores
-from robotid.workers.pieces import Reduction, join
+from robotid.regressor.reduction import Reduction, join
 from robotid.workers.processes import ProcessBackend, choose_workers
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
@@ -170,21 +166,3 @@ def test_workers_default_to_the_cores_for_long_work_only(tmp_path):
         choose_workers(short, 0)
     with pytest.raises(SettingsError, match="workers is 0, wanted at least 1"):
         ProcessBackend(0)
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        DataError("no", "gap"),
-        RankDeficientError(3, ["a.m"], 4),
-        NotConvergedError("no", "stalled"),
-        MissingDependencyError("reading", "pyarrow", "parquet"),
-    ],
-    ids=lambda error: type(error).__name__,
-)
-def test_errors_travel_between_processes_with_their_facts(error):
-    error.add_note("while reducing a")
-    again = pickle.loads(pickle.dumps(error))
-    assert type(again) is type(error)
-    assert str(again) == str(error)
-    assert vars(again) == vars(error)
