@@ -1,15 +1,12 @@
 """Run the paper's simulation and write its figures, tables and numbers."""
 
-import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from robotid._files import folder_beside, write_json
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.paper import plots
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
@@ -27,7 +24,7 @@ from robotid.paper.study import (
     paper_arm,
     study_model,
 )
-from robotid.report.plots import STYLE, svg_element
+from robotid.report.svg import STYLE, svg_element
 from robotid.versions import __version__
 
 __all__ = ["run_paper"]
@@ -211,8 +208,7 @@ def _write(
     """Write all files beside their places, then put each in place."""
     import matplotlib
 
-    beside = Path(tempfile.mkdtemp(prefix=".paper.", dir=target))
-    try:
+    with folder_beside(target) as beside:
         shown = {}
         with matplotlib.rc_context(STYLE):
             for name, figure in figures.items():
@@ -222,12 +218,7 @@ def _write(
                 shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
         write_paper_replay(study, beside)
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
-        text = json.dumps(content, allow_nan=False, indent=1)
-        (beside / "paper.json").write_text(text + "\n", encoding="utf-8")
-        for file in sorted(beside.iterdir()):
-            os.replace(file, target / file.name)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        write_json(content, beside / "paper.json")
 
 
 def _counter(what: str, most: int, report: ProgressCallback) -> Callable[[int], None]:
