@@ -263,17 +263,16 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
     return Scatter(meat, bread, inflation, R, adjusted)
 
 
-def quantile(freedom: Array, coverage: float = 0.95) -> Array:
-    """Return how many standard errors a two-sided interval reaches.
+def quantile(freedom: Array) -> Array:
+    """Return how many standard errors a two-sided 95 % interval reaches.
 
     Args:
         freedom: Degrees of freedom of each standard error, shape (c,).
-        coverage: Probability that the interval holds the truth.
 
     Returns:
         Quantiles of Student's distribution, shape (c,).
     """
-    reach: Array = scipy.special.stdtrit(freedom, 0.5 + coverage / 2)
+    reach: Array = scipy.special.stdtrit(freedom, 0.975)
     return reach
 
 
@@ -289,8 +288,10 @@ def _bounded(
 
     The meat is that of the rows as ``Consistent.rows`` has them, of which a share counts.
     """
-    rows = redraws.fit.rows(factors, sigma)
-    found, failures = redraws.fit.redrawn(rows, estimate.theta, meat, redraws.draws, redraws.rng)
+    fit = redraws.fit
+    found, failures = fit.programme.redrawn(
+        fit.rows(factors, sigma), fit.prior_weight, estimate.theta, meat, redraws.draws, redraws.rng
+    )
     if len(found) < _LEAST_SOLVED * redraws.draws:
         raise NotConvergedError(
             f"the spread of the fit where its bounds bind is not known: Clarabel solved "
