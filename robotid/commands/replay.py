@@ -151,7 +151,7 @@ def replay_identified(identification: Identification) -> Replay:
     Returns:
         The page: measured and predicted torque, masses before and after.
     """
-    shown = (*identification.identification, *identification.validation)[-1]
+    shown = (*identification.fitted, *identification.validation)[-1]
     motion = shown.recording.trajectory
     predicted = _sure(shown.torques["estimate"], shown.recording.mask)
     return replay(

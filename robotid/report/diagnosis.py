@@ -123,7 +123,7 @@ def information_section(found: Identification) -> str:
 
 def _shown(found: Identification) -> Evaluation:
     """Return the recording that is looked into: the first one that was not fitted."""
-    return (found.validation or found.identification)[0]
+    return (found.validation or found.fitted)[0]
 
 
 def _residual_figure(e: Evaluation, row: int, name: str, unit: str) -> str:

@@ -92,7 +92,7 @@ def write_report(
 
 
 def _summary(found: Identification) -> str:
-    verdict, fitted, kept = found.verdict, found.identification, found.validation
+    verdict, fitted, kept = found.verdict, found.fitted, found.validation
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
@@ -135,8 +135,8 @@ def _errors(found: Identification) -> str:
         )
         for e in found.validation
     ]
-    count = len(found.identification)
-    fitted = "All fitted rows together" if count > 1 else f"{_names(found.identification)}: fitted"
+    count = len(found.fitted)
+    fitted = "All fitted rows together" if count > 1 else f"{_names(found.fitted)}: fitted"
     tables.append(_error_table(fitted, found, found.metrics(), found.metrics("wls")))
     return (
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
@@ -187,7 +187,7 @@ def _remark(measured: JointMetrics) -> str:
 
 
 def _torques(found: Identification) -> str:
-    model, evaluations = found.model, found.validation or found.identification
+    model, evaluations = found.model, found.validation or found.fitted
     shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
     points = min(_LONGEST, max(200, _POINTS // (3 * model.n_rows * len(shown))))
     parts = [
@@ -254,7 +254,7 @@ def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
     known = [finding.message for finding in findings]
     notes = [
         Finding("log_note", "note", str(e.recording.log.path), note)
-        for e in (*found.identification, *found.validation)
+        for e in (*found.fitted, *found.validation)
         for note in e.recording.log.notes
         if not any(message.endswith(note) for message in known)
     ]

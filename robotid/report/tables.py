@@ -237,7 +237,7 @@ def settings_tables(found: Identification) -> str:
         pairs[f"coupling {coupling.name}"] = ratios
     rows = [[text(key), text(value)] for key, value in pairs.items()]
     headers = ["log", "filter", "rate Hz", "velocity", "trim s", "least speed", "gap s"]
-    signals = [_signal_row(e.recording) for e in (*found.identification, *found.validation)]
+    signals = [_signal_row(e.recording) for e in (*found.fitted, *found.validation)]
     return table("Model and estimator", ["setting", "value"], rows) + table(
         "Signals, as used for each log; least speed in rad/s or m/s", headers, signals
     )
@@ -254,7 +254,7 @@ def input_table(found: Identification) -> str:
     """
     urdf = found.model.tree.path
     rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
-    for role, evaluations in (("fitted", found.identification), ("validation", found.validation)):
+    for role, evaluations in (("fitted", found.fitted), ("validation", found.validation)):
         rows += [[text(role), *_input_row(e.recording)] for e in evaluations]
     headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "stretches", "SHA-256"]
     return table("Files read", headers, rows)
