@@ -9,11 +9,12 @@ import numpy as np
 from robotid._files import folder_beside, write_json
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.paper import plots
+from robotid.paper.dynamics import PlanarDynamics, torque
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
 from robotid.paper.page import paper_page
+from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.random_motions import RandomRuns, random_runs
-from robotid.paper.replay import write_paper_replay
 from robotid.paper.study import (
     AMPLITUDE,
     CASES,
@@ -25,11 +26,15 @@ from robotid.paper.study import (
     study_model,
 )
 from robotid.report.svg import STYLE, svg_element
+from robotid.robot.model import RobotModel
+from robotid.simulation.program import ProgramMotion
 from robotid.versions import __version__
+from robotid.viewer.replays import Torques, write_replay
 
 __all__ = ["run_paper"]
 
 _ENOUGH = 1e-4  # [-] relative error at which the simulation has converged
+_SAMPLES = 241  # of the replay
 _CAPTIONS = {
     "figure_3a": "Figure 3(a). The program motion of link 1, (28)",
     "figure_3b": "Figure 3(b). The program motion of link 2, (28)",
@@ -216,9 +221,33 @@ def _write(
                 figure.set_layout_engine("none")  # it is laid out now
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
                 shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
-        write_paper_replay(study, beside)
+        _write_replay(study, beside)
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
         write_json(content, beside / "paper.json")
+
+
+def _write_replay(study: ModelStudy, folder: Path) -> None:
+    """Write planar_2r.urdf and replay.html: the program motion (28) of the physical arm."""
+    (folder / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
+    model = RobotModel.from_urdf(folder / "planar_2r.urdf")
+    t = np.linspace(0.0, DURATION, _SAMPLES)
+    q, v, a = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(t)
+    dynamics = PlanarDynamics("corrected")
+    estimates = study.history.estimates[:, 0]
+    last = len(estimates) - 1
+    guesses = {"first guess": estimates[0], f"after {last} iterations": estimates[-1]}
+    write_replay(
+        model,
+        t,
+        q,
+        folder / "replay.html",
+        torques=Torques(
+            t,
+            torque(dynamics, q, v, a, study.P),
+            {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
+        ),
+        notes=["Program motion (28); arcs are coloured by the residual of the first guess."],
+    )
 
 
 def _counter(what: str, most: int, report: ProgressCallback) -> Callable[[int], None]:
