@@ -28,7 +28,7 @@ def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]
     sections = {
         "result": (
             "What the simulation reaches",
-            _result_table(content) + _parameter_tables(content),
+            _result_table(content) + _parameter_tables(content) + _vector_table(content),
         ),
         "figures": ("The paper's figures", "".join([*first, shown["figure_5"]])),
         "convergence": ("Proximity and error", shown["convergence"]),
@@ -105,6 +105,19 @@ def _parameter_tables(content: Mapping[str, Any]) -> str:
         headers = ["parameter", "true", "estimate", "difference"]
         parts.append(table(f"{name}: parameters at the end [kg m²]", headers, rows))
     return "".join(parts)
+
+
+def _vector_table(content: Mapping[str, Any]) -> str:
+    vector = content["inertial_vector"]
+    values = zip(vector["names"], vector["true"], vector["identified"], strict=True)
+    rows = [[code(name), number(true), number(found, ".7g")] for name, true, found in values]
+    return (
+        "<p>The physical arm's inertial parameters in the order of (9)-(10), about the joint "
+        "frames. Torque shows four sums of the twenty; identified are the values nearest to the "
+        "first guess, half of the true ones, that have the four sums P̂. What no torque of the arm "
+        "depends on stays at the guess.</p>\n"
+        + table("Inertial vector (9)-(10), SI units", ["parameter", "true", "identified"], rows)
+    )
 
 
 def _disturbance(content: Mapping[str, Any]) -> str:
