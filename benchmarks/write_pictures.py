@@ -1,6 +1,6 @@
 """Write the README's pictures, report.png and replay.png, from a fresh ``robotid demo``.
 
-    python docs/pictures/make.py
+    python benchmarks/write_pictures.py
 
 It needs the extra [dev] and a Chromium.
 """
@@ -12,8 +12,9 @@ from pathlib import Path
 
 from PIL import Image
 
-HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parents[1] / "tests"))
+ROOT = Path(__file__).resolve().parents[1]
+HERE = ROOT / "docs" / "pictures"
+sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browsing import launch, visit
 
 from robotid.commands.demo import run_demo
