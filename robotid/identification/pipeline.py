@@ -8,8 +8,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators import WLS, Consistent, Estimate
-from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.determination import Determination, base_spread, determine
+from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, pool
@@ -19,9 +19,8 @@ from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import (
     ESTIMATORS,
-    RECURSIVE,
     EstimatorSettings,
-    Prior,
+    Known,
     consistent_fit,
     make_estimator,
 )
@@ -42,11 +41,11 @@ from robotid.logs.data import Log
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
+from robotid.regressor.reduction import join
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.workers.pieces import join
 
 __all__ = [
     "ESTIMATORS",
@@ -56,7 +55,6 @@ __all__ = [
     "identify",
 ]
 
-_GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
@@ -319,7 +317,7 @@ class _Ground:
 
     recordings: Recordings
     factors: Factors
-    before: Prior
+    before: Known
     rough: Estimate
     determination: Determination
     grown: float
@@ -339,7 +337,7 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     factors, share = reduction.factors, recordings.share
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Prior(prior, spread, share, rough.sigma, stretches)
+    before = Known(prior, spread, share, rough.sigma, stretches)
     known = model.layout.owned_by(choice.constraints.get("pinned", ()))
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
@@ -353,15 +351,15 @@ def _measured(
     recordings, factors, rough = ground.recordings, ground.factors, ground.rough
     model, mapping, before = recordings.model, recordings.mapping, ground.before
     try:
-        estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
+        estimate, fit, weighing = _run(choice, model, mapping, before, recordings, factors, rough)
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
     stretches, share = before.stretches, before.share
     wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
-    if choice.name in _GRADIENT and not choice.physical:
+    if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
-        sigma = np.ones_like(rough.sigma) if choice.name == "ols" else rough.sigma
+        sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
         estimate, errors = measured_errors(
             estimate,
             stretches,
@@ -369,7 +367,7 @@ def _measured(
             share,
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
-            is_filter=choice.name == "kalman" or choice.forgetting < 1,
+            is_filter=weighing == "by age",
             redraws=None if fit is None else Redraws(fit, choice.draws, np.random.default_rng(0)),
         )
     if ground.grown != 1.0:
@@ -382,28 +380,22 @@ def _run(
     choice: EstimatorSettings,
     model: RobotModel,
     mapping: BaseMapping,
-    prior: Prior,
+    prior: Known,
     recordings: Recordings,
     factors: Factors,
     wls: Estimate,
-) -> tuple[Estimate, Consistent | None]:
-    """Return the estimate and, if it is physically consistent, what made it so.
-
-    Batch estimators read the factors, recursive ones the samples.
-    """
+) -> tuple[Estimate, Consistent | None, Weighing]:
+    """Return the estimate, what made it physically consistent if it is, and how rows weighed."""
     estimator = make_estimator(choice, model, mapping, prior)
-    if isinstance(estimator, LogCholesky):
-        return estimator.fit(factors), estimator.fit_in_cone
-    if choice.name not in RECURSIVE:
-        fit = estimator if isinstance(estimator, Consistent) else None
-        return estimator.fit(factors), fit
-    estimate = estimator.fit(recordings.problem(with_mass=choice.needs_mass))
+    if estimator.reads == "factors":
+        return estimator.fit(factors), estimator.in_cone, estimator.weighing
+    estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
     if not choice.physical:
-        return estimate, None
-    if choice.name in _GRADIENT:
+        return estimate, None, estimator.weighing
+    if estimator.weighing == "by step":
         estimate = with_wls_errors(estimate, wls)
     fit = consistent_fit(choice, model, mapping, prior)
-    return fit.project(estimate), fit
+    return fit.project(estimate), fit, estimator.weighing
 
 
 def _standard(

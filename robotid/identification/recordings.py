@@ -11,9 +11,9 @@ from robotid.identification.survey import ReducedPiece, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress_stretches
 from robotid.regressor.problem import Block, Problem, concatenate
+from robotid.regressor.reduction import Reduction, join_stretches
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Reduction, join_stretches
 from robotid.workers.plan import WorkPlan
 
 __all__ = ["Recordings"]

@@ -1,11 +1,10 @@
 """Rows of a trajectory: which of them are used, and what they count."""
 
-import numpy as np
-
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.columns import sure_rows
 from robotid.regressor.problem import Problem
 from robotid.regressor.torque import build_problem
 from robotid.robot.model import RobotModel
@@ -24,17 +23,7 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
     Returns:
         Flags, shape (N, n_rows), bool.
     """
-    mask = np.ones((len(trajectory.t), model.n_rows), dtype=bool)
-    if "coulomb" not in model.layout.terms or min_velocity == 0:
-        return mask
-    first = model.n_rows - len(model.joints)
-    v = trajectory.v[:, first:]
-    mask[:, first:] = np.abs(v) >= min_velocity
-    for coupling in model.layout.couplings:
-        rows = [model.joints.index(joint) for joint, _ in coupling.ratios]
-        w = v[:, rows] @ np.array([ratio for _, ratio in coupling.ratios])
-        mask[:, [first + row for row in rows]] &= (np.abs(w) >= min_velocity)[:, None]
-    return mask
+    return sure_rows(model.layout, trajectory.v, min_velocity)
 
 
 def base_problem(
