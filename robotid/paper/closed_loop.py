@@ -21,7 +21,7 @@ from robotid.paper.formulas import (
     reference_acceleration,
 )
 from robotid.paper.procedure import History, Influences, LoopSettings
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = ["run_procedure"]
 

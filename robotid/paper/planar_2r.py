@@ -17,7 +17,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = [
     "PAPER_LINKS",

@@ -11,7 +11,7 @@ from robotid._typing import Array
 from robotid.paper.closed_loop import run_procedure
 from robotid.paper.dynamics import LinearDynamics, LinearPlant
 from robotid.paper.procedure import History, LoopSettings
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = ["TOLERANCE", "RandomRuns", "random_runs"]
 

@@ -16,7 +16,7 @@ from robotid.paper.closed_loop import run_procedure
 from robotid.paper.dynamics import LinearPlant, PlanarDynamics, torque
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
 from robotid.paper.procedure import History, Influences, LoopSettings, random_torque
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = [
     "AMPLITUDE",

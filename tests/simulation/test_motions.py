@@ -5,7 +5,7 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.paper import planar_2r
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 
 def test_a_motion_of_seven_joints_has_the_coefficients_of_equation_28():
