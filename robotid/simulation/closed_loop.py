@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -12,27 +11,14 @@ from robotid.exceptions import DataError
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 from robotid.simulation.integration import rk4
+from robotid.simulation.motions import Motion
 from robotid.simulation.plant import RobotPlant
 
-__all__ = ["Motion", "Noise", "another_robot", "simulate"]
+__all__ = ["Noise", "another_robot", "simulate"]
 
 _BANDWIDTH = 20.0  # [rad/s] of the tracking controller
 _SUBSTEPS = 2  # Runge-Kutta steps per sample, at least
 _LONGEST_STEP = 0.005  # [s] of Runge-Kutta, whatever the rate of the log
-
-
-class Motion(Protocol):
-    """A motion that a controller can track."""
-
-    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations.
-
-        Args:
-            t: Times, shape (N,) [s].
-
-        Returns:
-            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
-        """
 
 
 @dataclass(frozen=True)

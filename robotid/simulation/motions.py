@@ -1,6 +1,7 @@
 """Motions to follow: Fourier series within a robot's limits, quintics from rest to rest."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
 
-__all__ = ["FourierTrajectory", "ProgramMotion", "random_fourier"]
+__all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "random_fourier"]
 
 _ROTARY_REACH = 1.2  # [rad] amplitude of a joint whose limits are wider or unknown
 _LINEAR_REACH = 0.15  # [m]
@@ -16,8 +17,22 @@ _ROTARY_SPEED = 1.5  # [rad/s] peak speed where the limit is higher or unknown
 _LINEAR_SPEED = 0.3  # [m/s]
 
 
+class Motion(Protocol):
+    """A motion that a controller can track."""
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations.
+
+        Args:
+            t: Times, shape (N,) [s].
+
+        Returns:
+            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
+        """
+
+
 @dataclass(frozen=True, eq=False)
-class FourierTrajectory:
+class FourierTrajectory(Motion):
     """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
 
     Attributes:
@@ -43,14 +58,6 @@ class FourierTrajectory:
             )
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration.
-
-        Args:
-            t: Times, shape (N,) [s].
-
-        Returns:
-            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
-        """
         w = 2 * np.pi / self.period * np.arange(1, len(self.sine) + 1)  # (h,)
         sin, cos = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))  # (N, h)
         q = self.q0 + sin @ self.sine + cos @ self.cosine
@@ -60,7 +67,7 @@ class FourierTrajectory:
 
 
 @dataclass(frozen=True)
-class ProgramMotion:
+class ProgramMotion(Motion):
     """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
 
     The coefficients a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 take q from q0 to q0 + A and leave
@@ -89,7 +96,7 @@ class ProgramMotion:
             raise SettingsError(f"duration is {self.duration}, wanted a positive number")
 
     def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration.
+        """Return positions, velocities and accelerations.
 
         Args:
             t: Times of one motion, any shape, or one per motion, shape (R,) [s].
