@@ -19,7 +19,6 @@ from robotid.logs.smoothing import Stretch, process_stretches, too_short
 __all__ = [
     "SignalSettings",
     "decide",
-    "is_moving",
     "process",
     "resolve",
     "turns_note",
@@ -143,20 +142,6 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
         raise too_short(log.path or "log", len(stretches), settings)
     numbers = np.unique(trajectory.segment, return_inverse=True)[1]
     return replace(trajectory, segment=numbers)
-
-
-def is_moving(trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return which joints move: near stand-still the sign of the velocity is noise.
-
-    Args:
-        trajectory: N samples.
-        min_velocity: Bound on the speed [rad/s or m/s].
-
-    Returns:
-        Flags, shape (N, n), bool.
-    """
-    moving: Array = np.abs(trajectory.v) >= min_velocity
-    return moving
 
 
 def velocity_lag(log: Log) -> float:

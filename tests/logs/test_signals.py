@@ -3,7 +3,7 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings, is_moving, process, resolve, unwrap, velocity_lag
+from robotid.logs.signals import SignalSettings, process, resolve, unwrap, velocity_lag
 
 
 def sine_log(t, frequency=0.5, lag=0.0, **options):
@@ -123,11 +123,6 @@ def test_what_was_automatic_is_stated():
     resolved = resolve(sine_log(np.arange(0, 10, 0.01)), SignalSettings(cutoff=10.0))
     assert resolved.rate == pytest.approx(100.0)
     assert resolved.max_gap == pytest.approx(0.025)
-
-
-def test_rows_of_a_joint_that_stands_still_are_told_apart():
-    out = process(sine_log(np.arange(0, 10, 0.01)), SignalSettings())
-    np.testing.assert_array_equal(is_moving(out, 0.1), np.abs(out.v) >= 0.1)
 
 
 def test_full_turns_are_taken_out_of_free_joints_only():
