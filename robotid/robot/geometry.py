@@ -138,9 +138,11 @@ def _shape_points(shape: Shape, urdf: Path) -> Array | None:
     size: Array = np.array(shape.size)
     match shape.kind:
         case "box":
-            return 0.5 * corners * size
+            corners *= 0.5 * size
+            return corners
         case "sphere":
-            return corners * size[0]
+            corners *= size[0]
+            return corners
         case "cylinder":
             turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
             radius, length = size
