@@ -12,6 +12,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import Stretch, process_stretches, too_short
@@ -197,7 +198,7 @@ def unwrap(log: Log, is_free: Array) -> Log:
         k = int(np.argmax(jumps[:, j]))
         raise DataError(
             f"{log.path or 'log'}: q_{log.joints[j]} jumps by a full turn at t = "
-            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; mend the recording",
+            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; correct the recording",
             code="full_turn",
         )
     if not turned.any():
@@ -217,7 +218,7 @@ def turns_note(joints: Sequence[str]) -> str:
     Returns:
         The note.
     """
-    return f"full turns taken out of the angle of {list(joints)}"
+    return f"full turns taken out of the angle of {listed(joints)}"
 
 
 def _distance(slope: Array, v: Array, shift: int) -> float:

@@ -131,11 +131,11 @@ def test_changed_parameters_stay_out_of_the_original(ur5):
 BAD = {
     "no joint of that name": (
         dict(joints=["elbow2"]),
-        "joint 'elbow2' is not in two.urdf; joints: ['shoulder', 'elbow']. Did you mean 'elbow'?",
+        "joint 'elbow2' is not in two.urdf; joints: shoulder, elbow. Did you mean 'elbow'?",
     ),
     "identified and locked": (
         dict(joints=["elbow"], locked={"elbow": 0.0}),
-        "joints ['elbow'] are both identified and locked",
+        "joints elbow are both identified and locked",
     ),
     "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted 'independent' or 'coupled'"),
     "gravity of two numbers": (dict(gravity=(0, 9.81)), "wanted three finite numbers"),
