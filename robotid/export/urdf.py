@@ -6,14 +6,12 @@ for, armature and friction of coupled drives above all, goes into ``<name>.drive
 
 import json
 import math
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from robotid._files import folder_beside
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export.sidecar import SCHEMA_VERSION, digest, load_identified, sidecar_facts
@@ -83,18 +81,13 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
         **sidecar_facts(model, pi, places),
         "read_back_with": readers,
     }
-    partial = Path(tempfile.mkdtemp(prefix=f".{goal.stem}-", dir=goal.parent))
-    try:
+    with folder_beside(goal.parent) as partial:
         (partial / goal.name).write_bytes(content)
         text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
         if "yourdfpy" in readers:
             _check_masses(partial / goal.name)
-        os.replace(partial / sidecar.name, sidecar)
-        os.replace(partial / goal.name, goal)
-    finally:
-        shutil.rmtree(partial)
     return sidecar
 
 

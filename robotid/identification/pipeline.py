@@ -8,8 +8,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators import WLS, Consistent, Estimate
-from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.determination import Determination, base_spread, determine
+from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, pool, prepare
@@ -19,9 +19,8 @@ from robotid.identification.recordings import LoadedRecordings, Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import (
     ESTIMATORS,
-    RECURSIVE,
     EstimatorSettings,
-    Prior,
+    Known,
     consistent_fit,
     make_estimator,
 )
@@ -41,11 +40,11 @@ from robotid.logs.data import Log
 from robotid.logs.signals import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
+from robotid.regressor.reduction import join
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.workers.pieces import join
 
 __all__ = [
     "ESTIMATORS",
@@ -55,7 +54,6 @@ __all__ = [
     "identify",
 ]
 
-_GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
@@ -77,7 +75,7 @@ class Identification:
         standard_covariance: Their covariance given the prior, shape (p, p).
         base: Base parameters, shape (b,).
         base_error: Their standard errors, shape (b,); inf where the data say nothing.
-        identification: The recordings that were fitted, with predictions "estimate" and "wls".
+        fitted: The recordings that were fitted, with predictions "estimate" and "wls".
         validation: The same of the recordings that were kept apart.
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
@@ -98,7 +96,7 @@ class Identification:
     standard_covariance: Array
     base: Array
     base_error: Array
-    identification: tuple[Evaluation, ...]
+    fitted: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
     errors: StandardErrors
     factors: Factors
@@ -187,7 +185,7 @@ class Identification:
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
         """Rows of the fitted recordings that the estimate does not explain, the worst first."""
-        return find_outliers(self.model, self.identification, self.standard)
+        return find_outliers(self.model, self.fitted, self.standard)
 
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.
@@ -198,7 +196,7 @@ class Identification:
         Returns:
             The metrics.
         """
-        return pool(self.model, self.identification, name)
+        return pool(self.model, self.fitted, name)
 
     @property
     def refitted(self) -> tuple[Evaluation, ...]:
@@ -286,19 +284,19 @@ def conclude(
     factors, share = reduction.factors, recordings.share
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Prior(prior, spread, share, rough.sigma, stretches)
+    before = Known(prior, spread, share, rough.sigma, stretches)
     known = model.layout.owned_by(choice.constraints.get("pinned", ()))
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
     try:
-        estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
+        estimate, fit, weighing = _run(choice, model, mapping, before, recordings, factors, rough)
     except RankDeficientError as error:
         raise determination.refusal(error) from error
     wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
-    if choice.name in _GRADIENT and not choice.physical:
+    if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
-        sigma = np.ones_like(rough.sigma) if choice.name == "ols" else rough.sigma
+        sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
         estimate, errors = measured_errors(
             estimate,
             stretches,
@@ -306,7 +304,7 @@ def conclude(
             share,
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
-            is_filter=choice.name == "kalman" or choice.forgetting < 1,
+            is_filter=weighing == "by age",
             redraws=None if fit is None else Redraws(fit, choice.draws, np.random.default_rng(0)),
         )
     if grown != 1.0:
@@ -330,7 +328,7 @@ def conclude(
         standard_covariance=covariance,
         base=mapping.to_base(standard),
         base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
-        identification=fitted,
+        fitted=fitted,
         validation=kept,
         errors=errors,
         factors=factors,
@@ -342,28 +340,22 @@ def _run(
     choice: EstimatorSettings,
     model: RobotModel,
     mapping: BaseMapping,
-    prior: Prior,
+    prior: Known,
     recordings: Recordings,
     factors: Factors,
     wls: Estimate,
-) -> tuple[Estimate, Consistent | None]:
-    """Return the estimate and, if it is physically consistent, what made it so.
-
-    Batch estimators read the factors, recursive ones the samples.
-    """
+) -> tuple[Estimate, Consistent | None, Weighing]:
+    """Return the estimate, what made it physically consistent if it is, and how rows weighed."""
     estimator = make_estimator(choice, model, mapping, prior)
-    if isinstance(estimator, LogCholesky):
-        return estimator.fit(factors), estimator.fit_in_cone
-    if choice.name not in RECURSIVE:
-        fit = estimator if isinstance(estimator, Consistent) else None
-        return estimator.fit(factors), fit
-    estimate = estimator.fit(recordings.problem(mapping, with_mass=choice.needs_mass))
+    if estimator.reads == "factors":
+        return estimator.fit(factors), estimator.in_cone, estimator.weighing
+    estimate = estimator.fit(recordings.problem(mapping, with_mass=estimator.needs_mass))
     if not choice.physical:
-        return estimate, None
-    if choice.name in _GRADIENT:
+        return estimate, None, estimator.weighing
+    if estimator.weighing == "by step":
         estimate = with_wls_errors(estimate, wls)
     fit = consistent_fit(choice, model, mapping, prior)
-    return fit.project(estimate), fit
+    return fit.project(estimate), fit, estimator.weighing
 
 
 def _standard(

@@ -14,10 +14,11 @@ from robotid.estimators import (
     RLS,
     TLS,
     WLS,
+    BatchEstimator,
     Consistent,
-    Estimator,
     Kalman,
     NormalisedGradient,
+    RecursiveEstimator,
 )
 from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.consistent.penalties import METRICS
@@ -36,7 +37,7 @@ __all__ = [
     "KEYS",
     "RECURSIVE",
     "EstimatorSettings",
-    "Prior",
+    "Known",
     "consistent_fit",
     "make_estimator",
 ]
@@ -152,18 +153,13 @@ class EstimatorSettings:
         _check_range("starts", self.starts, self.starts >= 0, "x >= 0")
         ConstraintSettings(**self.constraints)
 
-    @property
-    def needs_mass(self) -> bool:
-        """Whether each sample must carry the regressor of the mass matrix."""
-        return self.name == "prx" and (self.step == "printed" or self.metric == "mass")
-
     def to_dict(self) -> dict[str, Any]:
         """Return the name and the estimator's own settings, in the shape of the job file."""
         return {"name": self.name, **{key: getattr(self, key) for key in KEYS[self.name]}}
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class Known:
     """What is known before the data.
 
     Attributes:
@@ -182,8 +178,8 @@ class Prior:
 
 
 def make_estimator(
-    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
-) -> Estimator:
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Known
+) -> BatchEstimator | RecursiveEstimator[Any]:
     """Return the estimator that settings describe.
 
     Args:
@@ -211,7 +207,7 @@ def make_estimator(
 
 
 def consistent_fit(
-    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Known
 ) -> Consistent:
     """Return the physically consistent estimator, which also projects.
 
@@ -251,7 +247,9 @@ def consistent_fit(
     return replace(fit, prior_weight=choice.weight, choice=choice)
 
 
-def _recursive(settings: EstimatorSettings, mapping: BaseMapping, prior: Prior) -> Estimator:
+def _recursive(
+    settings: EstimatorSettings, mapping: BaseMapping, prior: Known
+) -> RecursiveEstimator[Any]:
     beta, sigma = mapping.to_base(prior.pi), prior.sigma
     KS = mapping.K * prior.spread
     C = KS @ KS.T  # (b, b), of the base parameters before the data
