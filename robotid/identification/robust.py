@@ -13,9 +13,9 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.recordings import LoadedRecordings, Recordings
 from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.columns import drive_columns
 from robotid.regressor.prediction import predict
 from robotid.regressor.reduction import Reduction, join
+from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -224,12 +224,11 @@ def find_outliers(
 
 def _friction_step(model: RobotModel, standard: Array) -> Array:
     """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
-    step = np.zeros(model.n_rows)
-    drives = drive_columns(model.layout, model.n_rows)
-    for value, drive in zip(standard[model.layout.n_inertial :], drives, strict=True):
-        if drive.term == "coulomb":
-            for row, ratio in drive.ratios.items():
-                step[row] += 2.0 * abs(ratio * value)
+    layout, still, step = model.layout, np.zeros(1), np.zeros(model.n_rows)
+    forth, back = (DriveMotion(still, still, sign * np.ones(1)) for sign in (1.0, -1.0))
+    for term, values in layout.by_drive(standard):
+        change = np.abs((term.column(forth) - term.column(back)) * values)  # (d,)
+        step[model.n_rows - len(model.joints) :] += np.abs(layout.drive_ratios.T) @ change
     return step
 
 
