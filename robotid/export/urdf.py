@@ -27,6 +27,7 @@ from robotid.export.xml_splice import (
 )
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
+from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import read_tree, read_with_yourdfpy
@@ -172,7 +173,7 @@ def _text(value: float) -> str:
 
 
 def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
-    attributes = {"viscous": "damping", "coulomb": "friction"}
+    attributes = {name: term.dynamics for name, term in TERMS.items() if term.dynamics}
     values = dict(zip(model.layout.names, pi, strict=True))
     edits: list[Edit] = []
     for joint in document.root.find_all("joint"):

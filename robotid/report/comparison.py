@@ -11,7 +11,7 @@ from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import read_result
 
-__all__ = ["compare_results", "comparison_page", "write_comparison"]
+__all__ = ["compare_results", "write_comparison"]
 
 _FAR = 3.0  # combined standard errors beyond which a difference is shown as a fault
 _FILES = ("urdf", "identification", "validation")  # settings that stand among the inputs
@@ -84,37 +84,8 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
         DataError: If the results cannot be compared, or the folder of the target is missing.
     """
     content = compare_results(paths)
-    write_text(comparison_page(content), target)
+    write_text(_page(content), target)
     return content
-
-
-def comparison_page(content: Mapping[str, Any]) -> str:
-    """Return the page.
-
-    Args:
-        content: What ``compare_results`` returns.
-
-    Returns:
-        HTML that fetches nothing.
-    """
-    sections = {
-        "errors": ("Prediction errors", _errors_section(content)),
-        "base": ("Base parameters", _base_section(content)),
-        "settings": ("Settings that differ", _differing(content, "settings", "setting")),
-        "inputs": ("Inputs", _inputs_section(content)),
-        "versions": ("Versions that differ", _differing(content, "versions", "what")),
-    }
-    links = "".join(f'<a href="#{key}">{title}</a> ' for key, (title, _) in sections.items())
-    body = "".join(
-        f'<section aria-labelledby="{key}">\n<h2 id="{key}">{title}</h2>\n{html}</section>\n'
-        for key, (title, html) in sections.items()
-    )
-    robots = ", ".join(dict.fromkeys(result["robot"] for result in content["results"]))
-    title = f"{robots}: {len(content['results'])} results compared"
-    nav = f'<nav aria-label="Sections">{links}</nav>'
-    return page(
-        title, f"<header>\n<h1>{escape(title)}</h1>\n{_verdicts(content)}</header>{nav}{body}"
-    )
 
 
 def _label(k: int) -> str:
@@ -300,6 +271,19 @@ def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 # --- the page ---------------------------------------------------------------------------------
+
+
+def _page(content: Mapping[str, Any]) -> str:
+    sections = {
+        "errors": ("Prediction errors", _errors_section(content)),
+        "base": ("Base parameters", _base_section(content)),
+        "settings": ("Settings that differ", _differing(content, "settings", "setting")),
+        "inputs": ("Inputs", _inputs_section(content)),
+        "versions": ("Versions that differ", _differing(content, "versions", "what")),
+    }
+    robots = ", ".join(dict.fromkeys(result["robot"] for result in content["results"]))
+    title = f"{robots}: {len(content['results'])} results compared"
+    return page(title, f"<h1>{escape(title)}</h1>\n{_verdicts(content)}", sections)
 
 
 def _verdicts(content: Mapping[str, Any]) -> str:

@@ -37,21 +37,6 @@ _POINTS = 120_000  # points of all lines together: about 2 MB
 _LONGEST = 2000  # points of one line
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 _SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
-_SECTIONS = {
-    "errors": "Prediction errors",
-    "torques": "Torques over time",
-    "residuals": "What the residuals hold",
-    "drives": "Drive parameters",
-    "base": "Base parameters",
-    "standard": "Standard parameters",
-    "consistency": "Physical consistency",
-    "information": "Excitation and correlation",
-    "open": "What the data do not determine",
-    "warnings": "Warnings and notes",
-    "settings": "Settings",
-    "inputs": "Inputs",
-    "versions": "Versions",
-}
 _ESTIMATORS = {
     "ols": "ordinary least squares (ols)",
     "wls": "weighted least squares, rows weighted by the noise of their joint (wls)",
@@ -84,31 +69,26 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    contents = {
-        "errors": _errors(identification),
-        "torques": _torques(identification),
-        "residuals": residual_section(identification),
-        "drives": drive_figures(identification) + drive_table(identification),
-        "base": base_table(identification),
-        "standard": _standard(identification),
-        "consistency": consistency_section(identification),
-        "information": information_section(identification),
-        "open": open_section(identification),
-        "warnings": _warnings(identification, findings),
-        "settings": settings_tables(identification),
-        "inputs": input_table(identification),
-        "versions": version_table(),
+    sections = {
+        "errors": ("Prediction errors", _errors(identification)),
+        "torques": ("Torques over time", _torques(identification)),
+        "residuals": ("What the residuals hold", residual_section(identification)),
+        "drives": (
+            "Drive parameters",
+            drive_figures(identification) + drive_table(identification),
+        ),
+        "base": ("Base parameters", base_table(identification)),
+        "standard": ("Standard parameters", _standard(identification)),
+        "consistency": ("Physical consistency", consistency_section(identification)),
+        "information": ("Excitation and correlation", information_section(identification)),
+        "open": ("What the data do not determine", open_section(identification)),
+        "warnings": ("Warnings and notes", _warnings(identification, findings)),
+        "settings": ("Settings", settings_tables(identification)),
+        "inputs": ("Inputs", input_table(identification)),
+        "versions": ("Versions", version_table()),
     }
-    links = "".join(f'<a href="#{key}">{title}</a> ' for key, title in _SECTIONS.items())
-    nav = f'<nav aria-label="Sections">{links}</nav>'
-    sections = "".join(
-        f'<section aria-labelledby="{key}">\n<h2 id="{key}">{title}</h2>\n'
-        f"{contents[key]}</section>\n"
-        for key, title in _SECTIONS.items()
-    )
     title = f"{identification.model.name}: identified parameters"
-    html = page(title, f"{_summary(identification)}{nav}\n{sections}")
-    return write_text(html, target)
+    return write_text(page(title, _summary(identification), sections), target)
 
 
 def _summary(found: Identification) -> str:
@@ -125,11 +105,11 @@ def _summary(found: Identification) -> str:
         + f"Signals: {'; or '.join(chains)}."
     )
     return (
-        f"<header>\n<h1>{escape(found.model.name)}</h1>\n"
+        f"<h1>{escape(found.model.name)}</h1>\n"
         f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
         f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n"
         f'<p class="note">Written by robotid {__version__}. SI units throughout; inertial '
-        "parameters in Pinocchio's order, inertias about the joint frame.</p>\n</header>\n"
+        "parameters in Pinocchio's order, inertias about the joint frame.</p>\n"
     )
 
 

@@ -23,6 +23,7 @@ from mcap.writer import Writer as McapLibraryWriter
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
+from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import read_log, write_log
 from robotid.logs.table import LogSource
 
