@@ -1,7 +1,6 @@
 """What a log shows of its own clock and of its joints' motion, without a model of the robot."""
 
 from collections.abc import Collection, Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -36,7 +35,7 @@ def check_clock(log: Log) -> Iterator[Finding]:
     median = float(np.median(step))
     usual = step[step < _GAP * median]
     spread = float(np.std(usual)) / median
-    name = _name(log)
+    name = log.name
     evidence = {"rate": 1 / median, "samples": len(log.t), "duration": float(log.t[-1] - log.t[0])}
     message = (
         f"{name}: {len(log.t)} rows in {evidence['duration']:.4g} s, {1 / median:.4g} Hz in the "
@@ -71,12 +70,12 @@ def check_gaps(log: Log) -> Iterator[Finding]:
     longest = int(gaps[np.argmax(step[gaps])])
     severity = "warning" if step[longest] > max(_LONG, _GAP * median) else "note"
     message = (
-        f"{_name(log)}: {len(gaps)} gaps, the longest of {step[longest]:.3g} s at t = "
+        f"{log.name}: {len(gaps)} gaps, the longest of {step[longest]:.3g} s at t = "
         f"{log.t[longest]:.6g} s; nothing is filtered or differentiated across long ones, and the "
         "rows beside them are lost: record without interruption if you can"
     )
     evidence = {"gaps": len(gaps), "longest": float(step[longest]), "at": float(log.t[longest])}
-    yield Finding("gap", severity, _name(log), message, evidence)
+    yield Finding("gap", severity, log.name, message, evidence)
 
 
 def check_stale_rows(log: Log) -> Iterator[Finding]:
@@ -100,13 +99,13 @@ def check_stale_rows(log: Log) -> Iterator[Finding]:
         return
     share = stale / len(log.t)
     message = (
-        f"{_name(log)}: {stale} rows ({100 * share:.2g} %) repeat the row before in every channel "
+        f"{log.name}: {stale} rows ({100 * share:.2g} %) repeat the row before in every channel "
         "while the robot moves: the logger ran faster than the robot's state; log each state "
         "once, with its own time stamp"
     )
     evidence = {"rows": stale, "share": share, "longest_run": max(e - s for s, e in runs)}
     severity = "warning" if share > _STALE else "note"
-    yield Finding("stale_rows", severity, _name(log), message, evidence)
+    yield Finding("stale_rows", severity, log.name, message, evidence)
 
 
 def check_standstill(log: Log, motion_t: Array, motion_v: Array) -> Iterator[Finding]:
@@ -128,11 +127,11 @@ def check_standstill(log: Log, motion_t: Array, motion_v: Array) -> Iterator[Fin
     if max(before, after) < _REST:
         return
     message = (
-        f"{_name(log)}: the robot rests for the first {before:.3g} s and the last {after:.3g} s; "
+        f"{log.name}: the robot rests for the first {before:.3g} s and the last {after:.3g} s; "
         "rows of resting joints are left out where friction is identified; cut them with start "
         f"= {motion_t[moving[0]]:.4g} and end = {motion_t[moving[-1]]:.4g}"
     )
-    yield Finding("standstill", "note", _name(log), message, {"before": before, "after": after})
+    yield Finding("standstill", "note", log.name, message, {"before": before, "after": after})
 
 
 def check_static(
@@ -155,14 +154,14 @@ def check_static(
         evidence = {"range": reach, "moving_share": share}
         if reach < _STATIC:
             message = (
-                f"{_name(log)}: {joint} stands still (range {reach:.2g}): its friction, its "
+                f"{log.name}: {joint} stands still (range {reach:.2g}): its friction, its "
                 "inertia and much of what it carries cannot be identified from this log; move it, "
                 "or lock it"
             )
             yield Finding("static_joint", "warning", _at(log, joint), message, evidence)
         elif reach < (_HARDLY_SLIDES if joint in prismatic else _HARDLY) or share < _MOVING:
             message = (
-                f"{_name(log)}: {joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} "
+                f"{log.name}: {joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} "
                 "% of the time): what it alone excites is poorly known; move it farther and longer"
             )
             yield Finding("hardly_moves", "note", _at(log, joint), message, evidence)
@@ -174,9 +173,5 @@ def _runs(flags: Array) -> list[tuple[int, int]]:
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
-def _name(log: Log) -> str:
-    return Path(log.path).name or "log"
-
-
 def _at(log: Log, joint: str) -> str:
-    return f"{_name(log)}: {joint}"
+    return f"{log.name}: {joint}"
