@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,15 +17,23 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.commands import identify as workflow
+from robotid.commands.checkpoint_inputs import checkpoint_inputs
+from robotid.commands.job import read_job
+from robotid.commands.logs import survey_logs
 from robotid.commands.progress import terminal_progress
 from robotid.exceptions import SettingsError
+from robotid.identification import evaluation
+from robotid.identification.recordings import Recordings
 from robotid.logs.read import write_log
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
+from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
 from robotid.workers.plan import WorkPlan
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
 CHECKPOINT = ".robotid-checkpoint"
+SIGNALS = "[signals]\ncutoff = 8.0\norder = 4\ntrim = 0.2\n"
 HELD = ROOT / "tests" / "helpers" / "held.py"
 
 
@@ -135,6 +144,64 @@ def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, mon
     error = capsys.readouterr().err
     assert "is the checkpoint of other inputs: logs[0]." in error
     assert "fit.csv.changed was" in error
+
+
+@pytest.fixture(scope="module")
+def interrupted(logs, tmp_path_factory):
+    """Return a job that was cut off once its pieces were done: folder, job file, URDF, results."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    for name in ("fit.csv", "keep.csv"):
+        (folder / name).write_text((logs / name).read_text())
+    urdf, out = folder / "arm.urdf", folder / "out"
+    urdf.write_text(Path(URDF).read_text())
+    job = Path(write_job(folder, 1024))
+    text = job.read_text().replace(URDF, str(urdf)).replace("[reduction]", SIGNALS + "[reduction]")
+    job.write_text(text)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "_score_logs", interrupt)
+        assert main(["identify", str(job), "--out", str(out)]) == 130
+    assert len(list((out / CHECKPOINT).glob("piece-*.npz"))) == 24
+    return folder, job, urdf, out
+
+
+@pytest.mark.parametrize(
+    ("changed", "before", "after", "said"),
+    [
+        ("job.toml", "cutoff = 8.0", "cutoff = 6.0", "settings.signals.cutoff was 8.0, is 6.0"),
+        ("job.toml", "order = 4", "order = 2", "settings.signals.order was 4, is 2"),
+        ("job.toml", "trim = 0.2", "trim = 0.3", "settings.signals.trim was 0.2, is 0.3"),
+        ("arm.urdf", "</robot>", "<!-- changed --></robot>", "urdf_sha256 was "),
+    ],
+)
+def test_a_checkpoint_of_another_filter_or_urdf_is_not_used(
+    interrupted, capsys, changed, before, after, said
+):
+    """Neither resumed, nor left to the next run: what it holds stands for other rows."""
+    folder, job, urdf, out = interrupted
+    file = folder / changed
+    text = file.read_text()
+    assert before in text
+    try:
+        file.write_text(text.replace(before, after))
+        assert main(["identify", str(job), "--out", str(out), "--resume"]) == 1
+        error = capsys.readouterr().err
+        assert f"is the checkpoint of other inputs: {said}" in error
+        assert not (out / "result.json").exists()
+    finally:
+        file.write_text(text)
+    kept = Checkpoint.open(out, checkpoint_inputs(read_job(job)), pieces_of(job), resume=True)
+    assert len(kept.finished()) == 24  # with the old file it is this checkpoint
+
+
+def pieces_of(job):
+    found = read_job(job)
+    model = found.model()
+    fitted, _ = survey_logs(found, model, found.identification, found.validation)
+    return Recordings(model, structural_mapping(model), fitted).pieces
 
 
 def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
