@@ -17,23 +17,15 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
 from robotid.commands import identify as workflow
-from robotid.commands.checkpoint_inputs import checkpoint_inputs
-from robotid.commands.job import read_job
-from robotid.commands.logs import survey_logs
 from robotid.commands.progress import terminal_progress
 from robotid.exceptions import SettingsError
-from robotid.identification import evaluation
-from robotid.identification.recordings import Recordings
 from robotid.logs.read import write_log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
-from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
 from robotid.workers.plan import WorkPlan
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
 CHECKPOINT = ".robotid-checkpoint"
-SIGNALS = "[signals]\ncutoff = 8.0\norder = 4\ntrim = 0.2\n"
 HELD = ROOT / "tests" / "helpers" / "held.py"
 
 
@@ -128,80 +120,45 @@ def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, t
     assert (out / "result.json").read_text() == expected
 
 
-def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
-    for name in ("fit.csv", "keep.csv"):
-        (tmp_path / name).write_text((logs / name).read_text())
-    job, out = write_job(tmp_path, 1024), tmp_path / "out"
+def break_off(job, out, monkeypatch):
+    """Run a job until its pieces are reduced, and no further."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(workflow, "conclude", interrupt)
-        assert main(["identify", job, "--out", str(out)]) == 130
+        assert main(["identify", job, "--out", out]) == 130
+
+
+def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).write_text((logs / name).read_text())
+    job, out = write_job(tmp_path, 1024), str(tmp_path / "out")
+    break_off(job, out, monkeypatch)
     (tmp_path / "fit.csv").write_text((logs / "keep.csv").read_text())
-    assert main(["identify", job, "--out", str(out), "--resume"]) == 1
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
     error = capsys.readouterr().err
     assert "is the checkpoint of other inputs: logs[0]." in error
     assert "fit.csv.changed was" in error
 
 
-@pytest.fixture(scope="module")
-def interrupted(logs, tmp_path_factory):
-    """Return a job that was cut off once its pieces were done: folder, job file, URDF, results."""
-    folder = tmp_path_factory.mktemp("interrupted")
-    for name in ("fit.csv", "keep.csv"):
-        (folder / name).write_text((logs / name).read_text())
-    urdf, out = folder / "arm.urdf", folder / "out"
-    urdf.write_text(Path(URDF).read_text())
-    job = Path(write_job(folder, 1024))
-    text = job.read_text().replace(URDF, str(urdf)).replace("[reduction]", SIGNALS + "[reduction]")
-    job.write_text(text)
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "_score_logs", interrupt)
-        assert main(["identify", str(job), "--out", str(out)]) == 130
-    assert len(list((out / CHECKPOINT).glob("piece-*.npz"))) == 24
-    return folder, job, urdf, out
-
-
-@pytest.mark.parametrize(
-    ("changed", "before", "after", "said"),
-    [
-        ("job.toml", "cutoff = 8.0", "cutoff = 6.0", "settings.signals.cutoff was 8.0, is 6.0"),
-        ("job.toml", "order = 4", "order = 2", "settings.signals.order was 4, is 2"),
-        ("job.toml", "trim = 0.2", "trim = 0.3", "settings.signals.trim was 0.2, is 0.3"),
-        ("arm.urdf", "</robot>", "<!-- changed --></robot>", "urdf_sha256 was "),
-    ],
-)
-def test_a_checkpoint_of_another_filter_or_urdf_is_not_used(
-    interrupted, capsys, changed, before, after, said
+def test_a_filter_or_a_robot_that_changed_since_is_refused_by_name(
+    logs, tmp_path, capsys, monkeypatch
 ):
-    """Neither resumed, nor left to the next run: what it holds stands for other rows."""
-    folder, job, urdf, out = interrupted
-    file = folder / changed
-    text = file.read_text()
-    assert before in text
-    try:
-        file.write_text(text.replace(before, after))
-        assert main(["identify", str(job), "--out", str(out), "--resume"]) == 1
-        error = capsys.readouterr().err
-        assert f"is the checkpoint of other inputs: {said}" in error
-        assert not (out / "result.json").exists()
-    finally:
-        file.write_text(text)
-    kept = Checkpoint.open(out, checkpoint_inputs(read_job(job)), pieces_of(job), resume=True)
-    assert len(kept.finished()) == 24  # with the old file it is this checkpoint
-
-
-def pieces_of(job):
-    found = read_job(job)
-    model = found.model()
-    fitted, _ = survey_logs(found, model, found.identification, found.validation)
-    return Recordings(model, structural_mapping(model), fitted).pieces
+    robot, out = tmp_path / "arm.urdf", str(tmp_path / "out")
+    robot.write_text(Path(URDF).read_text())
+    monkeypatch.setitem(globals(), "URDF", str(robot))
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).symlink_to(logs / name)
+    break_off(write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0"), out, monkeypatch)
+    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.5")
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
+    assert "other inputs: settings.signals.cutoff was 6.0, is 6.5." in capsys.readouterr().err
+    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0")
+    robot.write_text(robot.read_text() + "<!-- a later version -->")
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
+    assert "other inputs: urdf_sha256 was" in capsys.readouterr().err
 
 
 def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
