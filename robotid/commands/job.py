@@ -15,16 +15,12 @@ from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.signals import SignalSettings
 from robotid.logs.table import LogSource, Table
 from robotid.logs.units import LogUnits
+from robotid.robot.drives import DRIVE_TERMS, TERMS, friction_models
 from robotid.robot.model import GRAVITY, RobotModel
-from robotid.robot.parameters import DRIVE_TERMS, Coupling
+from robotid.robot.parameters import Coupling
 
 __all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
 
-_FRICTION = {
-    "none": (),
-    "viscous": ("viscous",),
-    "viscous+coulomb": ("viscous", "coulomb"),
-}
 _NUMBER = (int, float)
 
 
@@ -174,11 +170,8 @@ class Job:
         }
         if self.signals.cutoff is None:
             signals["cutoff"] = False
-        friction = next(
-            name
-            for name, terms in _FRICTION.items()
-            if terms == tuple(t for t in self.terms if t in ("viscous", "coulomb"))
-        )
+        chosen = tuple(term for term in self.terms if TERMS[term].is_friction)
+        friction = next(name for name, terms in friction_models().items() if terms == chosen)
         return {
             "urdf": str(self.urdf.resolve()),
             **({"joints": list(self.joints)} if self.joints is not None else {}),
@@ -188,9 +181,7 @@ class Job:
             "mimic": self.mimic,
             "signals": signals,
             "model": {
-                "armature": "armature" in self.terms,
-                "friction": friction,
-                "offset": "offset" in self.terms,
+                key: friction if key == "friction" else key in self.terms for key in KEYS["model"]
             },
             "torque": {"gains": dict(self.gains)},
             "columns": dict(self.columns),
@@ -259,13 +250,12 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
     model = table.get("model", {})
-    friction = model.get("friction", "viscous+coulomb")
-    if friction not in _FRICTION:
-        raise SettingsError(f"{where}: friction is {friction!r}, wanted one of {list(_FRICTION)}")
+    friction, models = model.get("friction", "viscous+coulomb"), friction_models()
+    if friction not in models:
+        raise SettingsError(f"{where}: friction is {friction!r}, wanted one of {list(models)}")
     wanted = {
-        "armature": model.get("armature", True),
-        "offset": model.get("offset", True),
-        **dict.fromkeys(_FRICTION[friction], True),
+        name: name in models[friction] if term.is_friction else model.get(name, term.is_default)
+        for name, term in TERMS.items()
     }
     joints = table.get("joints")
     entries = {
@@ -284,7 +274,7 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
             free_flyer=table.get("free_flyer", False),
             mimic=table.get("mimic", "independent"),
             signals=_signals(table.get("signals", {})),
-            terms=tuple(term for term in DRIVE_TERMS if wanted.get(term)),
+            terms=tuple(term for term in TERMS if wanted[term]),
             gains=_numbers(table.get("torque", {}).get("gains", {}), where, "gains"),
             couplings=tuple(
                 Coupling(c["name"], tuple(_numbers(c["ratios"], where, "ratios").items()))

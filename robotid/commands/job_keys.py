@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from robotid.exceptions import SettingsError
+from robotid.robot.drives import TERMS
 
 __all__ = ["KEYS", "check_keys"]
 
@@ -32,7 +33,10 @@ KEYS: dict[str, Any] = {
         "velocity_delay": _NUMBER,
     },
     "doctor": {"ignore": list},
-    "model": {"armature": bool, "friction": str, "offset": bool},
+    "model": {
+        "friction" if term.is_friction else name: str if term.is_friction else bool
+        for name, term in TERMS.items()
+    },
     "torque": {"gains": dict},
     "columns": dict,
     "log": {"topic": str, "joints": dict, "effort": str, "stamp": str},

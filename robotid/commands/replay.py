@@ -12,14 +12,15 @@ from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import read_result, stated_parameters
-from robotid.identification.evaluation import predict, prepare
+from robotid.identification.evaluation import predict
 from robotid.identification.pipeline import Identification
+from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.table import LogSource, prefixes
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
-from robotid.viewer.unexplained import find_surprises
+from robotid.viewer.unexplained import find_unexplained
 
 __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
 
@@ -151,7 +152,7 @@ def replay_identified(identification: Identification) -> Replay:
     Returns:
         The page: measured and predicted torque, masses before and after.
     """
-    shown = (*identification.identification, *identification.validation)[-1]
+    shown = (*identification.fitted, *identification.validation)[-1]
     motion = shown.recording.trajectory
     predicted = _sure(shown.torques["estimate"], shown.recording.mask)
     return replay(
@@ -197,10 +198,10 @@ def _track(path: Path) -> Mapping[str, Any] | None:
 def _torques(job: Job, model: RobotModel, log: Log, vectors: Mapping[str, Array]) -> Torques:
     if not vectors:
         return Torques(log.t, log.tau)
-    recording = prepare(model, log, job.signals)
-    motion = recording.trajectory
+    rows = hold_log(model, log, job.signals).whole
+    motion = rows.trajectory
     predicted = predict(model, list(vectors.values()), motion)
-    shown = [_sure(torque, recording.mask) for torque in predicted]
+    shown = [_sure(torque, rows.mask) for torque in predicted]
     return Torques(motion.t, motion.tau, dict(zip(vectors, shown, strict=True)))
 
 
@@ -247,7 +248,7 @@ def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
     predicted = next(iter(torques.predicted.values()))
     units = dict(zip(model.joints, model.row_units, strict=True))
     marks = []
-    for found in find_surprises(torques.t, torques.measured, predicted, model.joints):
+    for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
         size = f"{found.residual:.2g} {units[found.joint]} on average"
         label = f"unexplained torque, most at {found.joint} ({size}, for "
         label += f"{found.end - found.start:.1f} s): contact or load?"

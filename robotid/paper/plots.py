@@ -9,8 +9,8 @@ from robotid._typing import Array
 from robotid.paper.errata import EnergyDrift
 from robotid.paper.random_motions import RandomRuns
 from robotid.paper.study import AMPLITUDE, CASES, DURATION, ModelStudy
-from robotid.report.plots import INK, STYLE
-from robotid.simulation.program import ProgramMotion
+from robotid.report.svg import INK, STYLE
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = [
     "convergence_figure",

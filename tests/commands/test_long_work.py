@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.paths import ROOT
+from helpers.piecework import local_cluster
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
@@ -24,6 +26,7 @@ from robotid.workers.plan import WorkPlan
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
 CHECKPOINT = ".robotid-checkpoint"
+HELD = ROOT / "tests" / "helpers" / "held.py"
 
 
 def write_job(folder, rows_in_memory, *tables):
@@ -73,69 +76,89 @@ def test_two_workers_give_the_same_result_to_the_last_bit(job, expected, tmp_pat
 
 
 def test_a_cluster_gives_the_same_result_to_the_last_bit(job, expected, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as cluster:
+    pytest.importorskip("distributed")
+    with local_cluster() as cluster:
         words = ["identify", job, "--scheduler", cluster.scheduler_address]
         assert main([*words, "--out", str(tmp_path)]) == 0
     assert (tmp_path / "result.json").read_text() == expected
 
 
 def cut_off(job, out, number, workers):
-    """Start the command line, send it a signal once some pieces are done; code and stderr."""
-    command = [sys.executable, "-m", "robotid", "identify", job, "--out", str(out)]
-    run = subprocess.Popen(
-        [*command, "--workers", workers], stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    while len(list((out / CHECKPOINT).glob("*.npz"))) < 3:
+    """Start the command line, send it a signal once three pieces are kept; code and stderr."""
+    mark = out.with_name("three pieces are kept")
+    command = [sys.executable, HELD, mark, "3", "identify", job, "--out", out, "--workers", workers]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    while not mark.exists():
         assert run.poll() is None, run.stderr.read()
-        time.sleep(0.002)
+        time.sleep(0.01)
     (os.killpg if number == signal.SIGINT else os.kill)(run.pid, number)
-    _, error = run.communicate(timeout=20)
+    _, error = run.communicate(timeout=60)
     return run.returncode, error
 
 
 def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
     job, expected, tmp_path, capsys
 ):
-    assert cut_off(job, tmp_path, signal.SIGKILL, "1")[0] == -signal.SIGKILL
-    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
-    done = len(list((tmp_path / CHECKPOINT).glob("*.npz")))
-    assert 3 <= done < 24
-    words = ["identify", job, "--workers", "2", "--out", str(tmp_path)]
+    out = tmp_path / "out"
+    assert cut_off(job, out, signal.SIGKILL, "1")[0] == -signal.SIGKILL
+    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+    words = ["identify", job, "--workers", "2", "--out", str(out)]
     assert main([*words, "--resume", "--verbose"]) == 0
-    assert f"reducing 24 pieces, {done} of them kept from before" in capsys.readouterr().err
-    assert (tmp_path / "result.json").read_text() == expected
-    assert not (tmp_path / CHECKPOINT).exists()
+    assert "reducing 24 pieces, 3 of them kept from before" in capsys.readouterr().err
+    assert (out / "result.json").read_text() == expected
+    assert not (out / CHECKPOINT).exists()
 
 
 def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, tmp_path):
-    code, error = cut_off(job, tmp_path, signal.SIGINT, "2")
+    out = tmp_path / "out"
+    code, error = cut_off(job, out, signal.SIGINT, "2")
     assert code == 130
     assert error.count("\n") == 1
     assert error.startswith("robotid: interrupted; finished pieces are kept in ")
-    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
-    assert main(["identify", job, "--out", str(tmp_path), "--resume"]) == 0
-    assert (tmp_path / "result.json").read_text() == expected
+    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+    assert main(["identify", job, "--out", str(out), "--resume"]) == 0
+    assert (out / "result.json").read_text() == expected
 
 
-def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
-    for name in ("fit.csv", "keep.csv"):
-        (tmp_path / name).write_text((logs / name).read_text())
-    job, out = write_job(tmp_path, 1024), tmp_path / "out"
+def break_off(job, out, monkeypatch):
+    """Run a job until its pieces are reduced, and no further."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(workflow, "conclude", interrupt)
-        assert main(["identify", job, "--out", str(out)]) == 130
+        assert main(["identify", job, "--out", out]) == 130
+
+
+def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).write_text((logs / name).read_text())
+    job, out = write_job(tmp_path, 1024), str(tmp_path / "out")
+    break_off(job, out, monkeypatch)
     (tmp_path / "fit.csv").write_text((logs / "keep.csv").read_text())
-    assert main(["identify", job, "--out", str(out), "--resume"]) == 1
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
     error = capsys.readouterr().err
     assert "is the checkpoint of other inputs: logs[0]." in error
     assert "fit.csv.changed was" in error
+
+
+def test_a_filter_or_a_robot_that_changed_since_is_refused_by_name(
+    logs, tmp_path, capsys, monkeypatch
+):
+    robot, out = tmp_path / "arm.urdf", str(tmp_path / "out")
+    robot.write_text(Path(URDF).read_text())
+    monkeypatch.setitem(globals(), "URDF", str(robot))
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).symlink_to(logs / name)
+    break_off(write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0"), out, monkeypatch)
+    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.5")
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
+    assert "other inputs: settings.signals.cutoff was 6.0, is 6.5." in capsys.readouterr().err
+    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0")
+    robot.write_text(robot.read_text() + "<!-- a later version -->")
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
+    assert "other inputs: urdf_sha256 was" in capsys.readouterr().err
 
 
 def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):
