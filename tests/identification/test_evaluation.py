@@ -1,8 +1,10 @@
 import numpy as np
+import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import (
     evaluate,
+    is_shared,
     pool,
     predict,
     prepare,
@@ -79,3 +81,11 @@ def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
 def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng)
     assert prepare(ur5, log, EXACT).name == "log 0-11.98 s"
+
+
+@pytest.mark.parametrize(
+    ("rows", "found", "shared"),
+    [(200, 4, False), (200, 5, True), (10, 1, False), (10, 2, True), (0, 0, False)],
+)
+def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rows, found, shared):
+    assert is_shared(np.arange(rows) < found) is shared
