@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.clock import runs_of
 from robotid.findings import Finding, listed
 from robotid.logs.data import Log
 from robotid.logs.signals import velocity_lag
@@ -87,7 +88,8 @@ def check_clipping(log: Log) -> Iterator[Finding]:
             continue
         for limit in (float(x.max()), float(x.min())):
             at = (x == limit) & moving
-            if at.mean() < _CLIPPED or _longest_run(at) < _PLATEAU or _steps(x) < _COARSE:
+            plateau = max((stop - start for start, stop in runs_of(at)), default=0)
+            if at.mean() < _CLIPPED or plateau < _PLATEAU or _steps(x) < _COARSE:
                 continue
             message = (
                 f"{log.name}: the torque of {joint} stays at its limit {limit:.6g} in "
@@ -288,11 +290,6 @@ def _quantum(x: Array) -> float:
 def _steps(x: Array) -> float:
     quantum = _quantum(x)
     return float(np.ptp(x)) / quantum if quantum > 0 else float("inf")
-
-
-def _longest_run(flags: Array) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
 
 
 def _spikes(t: Array, x: Array, reach: float) -> tuple[Array, Array]:

@@ -8,7 +8,14 @@ from robotid._typing import Array
 from robotid.findings import Finding
 from robotid.logs.data import Log
 
-__all__ = ["check_clock", "check_gaps", "check_stale_rows", "check_standstill", "check_static"]
+__all__ = [
+    "check_clock",
+    "check_gaps",
+    "check_stale_rows",
+    "check_standstill",
+    "check_static",
+    "runs_of",
+]
 
 _JITTER = 0.05  # spread of the steps over their median from which jitter is reported
 _GAP = 2.5  # a step longer than this many median steps is a gap
@@ -93,7 +100,7 @@ def check_stale_rows(log: Log) -> Iterator[Finding]:
     speed = np.abs(np.diff(log.q, axis=0)).max(axis=1) / np.diff(log.t)
     passing = np.zeros(len(same), dtype=bool)
     passing[1:-1] = (speed[:-2] > _STILL) | (speed[2:] > _STILL)
-    runs = _runs(same)
+    runs = runs_of(same)
     stale = sum(stop - start for start, stop in runs if passing[start] or passing[stop - 1])
     if stale == 0:
         return
@@ -167,8 +174,15 @@ def check_static(
             yield Finding("hardly_moves", "note", _at(log, joint), message, evidence)
 
 
-def _runs(flags: Array) -> list[tuple[int, int]]:
-    """Return the (start, stop) of each run of true flags."""
+def runs_of(flags: Array) -> list[tuple[int, int]]:
+    """Return where flags are true without a break.
+
+    Args:
+        flags: Shape (N,), bool.
+
+    Returns:
+        First row and row after the last one of each run.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
