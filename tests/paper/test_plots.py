@@ -5,7 +5,7 @@ import pytest
 
 from robotid.paper import plots
 from robotid.paper.study import MODELS, PaperSettings, study_model
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 
 @pytest.fixture(scope="module")
