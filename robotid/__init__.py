@@ -12,9 +12,7 @@ if TYPE_CHECKING:
     from robotid.identification.pipeline import EstimatorSettings, Identification, identify
     from robotid.logs.data import Log, Trajectory
     from robotid.logs.read import read_log, write_log
-    from robotid.logs.signals import SignalSettings
-    from robotid.logs.table import LogSource
-    from robotid.logs.units import LogUnits
+    from robotid.logs.settings import LogSource, LogUnits, SignalSettings
     from robotid.regressor.base_parameters import BaseMapping
     from robotid.report.document import write_report
     from robotid.robot.model import RobotModel

@@ -341,7 +341,7 @@ def _convert(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
     from robotid.commands.convert import convert
-    from robotid.logs.table import LogSource
+    from robotid.logs.settings import LogSource
 
     joints = options.joints.split(",") if options.joints else None
     source = LogSource(**source_settings(options))

@@ -16,7 +16,7 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions findings versions _files _html _typing",
+    "exceptions findings versions _files _html _settings _typing",
     "robot logs",
     "regressor",
     "estimators simulation workers",

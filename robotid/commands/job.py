@@ -12,9 +12,8 @@ from robotid.exceptions import SettingsError
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, lay_out, read_log
-from robotid.logs.signals import SignalSettings
-from robotid.logs.table import LogSource, Table
-from robotid.logs.units import LogUnits
+from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.table import Table
 from robotid.robot.model import GRAVITY, RobotModel
 from robotid.robot.parameters import DRIVE_TERMS, Coupling
 

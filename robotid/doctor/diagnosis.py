@@ -33,7 +33,7 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.findings import Finding, by_severity
 from robotid.identification.doubts import DOUBTFUL, is_outvoted
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 

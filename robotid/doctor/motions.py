@@ -14,7 +14,7 @@ from robotid.identification.evaluation import row_mask
 from robotid.identification.prior import spread_of
 from robotid.identification.recordings import base_problem, independent_share
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress, merge
 from robotid.robot.model import RobotModel

@@ -38,7 +38,7 @@ from robotid.identification.summary import (
 )
 from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
 from robotid.robot.bodies import held_parameters

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from robotid._typing import Array
 from robotid.identification.evaluation import Evaluation, Recording, evaluate, shares_rows
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress_stretches
 from robotid.regressor.problem import Problem, concatenate

@@ -20,7 +20,8 @@ from robotid.identification.recordings import base_problem
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
 from robotid.logs.read import LogLayout
-from robotid.logs.signals import SignalSettings, decide, unwrap, velocity_lag
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import decide, unwrap, velocity_lag
 from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches
 from robotid.logs.table import Place, RowReader, Table
 from robotid.logs.time_stamps import TimeStamps

@@ -9,7 +9,8 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import suggestion
-from robotid.logs.table import LogSource, Table, choose, prefixes
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Table, choose, prefixes
 
 __all__ = ["Entry", "table_of_arrays"]
 

@@ -13,7 +13,8 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.array_tables import Entry, table_of_arrays
-from robotid.logs.table import LogSource, Table
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Table
 
 __all__ = ["open_hdf5", "open_mat", "open_npz", "write_hdf5", "write_mat", "write_npz"]
 

@@ -16,7 +16,8 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.data import repeated, suggestion
-from robotid.logs.table import LogSource, Table, choose
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Table, choose
 
 __all__ = ["open_bag"]
 

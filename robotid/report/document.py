@@ -12,7 +12,7 @@ from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.report.consistency import consistency_notes
 from robotid.report.diagnosis import (
     drive_figures,

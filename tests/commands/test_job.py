@@ -4,7 +4,7 @@ import pytest
 
 from robotid.commands.job import job_from_settings, read_job
 from robotid.exceptions import SettingsError
-from robotid.logs.table import LogSource
+from robotid.logs.settings import LogSource
 from robotid.robot.parameters import Coupling
 
 FULL = """

@@ -17,7 +17,7 @@ from robotid.exceptions import SettingsError
 from robotid.findings import Finding
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import another_robot, simulate

@@ -10,7 +10,7 @@ from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.logs.read import write_log
-from robotid.logs.units import LogUnits
+from robotid.logs.settings import LogUnits
 from robotid.robot.examples import example_urdf
 
 HELD = "wrist_3_joint"

@@ -7,7 +7,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import OLS, WLS, Consistent
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.identification.prior import prior_spread
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem

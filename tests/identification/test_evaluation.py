@@ -10,7 +10,7 @@ from robotid.identification.evaluation import (
     shares_rows,
 )
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -7,7 +7,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.identification.pipeline import EstimatorSettings, identify
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 

@@ -2,7 +2,8 @@ import numpy as np
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.prior import prior_spread
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 
 
 def test_the_spread_has_the_size_of_the_robot(ur5, rng):

@@ -13,7 +13,8 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -11,7 +11,7 @@ from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import base_problem
 from robotid.identification.robust import LOSSES, loss_slope, loss_weight
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 
 NOISE = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])
 ROWS = {"wrist_2_joint": 584, "elbow_joint": 1148, "shoulder_pan_joint": 1287, "wrist_1_joint": 900}

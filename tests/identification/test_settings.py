@@ -11,7 +11,7 @@ from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import RECURSIVE, EstimatorSettings
 from robotid.logs.read import write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 
 JOBS = Path(__file__).parents[1] / "jobs"
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -18,9 +18,8 @@ from robotid.identification.survey import survey
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import lay_out, read_log, write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.logs.time_stamps import TimeStamps
-from robotid.logs.units import LogUnits
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf

@@ -8,7 +8,8 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.units import LogUnits, check_units
+from robotid.logs.settings import LogUnits
+from robotid.logs.units import check_units
 
 JOINTS = ("shoulder", "elbow")
 

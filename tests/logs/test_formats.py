@@ -24,7 +24,7 @@ from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
-from robotid.logs.table import LogSource
+from robotid.logs.settings import LogSource
 
 JOINTS = ("shoulder", "elbow")
 STATE = "sensor_msgs/msg/JointState"

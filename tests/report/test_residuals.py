@@ -5,7 +5,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import evaluate, prepare
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
 
 

@@ -8,7 +8,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
 from robotid.identification.evaluation import prepare
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 from robotid.workers.pieces import Reduction, join, join_stretches

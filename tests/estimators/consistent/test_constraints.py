@@ -13,7 +13,8 @@ from robotid.identification.constraint_settings import ConstraintSettings
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem
