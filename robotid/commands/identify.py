@@ -24,6 +24,7 @@ from robotid.identification.doubts import doubts_of
 from robotid.identification.findings import consistency_findings
 from robotid.identification.long_recordings import LongRecordings
 from robotid.identification.pipeline import Identification, conclude, identify
+from robotid.identification.settings import BoundedSettings
 from robotid.identification.verdict import Doubt
 from robotid.logs.data import Log
 from robotid.regressor.base_parameters import structural_mapping
@@ -122,7 +123,7 @@ def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding
     kept = [job.read(entry, model) for entry in job.validation]
     held = examine_locked(job, model, [*job.identification, *job.validation])
     diagnosis = (*held, *diagnose(model, logs, kept, job.signals))
-    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.robust != "none")
+    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.is_robust)
     with _explained(diagnosis):
         identification = identify(
             model, logs, validation=kept, signals=job.signals, estimator=job.estimator
@@ -143,7 +144,7 @@ def _identify_long(
         [look for log in some for look in log.looks] for some in (logs, kept)
     )
     diagnosis = diagnose(model, fitted_looks, kept_looks, job.signals)
-    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.robust != "none")
+    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.is_robust)
     pieces = [piece for log in logs for piece in log.pieces]
     checkpoint = Checkpoint.open(folder, checkpoint_inputs(job), pieces, resume=plan.resume)
     with plan, _explained(diagnosis):
@@ -188,7 +189,7 @@ def _doubts(
     """Return what makes the result doubtful, but for what the user knows better."""
     kept = [Path(e.recording.log.path).name for e in identification.validation if not e.is_refitted]
     told = [finding for finding in findings if finding.code not in job.ignore]
-    is_robust = job.estimator.robust != "none"
+    is_robust = job.estimator.is_robust
     return doubts_of(told, identification.model.joints, kept, is_robust=is_robust)
 
 
@@ -226,7 +227,7 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
     more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
     advice = (
         "they were weighted down"
-        if identification.estimator.robust != "none"
+        if identification.estimator.is_robust
         else "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
     )
     message = (
@@ -240,6 +241,8 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
 def _asked(identification: Identification) -> str:
     """Return in words what the user asks of the parameters, empty if nothing."""
     settings = identification.estimator
+    if not isinstance(settings, BoundedSettings):
+        return ""
     asked = {key: value for key, value in settings.constraints.items() if value}
     if settings.margin > _WIDE:
         asked["margin"] = settings.margin

@@ -118,7 +118,7 @@ def _verdict(
         for finding in diagnose(model, fitted, looks, job.signals)
         if finding.where.split(": ")[0] in names and finding.code not in job.ignore
     ]
-    alarms = alarming(found, job.ignore, is_robust=job.estimator.robust != "none")
+    alarms = alarming(found, job.ignore, is_robust=job.estimator.is_robust)
     stated = result["verdict"]
     return judge(
         Metrics({}, 0.0),
@@ -146,7 +146,7 @@ def _doubts(
 ) -> list[Doubt]:
     """Return the doubts of the result, but for its own validation, and those of the new logs."""
     own = [Doubt(**doubt) for doubt in stated.get("doubts", ())]
-    is_robust = job.estimator.robust != "none"
+    is_robust = job.estimator.is_robust
     doubts = [doubt for doubt in own if doubt.code != "repeated_motion"]
     doubts += doubts_of(found, model.joints, names, is_robust=is_robust)
     if missing:

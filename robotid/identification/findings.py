@@ -2,6 +2,7 @@
 
 from robotid.findings import Finding
 from robotid.identification.pipeline import Identification
+from robotid.identification.settings import ConsistentSettings
 
 __all__ = ["consistency_findings"]
 
@@ -23,7 +24,7 @@ def consistency_findings(identification: Identification) -> list[Finding]:
     findings = []
     check, details = identification.mass_matrix, identification.estimate.details
     if not check.is_positive:
-        is_consistent = identification.estimator.name in ("consistent", "log_cholesky")
+        is_consistent = isinstance(identification.estimator, ConsistentSettings)
         advice = "raise [estimator] margin" if is_consistent else "use the 'consistent' estimator"
         message = (
             f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
@@ -90,9 +91,9 @@ def _speaks_against(identification: Identification) -> str:
 
 def _stated(identification: Identification) -> set[str]:
     """Return the bounds that the user states; those of the links' geometry may well bind."""
-    stated = identification.estimator.constraints
+    stated = identification.estimator.bounds
     return {
         "total_mass all",
-        *(f"mass {link}" for link in stated.get("mass", ())),
-        *(f"centre_of_mass {link}" for link in stated.get("com", ())),
+        *(f"mass {link}" for link in stated.mass),
+        *(f"centre_of_mass {link}" for link in stated.com),
     }

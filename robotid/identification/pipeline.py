@@ -13,17 +13,17 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, pool, prepare
+from robotid.identification.fitting import Prior, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.prior import spread_of
 from robotid.identification.recordings import LoadedRecordings, Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import (
-    ESTIMATORS,
-    RECURSIVE,
+    BoundedSettings,
+    DescentSettings,
     EstimatorSettings,
-    Prior,
-    consistent_fit,
-    make_estimator,
+    OLSSettings,
+    RecursiveSettings,
 )
 from robotid.identification.standard_errors import (
     Redraws,
@@ -48,14 +48,12 @@ from robotid.robot.parameters import pseudo_inertia
 from robotid.workers.pieces import join
 
 __all__ = [
-    "ESTIMATORS",
     "EstimatorSettings",
     "Identification",
     "conclude",
     "identify",
 ]
 
-_GRADIENT = ("prx", "gradient")  # end beside the minimum of least squares
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's
@@ -155,7 +153,7 @@ class Identification:
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
         kept = self.model.layout.owned_by(self.estimate.details.get("pinned", ()))
-        masses = self.estimator.constraints.get("mass", {}).items()
+        masses = self.estimator.bounds.masses.items()
         known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
         kept = kept | np.isin(self.model.layout.names, known)
         return tuple(np.where(kept, "prior", names).tolist())
@@ -277,8 +275,8 @@ def conclude(
     mapping = structural_mapping(model)
     prior = model.standard_parameters()
     reductions, grown = recordings.reduce(mapping), 1.0
-    if choice.robust != "none":
-        robust = reweigh(model, mapping, recordings, reductions, choice.robust, prior)
+    if choice.is_robust:
+        robust = reweigh(model, mapping, recordings, reductions, choice.loss, prior)
         recordings, reductions = robust.recordings, robust.reductions
         grown = robust.loss_of_efficiency**2
     reduction = join(reductions)
@@ -287,7 +285,7 @@ def conclude(
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Prior(prior, spread, share, rough.sigma, stretches)
-    known = model.layout.owned_by(choice.constraints.get("pinned", ()))
+    known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
     try:
@@ -295,10 +293,10 @@ def conclude(
     except RankDeficientError as error:
         raise determination.refusal(error) from error
     wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
-    if choice.name in _GRADIENT and not choice.physical:
+    if isinstance(choice, DescentSettings) and not choice.physical:
         estimate = with_wls_errors(estimate, wls)
     else:
-        sigma = np.ones_like(rough.sigma) if choice.name == "ols" else rough.sigma
+        sigma = np.ones_like(rough.sigma) if isinstance(choice, OLSSettings) else rough.sigma
         estimate, errors = measured_errors(
             estimate,
             stretches,
@@ -306,8 +304,10 @@ def conclude(
             share,
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
-            is_filter=choice.name == "kalman" or choice.forgetting < 1,
-            redraws=None if fit is None else Redraws(fit, choice.draws, np.random.default_rng(0)),
+            is_filter=isinstance(choice, RecursiveSettings) and choice.is_filter,
+            redraws=Redraws(fit, choice.draws, np.random.default_rng(0))
+            if fit is not None and isinstance(choice, BoundedSettings)
+            else None,
         )
     if grown != 1.0:
         estimate = replace(estimate, covariance=grown * estimate.covariance)
@@ -354,13 +354,13 @@ def _run(
     estimator = make_estimator(choice, model, mapping, prior)
     if isinstance(estimator, LogCholesky):
         return estimator.fit(factors), estimator.fit_in_cone
-    if choice.name not in RECURSIVE:
+    if not isinstance(choice, RecursiveSettings):
         fit = estimator if isinstance(estimator, Consistent) else None
         return estimator.fit(factors), fit
-    estimate = estimator.fit(recordings.problem(mapping, with_mass=choice.needs_mass))
+    estimate = estimator.fit(recordings.problem(mapping, with_mass=estimator.needs_mass))
     if not choice.physical:
         return estimate, None
-    if choice.name in _GRADIENT:
+    if isinstance(choice, DescentSettings):
         estimate = with_wls_errors(estimate, wls)
     fit = consistent_fit(choice, model, mapping, prior)
     return fit.project(estimate), fit

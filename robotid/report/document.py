@@ -54,19 +54,6 @@ _SECTIONS = {
     "inputs": "Inputs",
     "versions": "Versions",
 }
-_ESTIMATORS = {
-    "ols": "ordinary least squares (ols)",
-    "wls": "weighted least squares, rows weighted by the noise of their joint (wls)",
-    "tls": "total least squares, which allows for noise of the regressor, too (tls)",
-    "rls": "recursive least squares, sample by sample (rls)",
-    "kalman": "a Kalman filter over the samples (kalman)",
-    "prx": "steps along the gradient PRX, sample by sample (prx)",
-    "gradient": "normalised gradient steps, sample by sample (gradient)",
-    "consistent": "weighted least squares that keeps every body physically possible and leaves "
-    "the URDF's value where the data say nothing (consistent)",
-    "log_cholesky": "the consistent fit without a cone, in log-Cholesky parameters (log_cholesky)",
-}
-
 
 def write_report(
     identification: Identification, target: str | Path, *, findings: Sequence[Finding] = ()
@@ -131,7 +118,7 @@ def _summary(found: Identification) -> str:
     said = (
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
         f"{_names(fitted)} ({samples} samples after filtering, {rows} torque rows used) by "
-        f"{_ESTIMATORS[found.estimator.name]}. "
+        f"{found.estimator.words} ({found.estimator.name}). "
         + (f"Kept apart for validation: {_names(kept)}. " if kept else "No log was kept apart. ")
         + f"Signals: {'; or '.join(chains)}."
     )

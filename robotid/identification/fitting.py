@@ -1,0 +1,224 @@
+"""The estimator that settings describe, made for a robot and what is known of it before."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import singledispatch
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import (
+    OLS,
+    PRX,
+    RLS,
+    TLS,
+    WLS,
+    Consistent,
+    Constraints,
+    Estimator,
+    Kalman,
+    LogCholesky,
+    NormalisedGradient,
+)
+from robotid.estimators.consistent.weighting import choose_weight
+from robotid.exceptions import SettingsError
+from robotid.identification.settings import (
+    BoundedSettings,
+    ConstraintSettings,
+    DescentSettings,
+    EstimatorSettings,
+    GradientSettings,
+    KalmanSettings,
+    LogCholeskySettings,
+    OLSSettings,
+    PRXSettings,
+    RLSSettings,
+    TLSSettings,
+    WLSSettings,
+)
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.factors import Factors, gather
+from robotid.robot.bodies import held_parameters
+from robotid.robot.geometry import geometry_half_spaces
+from robotid.robot.model import RobotModel
+
+__all__ = ["Prior", "consistent_fit", "make_constraints", "make_estimator"]
+
+_FOLDS = 6  # held out in turn by prior_weight = "cv"
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before the data.
+
+    Attributes:
+        pi: Standard parameters of the URDF, shape (p,).
+        spread: How far they may plausibly be wrong, shape (p,).
+        share: Share of the rows that count as independent [-].
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        stretches: Factors of the stretches of the fitted logs, to choose a weight with.
+    """
+
+    pi: Array
+    spread: Array
+    share: float
+    sigma: Array
+    stretches: tuple[Factors, ...] = ()
+
+
+@singledispatch
+def make_estimator(
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+) -> Estimator:
+    """Return the estimator that settings describe.
+
+    Args:
+        settings: The settings.
+        model: The robot.
+        mapping: Standard to base parameters.
+        prior: What is known before the data.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        SettingsError: If constraints contradict each other or do not fit the robot.
+    """
+    raise SettingsError(f"{settings!r} describes no estimator; take EstimatorSettings(name)")
+
+
+@make_estimator.register
+def _(settings: OLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> OLS:
+    return OLS(independent_share=prior.share)
+
+
+@make_estimator.register
+def _(settings: WLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> WLS:
+    return WLS(independent_share=prior.share)
+
+
+@make_estimator.register
+def _(settings: TLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> TLS:
+    return TLS(settings.regressor_noise, independent_share=prior.share)
+
+
+@make_estimator.register
+def _(
+    settings: LogCholeskySettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+) -> LogCholesky:
+    fit = consistent_fit(settings, model, mapping, prior)
+    rng = np.random.default_rng(settings.seed)
+    return LogCholesky(fit, starts=settings.starts, rng=rng)
+
+
+@make_estimator.register
+def _(settings: RLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> RLS:
+    # without forgetting nothing of the prior enters: batch least squares
+    std = np.sqrt(np.diag(_base_covariance(mapping, prior))) if settings.is_filter else None
+    beta = mapping.to_base(prior.pi)
+    return RLS(prior.sigma, settings.forgetting, beta, std, prior.share)
+
+
+@make_estimator.register
+def _(settings: KalmanSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> Kalman:
+    gate = None if settings.gate is False else float(settings.gate)
+    beta, C = mapping.to_base(prior.pi), _base_covariance(mapping, prior)
+    return Kalman(prior.sigma, beta, C, settings.walk, gate, prior.share)
+
+
+@make_estimator.register
+def _(settings: PRXSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> PRX:
+    return PRX(
+        prior.sigma,
+        mapping.to_base(prior.pi),
+        step=settings.step,
+        metric=settings.metric,
+        average=settings.average,
+        passes=settings.passes,
+        rng=_order(settings),
+    )
+
+
+@make_estimator.register
+def _(
+    settings: GradientSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+) -> NormalisedGradient:
+    return NormalisedGradient(
+        prior.sigma,
+        mapping.to_base(prior.pi),
+        step_size=settings.step_size,
+        average=settings.average,
+        passes=settings.passes,
+        rng=_order(settings),
+    )
+
+
+def _order(settings: DescentSettings) -> np.random.Generator | None:
+    return np.random.default_rng(settings.seed) if settings.seed >= 0 else None
+
+
+def _base_covariance(mapping: BaseMapping, prior: Prior) -> Array:
+    """Return the covariance of the base parameters before the data, shape (b, b)."""
+    KS = mapping.K * prior.spread
+    covariance: Array = KS @ KS.T
+    return covariance
+
+
+@make_estimator.register
+def consistent_fit(
+    settings: BoundedSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+) -> Consistent:
+    """Return the physically consistent estimator, which also projects.
+
+    Args:
+        settings: The settings.
+        model: The robot.
+        mapping: Standard to base parameters.
+        prior: What is known before the data.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        SettingsError: If constraints contradict each other or do not fit the robot.
+    """
+    geometry = geometry_half_spaces(model, settings.bounds.com_within)
+    weight = settings.prior_weight
+    fit = Consistent(
+        layout=model.layout,
+        K=mapping.K,
+        prior=prior.pi,
+        prior_std=prior.spread,
+        held=held_parameters(model),
+        margin=settings.margin,
+        prior_weight=1.0 if isinstance(weight, str) else weight,
+        independent_share=prior.share,
+        metric=settings.prior,
+        constraints=make_constraints(settings.bounds, geometry),
+        solver=settings.solver,
+        check=settings.check,
+    )
+    folds = gather(prior.stretches, _FOLDS)
+    if not isinstance(weight, str) or (weight == "auto" and len(folds) < 2):
+        return fit
+    choice = choose_weight(fit, folds, "cv" if weight == "auto" else weight)
+    return replace(fit, prior_weight=choice.weight, choice=choice)
+
+
+def make_constraints(
+    bounds: ConstraintSettings, geometry: Mapping[str, tuple[Array, Array]]
+) -> Constraints:
+    """Return the constraints as the estimator takes them.
+
+    Args:
+        bounds: The constraints as a job states them.
+        geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
+            the body; boxes stated in ``com`` go before them.
+
+    Returns:
+        The constraints.
+    """
+    com = dict(geometry)
+    for name, (low, high) in bounds.boxes.items():
+        com[name] = (np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, np.negative(low)]))
+    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned))
