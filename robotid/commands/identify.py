@@ -95,7 +95,7 @@ def run_job(
             )
             outputs |= {"urdf": name, "sidecar": sidecar.name}
         write_report(identification, partial / "report.html", findings=findings)
-        result = build_result(identification, job.to_settings(), findings, outputs)
+        result = build_result(identification, job.to_dict(), findings, outputs)
         write_json(result, partial / "result.json")
         for made in sorted(partial.iterdir()):
             os.replace(made, target / made.name)

@@ -5,10 +5,9 @@ from robotid.estimators.batch.total_least_squares import TLS
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.log_cholesky import LogCholesky
-from robotid.estimators.estimator import Estimate, Estimator
+from robotid.estimators.estimator import BatchEstimator, Estimate, Estimator
 from robotid.estimators.recursive.base import RecursiveEstimator, fold, load_state, save_state
-from robotid.estimators.recursive.descent import DescentState
-from robotid.estimators.recursive.gradient import NormalisedGradient
+from robotid.estimators.recursive.descent import DescentState, NormalisedGradient
 from robotid.estimators.recursive.kalman import Kalman, KalmanState
 from robotid.estimators.recursive.prx import PRX
 from robotid.estimators.recursive.rls import RLS, RLSState
@@ -19,6 +18,7 @@ __all__ = [
     "RLS",
     "TLS",
     "WLS",
+    "BatchEstimator",
     "Consistent",
     "Constraints",
     "DescentState",

@@ -1,10 +1,10 @@
 """The interface of estimators and what they return."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
@@ -14,15 +14,14 @@ from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors, compress
 from robotid.regressor.problem import Problem
 
-__all__ = [
-    "Estimate",
-    "Estimator",
-    "as_factors",
-    "estimate_html",
-    "estimate_line",
-    "estimate_text",
-    "require_rows",
-]
+if TYPE_CHECKING:
+    from robotid.estimators.consistent.fit import Consistent
+
+__all__ = ["BatchEstimator", "Estimate", "Estimator", "Weighing", "require_rows"]
+
+#: "alike"; "by joint", each by its noise level; "by age", as of a filter that forgets or gates; or
+#: "by step", as of a gradient method, which ends beside the minimum of least squares.
+Weighing: TypeAlias = Literal["alike", "by joint", "by age", "by step"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +57,21 @@ class Estimate:
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return estimate_line(self)
+        return f"<{self._line}>"
 
     def _repr_html_(self) -> str:
-        return estimate_html(self)
+        rows = [
+            [code(name), number(float(value)), number(float(error), ".2g")]
+            for name, value, error in self._rows
+        ]
+        head = escape(f"{self._line}; {self.message}")
+        return f"<p>{head}</p>\n" + table("Parameters", ["name", "value", "standard error"], rows)
 
     def summary(self) -> str:
-        """Return the parameters with their standard errors as text."""
-        return estimate_text(self)
+        """Return the parameters with their standard errors as text, one a line."""
+        width = max(len(name) for name in self.names)
+        rows = [f"  {name:{width}} {x:12.4g} +- {error:.2g}" for name, x, error in self._rows]
+        return "\n".join([self._line, self.message, *rows])
 
     __str__ = summary
 
@@ -75,40 +81,74 @@ class Estimate:
         errors: Array = np.sqrt(np.diag(self.covariance))
         return errors
 
+    @property
+    def _line(self) -> str:
+        state = "converged" if self.converged else "not converged"
+        return (
+            f"Estimate: {len(self.names)} parameters, rank {self.rank}, condition "
+            f"{self.condition:.3g}, {state}"
+        )
+
+    @property
+    def _rows(self) -> Iterator[tuple[str, float, float]]:
+        return zip(self.names, self.theta, self.std_error, strict=True)
+
 
 class Estimator(ABC):
-    """Settings go into the constructor, data only into ``fit``."""
+    """Settings go into the constructor, data only into ``fit``.
+
+    Attributes:
+        reads: What it needs of the data: the "factors" that all rows come down to, or the
+            "samples" one by one.
+    """
+
+    reads: ClassVar[Literal["factors", "samples"]]
+
+    @property
+    def needs_mass(self) -> bool:
+        """Whether each sample must carry the regressor of the mass matrix."""
+        return False
+
+    @property
+    def weighing(self) -> Weighing:
+        """How the rows weigh, which decides what their scatter says of the standard errors."""
+        return "by joint"
+
+    @property
+    def in_cone(self) -> "Consistent | None":
+        """The physically consistent fit whose bounds it keeps to, if it is one."""
+        return None
 
     @abstractmethod
-    def fit(self, data: Problem | Factors) -> Estimate:
+    def fit(self, data: Problem) -> Estimate:
         """Estimate the parameters.
 
         Args:
-            data: A problem in base parameters, or its factors.
+            data: A problem in base parameters; of a batch estimator also its factors.
 
         Returns:
             The estimate.
 
         Raises:
-            DataError: If there are fewer rows than parameters.
+            DataError: If there are fewer rows than parameters, or a row cannot be used.
+            RankDeficientError: If the data leave parameters open and there is no prior.
+            NotConvergedError: If an iteration or a solver does not end.
         """
 
 
-def as_factors(data: Problem | Factors) -> Factors:
-    """Return the factors of the data, and refuse data that cannot determine anything.
+class BatchEstimator(Estimator):
+    """An estimator to which the factors of the rows are enough."""
 
-    Args:
-        data: A problem or its factors.
+    reads: ClassVar[Literal["factors"]] = "factors"
 
-    Returns:
-        The factors.
+    def fit(self, data: Problem | Factors) -> Estimate:
+        factors = compress(data) if isinstance(data, Problem) else data
+        require_rows(int(factors.rows.sum()), len(factors.names), len(factors.rows))
+        return self._fit(factors)
 
-    Raises:
-        DataError: If there are fewer rows than parameters: a perfect fit would mean nothing.
-    """
-    factors = compress(data) if isinstance(data, Problem) else data
-    require_rows(int(factors.rows.sum()), len(factors.names), len(factors.rows))
-    return factors
+    @abstractmethod
+    def _fit(self, factors: Factors) -> Estimate:
+        """Estimate the parameters from at least as many rows."""
 
 
 def require_rows(rows: int, columns: int, n_joints: int) -> None:
@@ -132,58 +172,3 @@ def require_rows(rows: int, columns: int, n_joints: int) -> None:
             f"{rows} torque rows for {columns} parameters: too few rows to fit; record at least "
             f"{-(-10 * columns // n_joints)} samples, or loosen min_velocity and trim"
         )
-
-
-def estimate_line(estimate: Estimate) -> str:
-    """Return an estimate in one line.
-
-    Args:
-        estimate: The estimate.
-
-    Returns:
-        One line.
-    """
-    state = "converged" if estimate.converged else "not converged"
-    return (
-        f"<Estimate: {len(estimate.names)} parameters, rank {estimate.rank}, condition "
-        f"{estimate.condition:.3g}, {state}>"
-    )
-
-
-def estimate_text(estimate: Estimate) -> str:
-    """Return an estimate as text: one parameter a line.
-
-    Args:
-        estimate: The estimate.
-
-    Returns:
-        Lines.
-    """
-    width = max(len(name) for name in estimate.names)
-    lines = [estimate_line(estimate)[1:-1], estimate.message]
-    lines += [
-        f"  {name:{width}} {value:12.4g} +- {error:.2g}"
-        for name, value, error in zip(
-            estimate.names, estimate.theta, estimate.std_error, strict=True
-        )
-    ]
-    return "\n".join(lines)
-
-
-def estimate_html(estimate: Estimate) -> str:
-    """Return an estimate as HTML.
-
-    Args:
-        estimate: The estimate.
-
-    Returns:
-        A table of the parameters.
-    """
-    rows = [
-        [code(name), number(float(value)), number(float(error), ".2g")]
-        for name, value, error in zip(
-            estimate.names, estimate.theta, estimate.std_error, strict=True
-        )
-    ]
-    head = escape(f"{estimate_line(estimate)[1:-1]}; {estimate.message}")
-    return f"<p>{head}</p>\n" + table("Parameters", ["name", "value", "standard error"], rows)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import singledispatch
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +14,13 @@ from robotid.estimators import (
     RLS,
     TLS,
     WLS,
+    BatchEstimator,
     Consistent,
     Constraints,
-    Estimator,
     Kalman,
     LogCholesky,
     NormalisedGradient,
+    RecursiveEstimator,
 )
 from robotid.estimators.consistent.weighting import choose_weight
 from robotid.exceptions import SettingsError
@@ -42,13 +44,13 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.geometry import geometry_half_spaces
 from robotid.robot.model import RobotModel
 
-__all__ = ["Prior", "consistent_fit", "make_constraints", "make_estimator"]
+__all__ = ["Known", "consistent_fit", "make_constraints", "make_estimator"]
 
 _FOLDS = 6  # held out in turn by prior_weight = "cv"
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class Known:
     """What is known before the data.
 
     Attributes:
@@ -68,8 +70,8 @@ class Prior:
 
 @singledispatch
 def make_estimator(
-    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
-) -> Estimator:
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Known
+) -> BatchEstimator | RecursiveEstimator[Any]:
     """Return the estimator that settings describe.
 
     Args:
@@ -88,23 +90,23 @@ def make_estimator(
 
 
 @make_estimator.register
-def _(settings: OLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> OLS:
+def _(settings: OLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> OLS:
     return OLS(independent_share=prior.share)
 
 
 @make_estimator.register
-def _(settings: WLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> WLS:
+def _(settings: WLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> WLS:
     return WLS(independent_share=prior.share)
 
 
 @make_estimator.register
-def _(settings: TLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> TLS:
+def _(settings: TLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> TLS:
     return TLS(settings.regressor_noise, independent_share=prior.share)
 
 
 @make_estimator.register
 def _(
-    settings: LogCholeskySettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+    settings: LogCholeskySettings, model: RobotModel, mapping: BaseMapping, prior: Known
 ) -> LogCholesky:
     fit = consistent_fit(settings, model, mapping, prior)
     rng = np.random.default_rng(settings.seed)
@@ -112,22 +114,22 @@ def _(
 
 
 @make_estimator.register
-def _(settings: RLSSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> RLS:
+def _(settings: RLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> RLS:
     # without forgetting nothing of the prior enters: batch least squares
-    std = np.sqrt(np.diag(_base_covariance(mapping, prior))) if settings.is_filter else None
+    std = np.sqrt(np.diag(_base_covariance(mapping, prior))) if settings.forgetting < 1 else None
     beta = mapping.to_base(prior.pi)
     return RLS(prior.sigma, settings.forgetting, beta, std, prior.share)
 
 
 @make_estimator.register
-def _(settings: KalmanSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> Kalman:
+def _(settings: KalmanSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> Kalman:
     gate = None if settings.gate is False else float(settings.gate)
     beta, C = mapping.to_base(prior.pi), _base_covariance(mapping, prior)
     return Kalman(prior.sigma, beta, C, settings.walk, gate, prior.share)
 
 
 @make_estimator.register
-def _(settings: PRXSettings, model: RobotModel, mapping: BaseMapping, prior: Prior) -> PRX:
+def _(settings: PRXSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> PRX:
     return PRX(
         prior.sigma,
         mapping.to_base(prior.pi),
@@ -141,7 +143,7 @@ def _(settings: PRXSettings, model: RobotModel, mapping: BaseMapping, prior: Pri
 
 @make_estimator.register
 def _(
-    settings: GradientSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+    settings: GradientSettings, model: RobotModel, mapping: BaseMapping, prior: Known
 ) -> NormalisedGradient:
     return NormalisedGradient(
         prior.sigma,
@@ -157,7 +159,7 @@ def _order(settings: DescentSettings) -> np.random.Generator | None:
     return np.random.default_rng(settings.seed) if settings.seed >= 0 else None
 
 
-def _base_covariance(mapping: BaseMapping, prior: Prior) -> Array:
+def _base_covariance(mapping: BaseMapping, prior: Known) -> Array:
     """Return the covariance of the base parameters before the data, shape (b, b)."""
     KS = mapping.K * prior.spread
     covariance: Array = KS @ KS.T
@@ -166,7 +168,7 @@ def _base_covariance(mapping: BaseMapping, prior: Prior) -> Array:
 
 @make_estimator.register
 def consistent_fit(
-    settings: BoundedSettings, model: RobotModel, mapping: BaseMapping, prior: Prior
+    settings: BoundedSettings, model: RobotModel, mapping: BaseMapping, prior: Known
 ) -> Consistent:
     """Return the physically consistent estimator, which also projects.
 

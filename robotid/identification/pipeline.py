@@ -8,21 +8,19 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators import WLS, Consistent, Estimate
-from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.determination import Determination, base_spread, determine
+from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, pool, prepare
-from robotid.identification.fitting import Prior, consistent_fit, make_estimator
+from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.prior import spread_of
 from robotid.identification.recordings import LoadedRecordings, Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import (
     BoundedSettings,
-    DescentSettings,
     EstimatorSettings,
-    OLSSettings,
     RecursiveSettings,
 )
 from robotid.identification.standard_errors import (
@@ -284,19 +282,19 @@ def conclude(
     factors, share = reduction.factors, recordings.share
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Prior(prior, spread, share, rough.sigma, stretches)
+    before = Known(prior, spread, share, rough.sigma, stretches)
     known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
     try:
-        estimate, fit = _run(choice, model, mapping, before, recordings, factors, rough)
+        estimate, fit, weighing = _run(choice, model, mapping, before, recordings, factors, rough)
     except RankDeficientError as error:
         raise determination.refusal(error) from error
     wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
-    if isinstance(choice, DescentSettings) and not choice.physical:
+    if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
-        sigma = np.ones_like(rough.sigma) if isinstance(choice, OLSSettings) else rough.sigma
+        sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
         estimate, errors = measured_errors(
             estimate,
             stretches,
@@ -304,7 +302,7 @@ def conclude(
             share,
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
-            is_filter=isinstance(choice, RecursiveSettings) and choice.is_filter,
+            is_filter=weighing == "by age",
             redraws=Redraws(fit, choice.draws, np.random.default_rng(0))
             if fit is not None and isinstance(choice, BoundedSettings)
             else None,
@@ -342,28 +340,22 @@ def _run(
     choice: EstimatorSettings,
     model: RobotModel,
     mapping: BaseMapping,
-    prior: Prior,
+    prior: Known,
     recordings: Recordings,
     factors: Factors,
     wls: Estimate,
-) -> tuple[Estimate, Consistent | None]:
-    """Return the estimate and, if it is physically consistent, what made it so.
-
-    Batch estimators read the factors, recursive ones the samples.
-    """
+) -> tuple[Estimate, Consistent | None, Weighing]:
+    """Return the estimate, what made it physically consistent if it is, and how rows weighed."""
     estimator = make_estimator(choice, model, mapping, prior)
-    if isinstance(estimator, LogCholesky):
-        return estimator.fit(factors), estimator.fit_in_cone
-    if not isinstance(choice, RecursiveSettings):
-        fit = estimator if isinstance(estimator, Consistent) else None
-        return estimator.fit(factors), fit
+    if estimator.reads == "factors":
+        return estimator.fit(factors), estimator.in_cone, estimator.weighing
     estimate = estimator.fit(recordings.problem(mapping, with_mass=estimator.needs_mass))
-    if not choice.physical:
-        return estimate, None
-    if isinstance(choice, DescentSettings):
+    if not (isinstance(choice, RecursiveSettings) and choice.physical):
+        return estimate, None, estimator.weighing
+    if estimator.weighing == "by step":
         estimate = with_wls_errors(estimate, wls)
     fit = consistent_fit(choice, model, mapping, prior)
-    return fit.project(estimate), fit
+    return fit.project(estimate), fit, estimator.weighing
 
 
 def _standard(

@@ -122,7 +122,7 @@ class EstimatorSettings(Settings):
 
     name: str = setting("consistent", "which estimator")
 
-    def __new__(cls, name: str = "consistent", **options: object) -> Self:
+    def __new__(cls, name: str = "consistent", **options: object) -> "EstimatorSettings":
         kind = ESTIMATORS.get(name)
         if cls is not EstimatorSettings:
             return super().__new__(cls)
@@ -138,7 +138,8 @@ class EstimatorSettings(Settings):
     @classmethod
     def schema(cls) -> dict[str, Any]:
         kinds = ESTIMATORS.values() if cls is EstimatorSettings else [cls]
-        return {key: value for kind in kinds for key, value in super(cls, kind).schema().items()}
+        schemas = [super(EstimatorSettings, kind).schema() for kind in kinds]
+        return {key: value for schema in schemas for key, value in schema.items()}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
@@ -173,9 +174,7 @@ def _called(name: str, words: str) -> Any:  # noqa: ANN401
 class RobustSettings(EstimatorSettings):
     """Settings of estimators that can count rows less that fit badly."""
 
-    robust: str = setting(
-        "none", "loss of rows that fit badly", among=("none", "huber", "tukey")
-    )
+    robust: str = setting("none", "loss of rows that fit badly", among=("none", "huber", "tukey"))
 
     @property
     def loss(self) -> str:
@@ -229,11 +228,6 @@ class RecursiveSettings(BoundedSettings):
     """Settings of estimators that take the samples one by one."""
 
     physical: bool = setting(False, "whether the last estimate is made physically possible")
-
-    @property
-    def is_filter(self) -> bool:
-        """Whether what was sampled later counts more."""
-        return False
 
 
 @dataclass(frozen=True, init=False)
@@ -308,10 +302,6 @@ class RLSSettings(RecursiveSettings):
         within=Range("0 < x <= 1", lambda x: 0 < x <= 1),
     )
 
-    @property
-    def is_filter(self) -> bool:
-        return self.forgetting < 1
-
 
 @dataclass(frozen=True)
 class KalmanSettings(RecursiveSettings):
@@ -330,10 +320,6 @@ class KalmanSettings(RecursiveSettings):
             "0.5 <= x < 1, or false", lambda x: x is False or (x is not True and 0.5 <= x < 1)
         ),
     )
-
-    @property
-    def is_filter(self) -> bool:
-        return True
 
 
 @dataclass(frozen=True)

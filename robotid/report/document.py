@@ -55,6 +55,7 @@ _SECTIONS = {
     "versions": "Versions",
 }
 
+
 def write_report(
     identification: Identification, target: str | Path, *, findings: Sequence[Finding] = ()
 ) -> Path:

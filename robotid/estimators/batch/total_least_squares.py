@@ -8,10 +8,9 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators.batch.least_squares import WLS
-from robotid.estimators.estimator import Estimate, Estimator, as_factors
+from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.regressor.factors import Factors
-from robotid.regressor.problem import Problem
 
 __all__ = ["TLS"]
 
@@ -21,14 +20,16 @@ _ALONE = 1e-6  # relative gap of the two smallest singular values below which ne
 
 
 @dataclass(frozen=True)
-class TLS(Estimator):
+class TLS(BatchEstimator):
     """Total least squares with exact columns, rows weighted as by WLS.
 
     Finds the smallest corrections E of the regressor and e of the torque with
     (W + E) theta = tau - e, where the noise of a column is ``regressor_noise`` times its root mean
     square and columns of constants have none. It is right where positions are noisy and their
     derivatives more so, and wrong where the residual is what the model lacks: it then blames the
-    regressor for it. With ``regressor_noise`` towards 0 it is WLS.
+    regressor for it. With ``regressor_noise`` towards 0 it is WLS, whose covariance it states. It
+    refuses data of which no single solution is smallest, and a regressor's noise larger than the
+    residual allows (``DataError``).
 
     Attributes:
         regressor_noise: Noise of the columns over their root mean square [-].
@@ -44,22 +45,7 @@ class TLS(Estimator):
     exact: Sequence[str] = ("offset",)
     independent_share: float = 1.0
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the parameters; see ``Estimator.fit``.
-
-        Args:
-            data: A problem in base parameters, or its factors.
-
-        Returns:
-            The estimate; its covariance is that of WLS.
-
-        Raises:
-            DataError: If there are fewer rows than parameters, no single solution is smallest, or
-                the regressor's noise is larger than the residual allows.
-            NotConvergedError: If the shares of the two noises do not settle.
-            RankDeficientError: If the data leave parameters open.
-        """
-        factors = as_factors(data)
+    def _fit(self, factors: Factors) -> Estimate:
         wls = WLS(independent_share=self.independent_share).fit(factors)
         if wls.rank < len(factors.names):
             raise RankDeficientError(wls.rank, wls.undetermined, len(factors.names))

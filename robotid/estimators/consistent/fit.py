@@ -30,10 +30,9 @@ from robotid.estimators.consistent.penalties import (
 )
 from robotid.estimators.consistent.solvers import SOLVERS, ConeSolution
 from robotid.estimators.determination import base_spread, determine
-from robotid.estimators.estimator import Estimate, Estimator, as_factors
+from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors
-from robotid.regressor.problem import Problem
 from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["Consistent"]
@@ -42,7 +41,7 @@ _ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
 
 
 @dataclass(frozen=True, eq=False)
-class Consistent(Estimator):
+class Consistent(BatchEstimator):
     """Physically consistent estimate of the standard parameters.
 
     Minimises, over the standard parameters pi,
@@ -52,6 +51,10 @@ class Consistent(Estimator):
     subject to J(pi_i) - J(held_i) >= margin T_i for each body i, armature, viscous and Coulomb
     coefficients >= 0, and the further constraints. The noise levels sigma_j are those of the fit
     without the inequalities, from weighted least squares onwards.
+
+    An estimate is over the p standard parameters, its covariance that of the fit without the
+    inequalities; ``redrawn`` tells that with them. Its rank, condition number and the names of
+    undetermined parameters are those of the base parameters.
 
     Attributes:
         layout: The standard parameters.
@@ -112,22 +115,11 @@ class Consistent(Estimator):
             )
         check_constraints(self.constraints, self.layout, self.prior, self._held)
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the standard parameters; see ``Estimator.fit``.
+    @property
+    def in_cone(self) -> "Consistent":
+        return self
 
-        Args:
-            data: A problem in base parameters, or its factors.
-
-        Returns:
-            The estimate over the p standard parameters. The covariance is that of the fit without
-            the inequalities; ``redrawn`` tells that with them. Rank, condition number and the
-            names of undetermined parameters are those of the base parameters.
-
-        Raises:
-            DataError: If there are fewer rows than parameters.
-            NotConvergedError: If the cone solver does not solve it.
-        """
-        factors = as_factors(data)
+    def _fit(self, factors: Factors) -> Estimate:
         wls = self._wls(factors)
         sigma = self.noise(factors, wls.sigma)
         rows = self.rows(factors, sigma)

@@ -10,10 +10,9 @@ from robotid.estimators.consistent.cones import svec, unsvec
 from robotid.estimators.consistent.constraints import SIGN_MARGIN, Constraints
 from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.penalties import body_units
-from robotid.estimators.estimator import Estimate, Estimator, as_factors
+from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import SettingsError
 from robotid.regressor.factors import Factors
-from robotid.regressor.problem import Problem
 from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
 __all__ = [
@@ -34,7 +33,7 @@ _SPREAD = 1.0  # of random starts, in log-Cholesky parameters
 
 
 @dataclass(frozen=True, eq=False)
-class LogCholesky(Estimator):
+class LogCholesky(BatchEstimator):
     """The fit of ``Consistent``, over coordinates in which every point is possible.
 
     Beside its held share and its margin, a body's pseudo-inertia is U U^T with U an upper
@@ -64,21 +63,11 @@ class LogCholesky(Estimator):
                 "'consistent' for bounds and pinned links"
             )
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Estimate the standard parameters; see ``Estimator.fit``.
+    @property
+    def in_cone(self) -> Consistent:
+        return self.fit_in_cone
 
-        Args:
-            data: A problem in base parameters, or its factors.
-
-        Returns:
-            The estimate over the p standard parameters; the covariance is that of the fit without
-            the inequalities.
-
-        Raises:
-            DataError: If there are fewer rows than parameters.
-            NotConvergedError: If the cone programme is not solved.
-        """
-        factors = as_factors(data)
+    def _fit(self, factors: Factors) -> Estimate:
         cone = self.fit_in_cone.fit(factors)
         rows = self.fit_in_cone.rows(factors, cone.sigma)
         lowest = self.fit_in_cone.objective(rows, cone.theta)

@@ -107,46 +107,20 @@ class Quadratic(Penalty):
 
     @property
     def centre(self) -> Array:
-        """Where it is 0, shape (p,)."""
         return self.prior
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether its Hessian is the same everywhere."""
         return True
 
     def value(self, pi: Array) -> float:
-        """Return the penalty; see ``Penalty.value``.
-
-        Args:
-            pi: Standard parameters, shape (p,).
-
-        Returns:
-            At least 0.
-        """
         return float((pi - self.prior) @ self.M @ (pi - self.prior))
 
     def gradient(self, pi: Array) -> Array:
-        """Return its gradient.
-
-        Args:
-            pi: Standard parameters, shape (p,).
-
-        Returns:
-            Gradient, shape (p,).
-        """
         slope: Array = 2.0 * self.M @ (pi - self.prior)
         return slope
 
     def hessian(self, pi: Array) -> Array:
-        """Return its second derivative.
-
-        Args:
-            pi: Standard parameters, shape (p,); without influence.
-
-        Returns:
-            Hessian, shape (p, p).
-        """
         return 2.0 * self.M
 
 

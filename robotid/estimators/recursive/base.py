@@ -7,17 +7,16 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators.estimator import Estimate, Estimator
-from robotid.exceptions import DataError
-from robotid.regressor.factors import Factors
+from robotid.estimators.estimator import Estimate, Estimator, require_rows
+from robotid.exceptions import DataError, RankDeficientError
 from robotid.regressor.problem import Problem, Sample
 
-__all__ = ["RecursiveEstimator", "as_problem", "fold", "load_state", "save_state", "scaled_rows"]
+__all__ = ["Filter", "RecursiveEstimator", "fold", "load_state", "save_state", "scaled_rows"]
 
 StateT = TypeVar("StateT")
 
@@ -28,6 +27,8 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
     A state is a frozen dataclass of arrays and numbers: ``save_state`` and
     ``load_state`` keep every bit of it.
     """
+
+    reads: ClassVar[Literal["samples"]] = "samples"
 
     @abstractmethod
     def init(self, c: int) -> StateT:
@@ -68,6 +69,32 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
         """
 
 
+class Filter(RecursiveEstimator[StateT]):
+    """A recursive estimator that visits the samples once, in the order of time."""
+
+    prior: Array | None
+
+    @abstractmethod
+    def rows_of(self, state: StateT) -> int:
+        """Return the number of rows that a state rests on.
+
+        Args:
+            state: The state.
+
+        Returns:
+            The number.
+        """
+
+    def fit(self, data: Problem) -> Estimate:
+        c = len(data.names)
+        state = fold(self, data.samples(), self.init(c))
+        require_rows(self.rows_of(state), c, data.n_joints)
+        estimate = self.estimate(state, data.names)
+        if estimate.rank < c and self.prior is None:
+            raise RankDeficientError(estimate.rank, estimate.undetermined, c)
+        return estimate
+
+
 def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state: StateT) -> StateT:
     """Return the state after all samples.
 
@@ -85,25 +112,6 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
     for sample in samples:
         state = estimator.update(state, sample)
     return state
-
-
-def as_problem(data: Problem | Factors) -> Problem:
-    """Return the data as a problem, and refuse factors: they hold no samples.
-
-    Args:
-        data: What was given to ``fit``.
-
-    Returns:
-        The problem.
-
-    Raises:
-        DataError: If the data are factors.
-    """
-    if isinstance(data, Problem):
-        return data
-    raise DataError(
-        "a recursive estimator reads samples, and factors hold none; give it the problem itself"
-    )
 
 
 def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:

@@ -1,36 +1,25 @@
-"""What the gradient methods share: state, column scaling, passes in random order, estimate.
+"""The gradient methods: a step per sample along the gradient, passes in random order.
 
 They work in scaled parameters x = scale theta, where every column has unit norm; their residual is
 e = Psi P^ - tau, the paper's sign.
 """
 
-from collections.abc import Callable
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators.estimator import Estimate, require_rows
-from robotid.estimators.recursive.base import scaled_rows
+from robotid.estimators.estimator import Estimate, Weighing, require_rows
+from robotid.estimators.recursive.base import RecursiveEstimator, fold, scaled_rows
 from robotid.exceptions import DataError
 from robotid.regressor.problem import Problem, Sample, shuffled
 
-__all__ = [
-    "DescentState",
-    "Rows",
-    "advance",
-    "column_scale",
-    "descent_estimate",
-    "is_zero",
-    "run_passes",
-    "start_state",
-]
+__all__ = ["Descent", "DescentState", "NormalisedGradient", "Rows", "column_scale"]
 
 #: Rows of a sample: all, or the indices of those of positive weight.
 Rows: TypeAlias = slice | Array
-#: Change of x from Psi (k, c), e (k,) and the rows, all in units of their noise.
-Step: TypeAlias = Callable[[Array, Array, Rows], Array]
 
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), so that the start fades as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
@@ -64,6 +53,185 @@ class DescentState:
     rows: int
 
 
+@dataclass(frozen=True, eq=False)
+class Descent(RecursiveEstimator[DescentState]):
+    """A gradient method; its leaves say how a sample moves the parameters.
+
+    ``fit`` visits the samples in several passes, until PRX = 0. A gradient method does not learn
+    how uncertain it is: the covariance is infinite, rank and condition number are unknown.
+
+    Attributes:
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        prior: Parameters to start from, shape (c,); 0 if None.
+        scale: Column scaling, shape (c,); None: ``fit`` takes the column norms, a state made by
+            ``init`` has none.
+        average: Whether the estimate is the average of the iterates; wanted with noise.
+        passes: Largest number of passes of ``fit``.
+        rng: Source of the random order in which ``fit`` visits the samples; in the order of time
+            if None.
+        eps1: PRX = 0 if its recent mean is within this norm, in scaled parameters.
+        eps2: Samples with |Psi|^2 <= eps2 are skipped.
+
+    Raises:
+        DataError: If a setting is out of its range.
+    """
+
+    sigma: Array
+    prior: Array | None = None
+    scale: Array | None = None
+    average: bool = True
+    passes: int = 4
+    rng: np.random.Generator | None = None
+    eps1: float = 1e-9
+    eps2: float = 1e-12
+
+    def __post_init__(self) -> None:
+        for name in ("passes", "eps1", "eps2"):
+            if not getattr(self, name) > 0:
+                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
+        self._check()
+
+    @property
+    def weighing(self) -> Weighing:
+        return "by step"
+
+    @property
+    @abstractmethod
+    def _takes_scale(self) -> bool:
+        """Whether ``fit`` scales the columns where no scale is given."""
+
+    @abstractmethod
+    def _check(self) -> None:
+        """Refuse settings of the leaf that are out of their range."""
+
+    @abstractmethod
+    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+        """Return x, shape (c,), after rows Psi (k, c) with residuals e (k,), in units of noise."""
+
+    def init(self, c: int) -> DescentState:
+        x = np.zeros(c) if self.prior is None else self.prior * self._unit
+        return DescentState(x, x, np.zeros(c), 0.0, np.zeros(len(self.sigma)), 0, 0, 0)
+
+    def update(self, state: DescentState, sample: Sample) -> DescentState:
+        c, sigma = len(state.x), self.sigma
+        rows = scaled_rows(sample, sigma, c)  # (k, c + 1)
+        Psi, tau = rows[:, :c], rows[:, c]
+        if self.scale is not None:
+            Psi = Psi / self.scale
+        steps = state.steps + 1
+        if np.vdot(Psi, Psi) <= self.eps2:
+            return replace(state, steps=steps, skipped=state.skipped + 1)
+        # all rows at once is the usual case, and a slice is cheap
+        used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
+        x = self._moved(state.x, Psi, Psi @ state.x - tau, used, sample)
+        newest = _AVERAGE / (steps + _AVERAGE - 1)
+        mean = state.mean + (x - state.mean) * newest if self.average else x
+        # how good the estimate was for this sample, before the sample changed it
+        e = Psi @ state.mean - tau
+        prx = e @ Psi  # (23), (4): Psi^T (Psi P^ - u)
+        share = 1.0 / min(steps, _MEMORY)
+        squares = state.squares.copy()
+        squares[used] += share * (e**2 * sigma[used] ** 2 / sample.weight[used] - squares[used])
+        return DescentState(
+            x,
+            mean,
+            state.prx + share * (prx - state.prx),
+            state.prx_square + share * (float(prx @ prx) - state.prx_square),
+            squares,
+            steps,
+            state.skipped,
+            state.rows + len(rows),
+        )
+
+    def estimate(self, state: DescentState, names: tuple[str, ...]) -> Estimate:
+        c = len(names)
+        prx = float(np.linalg.norm(state.prx))
+        return Estimate(
+            theta=state.mean / self._unit,
+            covariance=np.full((c, c), np.inf),
+            names=names,
+            sigma=np.sqrt(state.squares),
+            rank=c,
+            condition=float("inf"),
+            undetermined=(),
+            converged=self._is_zero(state),
+            n_iter=state.steps,
+            message=f"{state.steps} steps, {state.skipped} without information, |PRX| = {prx:.3g}; "
+            "a gradient method does not know its covariance, so it is stated as infinite",
+        )
+
+    def fit(self, data: Problem) -> Estimate:
+        estimator, c = self, len(data.names)
+        if self.scale is None and self._takes_scale:
+            estimator = replace(self, scale=column_scale(data, self.sigma))
+        state, settled = estimator.init(c), False
+        for _ in range(self.passes):
+            before = state
+            samples = data.samples() if self.rng is None else shuffled(data.samples(), self.rng)
+            state = fold(estimator, samples, state)
+            require_rows(state.rows, c, data.n_joints)
+            settled = self._has_settled(before, state)
+            if settled:
+                break
+        return replace(estimator.estimate(state, data.names), converged=settled)
+
+    @property
+    def _unit(self) -> Array | float:
+        return 1.0 if self.scale is None else self.scale
+
+    def _is_zero(self, state: DescentState) -> bool:
+        """Return whether PRX = 0 (25): within eps1, or within what its own scatter leaves open."""
+        if state.steps < _MEMORY:
+            return False
+        norm = float(np.linalg.norm(state.prx))
+        standard_error = np.sqrt(state.prx_square / (2 * _MEMORY))
+        return norm <= self.eps1 or norm <= _ZERO * standard_error
+
+    def _has_settled(self, before: DescentState, after: DescentState) -> bool:
+        """Return whether PRX = 0 after a pass.
+
+        What scatters about 0 only counts as 0 if the pass has not made the residual any smaller.
+        """
+        first, last = (float(np.sum(s.squares / self.sigma**2)) for s in (before, after))
+        gain = 1.0 - last / first if first > 0 else 1.0
+        is_small = float(np.linalg.norm(after.prx)) <= self.eps1
+        return is_small or (self._is_zero(after) and gain < _GAIN)
+
+
+@dataclass(frozen=True, eq=False)
+class NormalisedGradient(Descent):
+    """Normalised gradient (NLMS), the cheapest recursive estimator.
+
+    theta <- theta - mu / (eps + |Psi|_F^2) Psi^T e, e = Psi theta - tau, rows in units of their
+    noise. Without noise |theta~| never grows while 0 < mu < 2.
+
+    Attributes:
+        step_size: The relaxation mu, above 0 and below 2 [-].
+        regularisation: The small number eps [-].
+
+    References:
+        Goodwin, Sin (1984), Adaptive Filtering, Prediction and Control, 3.3.
+    """
+
+    step_size: float = 1.0
+    regularisation: float = 1e-9
+
+    @property
+    def _takes_scale(self) -> bool:
+        return True
+
+    def _check(self) -> None:
+        if not 0 < self.step_size < 2:
+            raise DataError(f"step_size is {self.step_size}, wanted above 0 and below 2")
+        if not self.regularisation > 0:
+            raise DataError(f"regularisation is {self.regularisation}, wanted a positive number")
+
+    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+        gamma = self.step_size / (self.regularisation + np.vdot(Psi, Psi))
+        moved: Array = x - gamma * (e @ Psi)
+        return moved
+
+
 def column_scale(problem: Problem, sigma: Array) -> Array:
     """Return the root mean square of each column, rows in units of their noise.
 
@@ -89,167 +257,3 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
         raise DataError("the problem holds a row that is not finite; check the trajectory")
     rms = np.sqrt(squares / max(count, 1))
     return np.where(rms > _SILENT * rms.max(initial=0.0), rms, 1.0)
-
-
-def start_state(c: int, n: int, prior: Array | None, scale: Array | None) -> DescentState:
-    """Return the state before any sample.
-
-    Args:
-        c: Number of parameters.
-        n: Rows per sample.
-        prior: Parameters to start from, shape (c,); 0 if None.
-        scale: Scaled parameters per parameter, shape (c,); 1 if None.
-
-    Returns:
-        The state.
-    """
-    x = np.zeros(c) if prior is None else prior * (1.0 if scale is None else scale)
-    return DescentState(x, x, np.zeros(c), 0.0, np.zeros(n), 0, 0, 0)
-
-
-def advance(
-    state: DescentState,
-    sample: Sample,
-    sigma: Array,
-    scale: Array | None,
-    step: Step,
-    *,
-    average: bool,
-    eps2: float,
-) -> DescentState:
-    """Return the state after one more sample.
-
-    Args:
-        state: The state before.
-        sample: One instant; rows of weight 0 are skipped.
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        scale: Scaled parameters per parameter, shape (c,); 1 if None.
-        step: Change of x from (Psi (k, c), e (k,), rows (k,)): rows in units of their noise.
-        average: Whether the estimate is the average of the iterates.
-        eps2: A sample with |Psi|^2 <= eps2 is skipped.
-
-    Returns:
-        The state after.
-
-    Raises:
-        DataError: If the sample is not finite or of another shape.
-    """
-    c = len(state.x)
-    rows = scaled_rows(sample, sigma, c)  # (k, c + 1)
-    Psi, tau = rows[:, :c], rows[:, c]
-    if scale is not None:
-        Psi = Psi / scale
-    steps = state.steps + 1
-    if np.vdot(Psi, Psi) <= eps2:
-        return replace(state, steps=steps, skipped=state.skipped + 1)
-    # all rows at once is the usual case, and a slice is cheap
-    used = slice(None) if len(rows) == len(sigma) else np.flatnonzero(sample.weight)
-    x = state.x - step(Psi, Psi @ state.x - tau, used)
-    mean = state.mean + (x - state.mean) * (_AVERAGE / (steps + _AVERAGE - 1)) if average else x
-    # how good the estimate was for this sample, before the sample changed it
-    e = Psi @ state.mean - tau
-    prx = e @ Psi  # (23), (4): Psi^T (Psi P^ - u)
-    share = 1.0 / min(steps, _MEMORY)
-    squares = state.squares.copy()
-    squares[used] += share * (e**2 * sigma[used] ** 2 / sample.weight[used] - squares[used])
-    return DescentState(
-        x,
-        mean,
-        state.prx + share * (prx - state.prx),
-        state.prx_square + share * (float(prx @ prx) - state.prx_square),
-        squares,
-        steps,
-        state.skipped,
-        state.rows + len(rows),
-    )
-
-
-def is_zero(state: DescentState, eps1: float) -> bool:
-    """Return whether PRX = 0: within eps1, or within what its own scatter leaves open.
-
-    Args:
-        state: The state.
-        eps1: Bound on the norm of PRX in scaled parameters, rows in units of their noise.
-
-    Returns:
-        Whether the recent mean of PRX is 0, (25).
-    """
-    if state.steps < _MEMORY:
-        return False
-    norm = float(np.linalg.norm(state.prx))
-    standard_error = np.sqrt(state.prx_square / (2 * _MEMORY))
-    return norm <= eps1 or norm <= _ZERO * standard_error
-
-
-def run_passes(
-    update: Callable[[DescentState, Sample], DescentState],
-    state: DescentState,
-    problem: Problem,
-    sigma: Array,
-    *,
-    passes: int,
-    rng: np.random.Generator | None,
-    eps1: float,
-) -> tuple[DescentState, bool]:
-    """Return the state after several passes over a problem, or once PRX = 0.
-
-    What scatters about 0 only counts as 0 if the last pass has not made the residual any smaller.
-
-    Args:
-        update: One step.
-        state: The state before.
-        problem: The samples.
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        passes: Largest number of passes.
-        rng: Source of the random order; in the order of time if None.
-        eps1: Bound for PRX = 0.
-
-    Returns:
-        The state after, and whether PRX = 0 there.
-
-    Raises:
-        DataError: If there are fewer rows than parameters, or a sample is not finite.
-    """
-    for _ in range(passes):
-        before = float(np.sum(state.squares / sigma**2))
-        samples = problem.samples() if rng is None else shuffled(problem.samples(), rng)
-        for sample in samples:
-            state = update(state, sample)
-        require_rows(state.rows, len(problem.names), problem.n_joints)
-        gain = 1.0 - float(np.sum(state.squares / sigma**2)) / before if before > 0 else 1.0
-        is_small = float(np.linalg.norm(state.prx)) <= eps1
-        if is_small or (is_zero(state, eps1) and gain < _GAIN):
-            return state, True
-    return state, False
-
-
-def descent_estimate(
-    state: DescentState, scale: Array | None, names: tuple[str, ...], eps1: float
-) -> Estimate:
-    """Return the estimate of a gradient method.
-
-    Args:
-        state: The state.
-        scale: Scaled parameters per parameter, shape (c,); 1 if None.
-        names: Names of the c parameters.
-        eps1: Bound for PRX = 0.
-
-    Returns:
-        The estimate. A gradient method does not learn how uncertain it is: its covariance is
-        infinite, and its rank and condition number are unknown.
-    """
-    c = len(names)
-    prx = float(np.linalg.norm(state.prx))
-    return Estimate(
-        theta=state.mean / (1.0 if scale is None else scale),
-        covariance=np.full((c, c), np.inf),
-        names=names,
-        sigma=np.sqrt(state.squares),
-        rank=c,
-        condition=float("inf"),
-        undetermined=(),
-        converged=is_zero(state, eps1),
-        n_iter=state.steps,
-        message=f"{state.steps} steps, {state.skipped} without information, |PRX| = {prx:.3g}; "
-        "a gradient method does not know its covariance, so it is stated as infinite",
-    )

@@ -6,11 +6,10 @@ from statistics import NormalDist
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators.estimator import Estimate, require_rows
-from robotid.estimators.recursive.base import RecursiveEstimator, as_problem, fold, scaled_rows
+from robotid.estimators.estimator import Estimate, Weighing
+from robotid.estimators.recursive.base import Filter, scaled_rows
 from robotid.exceptions import DataError
-from robotid.regressor.factors import Factors
-from robotid.regressor.problem import Problem, Sample
+from robotid.regressor.problem import Sample
 
 __all__ = ["Kalman", "KalmanState"]
 
@@ -42,14 +41,15 @@ class KalmanState:
 
 
 @dataclass(frozen=True, eq=False)
-class Kalman(RecursiveEstimator[KalmanState]):
+class Kalman(Filter[KalmanState]):
     """Kalman filter: theta_k+1 = theta_k + w, tau = Y theta + noise.
 
     The covariance is updated in Joseph's form, P <- (1 - K Y) P (1 - K Y)^T + K R K^T, multiplied
     out: P - A - A^T with A = K (P Y^T - K T / 2)^T and T = Y P Y^T + R. It is as forgiving of an
     inexact K, symmetric to the last bit, and its products have only n columns. A row whose
     innovation is improbable is turned away and counted; a joint that is turned away 50 times in a
-    row is believed again.
+    row is believed again. A parameter about which the data say next to nothing is undetermined,
+    and as uncertain as its prior.
 
     Attributes:
         sigma: Noise level of each joint, shape (n,) [N m or N].
@@ -88,18 +88,11 @@ class Kalman(RecursiveEstimator[KalmanState]):
         if self.gate is not None and not 0.5 <= self.gate < 1:
             raise DataError(f"gate is {self.gate}, wanted at least 0.5 and below 1, or None")
 
+    @property
+    def weighing(self) -> Weighing:
+        return "by age"
+
     def init(self, c: int) -> KalmanState:
-        """Return the state before any sample; see ``RecursiveEstimator.init``.
-
-        Args:
-            c: Number of parameters.
-
-        Returns:
-            The state.
-
-        Raises:
-            DataError: If the prior has another size.
-        """
         if self.prior.shape != (c,) or len(self.prior_std) != c:
             raise DataError(
                 f"prior {self.prior.shape} and prior_std {self.prior_std.shape}: wanted {c} "
@@ -111,18 +104,6 @@ class Kalman(RecursiveEstimator[KalmanState]):
         return KalmanState(self.prior, P, np.zeros(n), none, none, none, 0)
 
     def update(self, state: KalmanState, sample: Sample) -> KalmanState:
-        """Return the state after one more sample; see ``RecursiveEstimator.update``.
-
-        Args:
-            state: The state before.
-            sample: One instant.
-
-        Returns:
-            The state after.
-
-        Raises:
-            DataError: If the sample is not finite or of another shape; the state stays valid.
-        """
         c = len(state.theta)
         used = np.flatnonzero(sample.weight)
         # in units of each row's noise, that of rows which are not independent enlarged
@@ -154,16 +135,6 @@ class Kalman(RecursiveEstimator[KalmanState]):
         )
 
     def estimate(self, state: KalmanState, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds; see ``RecursiveEstimator.estimate``.
-
-        Args:
-            state: The state.
-            names: Names of the c parameters.
-
-        Returns:
-            The estimate; a parameter about which the data say next to nothing is undetermined,
-            and as uncertain as its prior.
-        """
         std = self._prior_spread()
         after = np.sqrt(np.maximum(np.diag(state.P), 0.0))
         # the mean of innovation times residual is the noise variance, whatever P is
@@ -184,23 +155,8 @@ class Kalman(RecursiveEstimator[KalmanState]):
             f"gate, {int(state.rows.sum())} taken",
         )
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Fold all samples of a problem; see ``Estimator.fit``.
-
-        Args:
-            data: A problem in base parameters.
-
-        Returns:
-            The estimate after the last sample.
-
-        Raises:
-            DataError: If there are fewer rows than parameters, or a sample is not finite.
-        """
-        problem = as_problem(data)
-        c = len(problem.names)
-        state = fold(self, problem.samples(), self.init(c))
-        require_rows(int(state.rows.sum()), c, problem.n_joints)
-        return self.estimate(state, problem.names)
+    def rows_of(self, state: KalmanState) -> int:
+        return int(state.rows.sum())
 
     def _prior_spread(self) -> Array:
         if self.prior_std.ndim == 1:

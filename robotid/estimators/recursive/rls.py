@@ -7,11 +7,11 @@ from scipy.linalg.lapack import dtpqrt
 
 from robotid._typing import Array
 from robotid.estimators.batch.least_squares import solve_factor
-from robotid.estimators.estimator import Estimate, require_rows
-from robotid.estimators.recursive.base import RecursiveEstimator, as_problem, fold, scaled_rows
-from robotid.exceptions import DataError, RankDeficientError
+from robotid.estimators.estimator import Estimate, Weighing
+from robotid.estimators.recursive.base import Filter, scaled_rows
+from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors
-from robotid.regressor.problem import Problem, Sample
+from robotid.regressor.problem import Sample
 
 __all__ = ["RLS", "RLSState"]
 
@@ -35,7 +35,7 @@ class RLSState:
 
 
 @dataclass(frozen=True, eq=False)
-class RLS(RecursiveEstimator[RLSState]):
+class RLS(Filter[RLSState]):
     """Recursive least squares with exponential forgetting.
 
     The state is the triangular factor R of all rows; a sample is folded in by QR:
@@ -46,7 +46,7 @@ class RLS(RecursiveEstimator[RLSState]):
     no information at all: without forgetting the result is that of batch least squares. With
     forgetting, information that no motion renews would vanish (wind-up). So each step adds one
     row of the prior, parameter after parameter, which keeps the information of each between
-    forgetting^c and 1 times that of the prior.
+    forgetting^c and 1 times that of the prior. What the data leave open has infinite variance.
 
     Attributes:
         sigma: Noise level of each joint, shape (n,) [N m or N]. Only the ratios matter: the
@@ -83,15 +83,11 @@ class RLS(RecursiveEstimator[RLSState]):
                 "prior_std to hold it above theirs"
             )
 
+    @property
+    def weighing(self) -> Weighing:
+        return "by joint" if self.forgetting == 1 else "by age"
+
     def init(self, c: int) -> RLSState:
-        """Return the state before any sample; see ``RecursiveEstimator.init``.
-
-        Args:
-            c: Number of parameters.
-
-        Returns:
-            The state.
-        """
         R = np.zeros((c + 1, c + 1), order="F")
         if self.prior is not None and self.prior_std is not None:
             R[:c, :c] = np.diag(1.0 / self.prior_std)
@@ -99,18 +95,6 @@ class RLS(RecursiveEstimator[RLSState]):
         return RLSState(R, 0.0, 0)
 
     def update(self, state: RLSState, sample: Sample) -> RLSState:
-        """Return the state after one more sample; see ``RecursiveEstimator.update``.
-
-        Args:
-            state: The state before.
-            sample: One instant.
-
-        Returns:
-            The state after.
-
-        Raises:
-            DataError: If the sample is not finite or of another shape; the state stays valid.
-        """
         rows = scaled_rows(sample, self.sigma, len(state.R) - 1)  # (k, c + 1)
         if not len(rows):
             return state
@@ -124,15 +108,6 @@ class RLS(RecursiveEstimator[RLSState]):
         return RLSState(R, count, state.steps + 1)
 
     def estimate(self, state: RLSState, names: tuple[str, ...]) -> Estimate:
-        """Return the estimate that a state holds; see ``RecursiveEstimator.estimate``.
-
-        Args:
-            state: The state.
-            names: Names of the c parameters.
-
-        Returns:
-            The estimate. Where the data leave a parameter open its variance is infinite.
-        """
         c = len(names)
         factors = Factors((state.R,), (np.arange(c),), np.array([int(state.rows)]), names)
         start = np.zeros(c) if self.prior is None else self.prior
@@ -156,28 +131,9 @@ class RLS(RecursiveEstimator[RLSState]):
             f"levels {scale:.3g} times those given",
         )
 
-    def fit(self, data: Problem | Factors) -> Estimate:
-        """Fold all samples of a problem; see ``Estimator.fit``.
-
-        Args:
-            data: A problem in base parameters.
-
-        Returns:
-            The estimate after the last sample.
-
-        Raises:
-            DataError: If there are fewer rows than parameters, or a sample is not finite.
-            RankDeficientError: If the data leave parameters open and there is no prior.
-        """
-        problem = as_problem(data)
-        c = len(problem.names)
-        state = fold(self, problem.samples(), self.init(c))
-        if self.forgetting == 1:
-            require_rows(int(state.rows), c, problem.n_joints)
-        estimate = self.estimate(state, problem.names)
-        if estimate.rank < c and self.prior is None:
-            raise RankDeficientError(estimate.rank, estimate.undetermined, c)
-        return estimate
+    def rows_of(self, state: RLSState) -> int:
+        # those that are forgotten have been seen all the same
+        return int(state.rows) if self.forgetting == 1 else state.steps * len(self.sigma)
 
     def _prior_row(self, state: RLSState) -> Array:
         """Return a row of the prior that makes up for what c steps forget of one parameter."""
