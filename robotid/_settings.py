@@ -7,7 +7,7 @@ the settings in result.json all come from these fields.
 import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar, Self, get_args, get_origin
+from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 
 from robotid.exceptions import SettingsError
 
@@ -54,6 +54,12 @@ class Key:
     load: Callable[[Any], Any] | None = None
     dump: Callable[[Any], Any] | None = None
 
+    @property
+    def words(self) -> str:
+        """What the setting is, with the words that it may be if they do not occur in that."""
+        is_told = all(word in self.text for word in self.among)
+        return self.text if is_told else f"{self.text}: {', '.join(self.among)}"
+
 
 def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
     """Declare a setting, as a field of a ``Settings``.
@@ -80,7 +86,9 @@ class Settings:
 
     def __init_subclass__(cls) -> None:
         own = {name: f.metadata["key"] for name, f in vars(cls).items() if isinstance(f, Field)}
-        lines = [f"    {name}: {key.text[:1].upper()}{key.text[1:]}" for name, key in own.items()]
+        lines = [
+            f"    {name}: {key.words[:1].upper()}{key.words[1:]}." for name, key in own.items()
+        ]
         cls.__doc__ = "\n".join([f"{cls.__doc__}\n\nAttributes:", *lines])
 
     def __post_init__(self) -> None:
@@ -107,6 +115,17 @@ class Settings:
             for table in tables:
                 inside = inside.setdefault(table, {})
             inside[last] = _read_type(f.type if key.reads is None else key.reads)
+        return found
+
+    @classmethod
+    def paths(cls) -> dict[str, Key]:
+        """Return what each key says of itself, those of tables inside with a dot between."""
+        found: dict[str, Key] = {}
+        for f in fields(cls):
+            key = f.metadata["key"]
+            at = key.at or f.name
+            inside = f.type.paths() if _is_table(f.type) else {"": key}
+            found |= {f"{at}.{last}".strip("."): inner for last, inner in inside.items()}
         return found
 
     @classmethod
@@ -215,16 +234,19 @@ def _type_name(kinds: tuple[type, ...]) -> str:
     return " or ".join(["a number", *(_ALSO[kind] for kind in kinds if kind in _ALSO)])
 
 
+def _is_table(kind: Any) -> TypeGuard[type[Settings]]:  # noqa: ANN401
+    return isinstance(kind, type) and issubclass(kind, Settings)
+
+
 def _read_type(kind: Any) -> Any:  # noqa: ANN401
     """Return what a job file holds where a field is annotated so."""
     if isinstance(kind, dict | list | tuple):
         return kind
-    if isinstance(kind, type) and issubclass(kind, Settings):
+    if _is_table(kind):
         return kind.schema()
     origin, inner = get_origin(kind), get_args(kind)
     if origin is tuple:
-        is_table = isinstance(inner[0], type) and issubclass(inner[0], Settings)
-        return [inner[0].schema()] if is_table else (list,)
+        return [inner[0].schema()] if _is_table(inner[0]) else (list,)
     if origin is not None and issubclass(origin, Mapping):
         return (dict,)
     if origin is not None and issubclass(origin, Sequence):
@@ -238,12 +260,11 @@ def _load(value: Any, about: Field[Any], name: str) -> Any:  # noqa: ANN401
     key, kind = about.metadata["key"], about.type
     if key.load is not None:
         return key.load(value)
-    if isinstance(kind, type) and issubclass(kind, Settings):
+    if _is_table(kind):
         return kind.from_dict(value)
     if isinstance(value, list):
         inner = get_args(kind)[0]
-        is_table = isinstance(inner, type) and issubclass(inner, Settings)
-        return tuple(inner.from_dict(item) if is_table else item for item in value)
+        return tuple(inner.from_dict(item) if _is_table(inner) else item for item in value)
     if isinstance(value, Mapping) and get_args(kind) == (str, float):
         for entry, number in value.items():
             if isinstance(number, bool) or not isinstance(number, _NUMBER):

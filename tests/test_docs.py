@@ -1,12 +1,16 @@
 """The examples under docs/ run, and what they say of their output is so."""
 
 import re
+import runpy
+import tomllib
 
 import pytest
 from helpers.corruptions import CASES
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 
@@ -21,6 +25,25 @@ def run(name):
     for block in blocks:
         exec(compile(block, name, "exec"), namespace)
     return blocks, namespace
+
+
+def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
+    page = (DOCS / "job_file.md").read_text()
+    written = runpy.run_path(str(DOCS / "make_job_file.py"))["page"]()
+    assert page == written, "run python docs/make_job_file.py"
+    for key in Job.paths():
+        assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(("ident", "valid"))
+    text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
+    job = job_from_settings(tomllib.loads(text), "job_file.md", tmp_path)
+    assert job.estimator == EstimatorSettings(
+        robust="tukey",
+        constraints={
+            "mass": {"forearm": [1.0, 3.0], "wrist": 0.8},
+            "com": {"forearm": [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.4]]},
+            "pinned": ["base"],
+        },
+    )
+    assert job.identification == (LogEntry(tmp_path / "first.csv", 0.5, 30.0),)
 
 
 def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):

@@ -27,8 +27,8 @@ class SignalSettings(Settings):
 
     rate: float | None = setting(
         None,
-        "rate of the uniform grid [Hz]; None takes the log's median rate (and, without a filter, "
-        "the rows as they are)",
+        "rate of the uniform grid [Hz]; if not stated, the log's median rate (and, without a "
+        "filter, the rows as they are)",
         within=POSITIVE,
     )
     cutoff: float | None = setting(
@@ -73,8 +73,8 @@ class SignalSettings(Settings):
     )
     max_gap: float | None = setting(
         None,
-        "a longer step between two rows is a gap [s]; None: 2.5 median steps, or a quarter of the "
-        "filter's period if that is longer",
+        "a longer step between two rows is a gap [s]; if not stated, 2.5 median steps, or a "
+        "quarter of the filter's period if that is longer",
         within=POSITIVE,
     )
     torque_delay: float = setting(
@@ -107,8 +107,8 @@ class LogSource(Settings):
 
     topic: str | None = setting(
         None,
-        "the topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; None if there is "
-        "only one",
+        "the topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; not needed if "
+        "there is only one",
     )
     joints: Mapping[str, str] = setting({}, "name in the file by joint, where they differ")
     effort: str = setting(
