@@ -11,7 +11,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.result import read_result, stated_parameters
+from robotid.export.result import load_result, stated_parameters
 from robotid.identification.evaluation import predict, prepare
 from robotid.identification.pipeline import Identification
 from robotid.logs.data import Log
@@ -76,7 +76,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
                 continue
             name = file.resolve().parent.name if len(paths) > 1 else "identified"
             label = name if name not in results else f"{name} {len(results) + 1}"
-            results[label] = read_result(file)
+            results[label] = load_result(file).content
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
     folder, content = tracks[0] if tracks else (None, None)

@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 from robotid._files import file_sha256
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.export.sidecar import load_identified
 from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
@@ -23,8 +26,9 @@ from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import __version__, versions
 
 __all__ = [
+    "Result",
     "build_result",
-    "read_result",
+    "load_result",
     "recording_metrics",
     "stated_parameters",
 ]
@@ -107,19 +111,79 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     return {"log": evaluation.recording.log.path, **_metrics(evaluation.metrics[name])}
 
 
-def read_result(path: str | Path) -> dict[str, Any]:
-    """Read a result.json.
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What an identification wrote: a result.json, and the URDF and sidecar beside it.
+
+    Attributes:
+        path: The result.json.
+        content: What it holds.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        return (
+            f"<Result of {self.content['robot']}: {self.content['structure']['base']} base "
+            f"parameters by {self.content['settings']['estimator']['name']}, verdict "
+            f"{self.verdict['status']}>"
+        )
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether the identified URDF was written: it is if the parameters are possible."""
+        return "urdf" in self.content["outputs"]
+
+    @cached_property
+    def identified(self) -> tuple[RobotModel, Array]:
+        """The robot of the identified URDF with its sidecar, and its standard parameters."""
+        if not self.has_urdf:
+            raise DataError(
+                f"{self.path.name} has no URDF, for its parameters are not physically consistent; "
+                "identify with the 'consistent' estimator"
+            )
+        outputs, folder = self.content["outputs"], self.path.parent
+        return load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
+
+    @property
+    def robot(self) -> RobotModel:
+        """The robot as identified."""
+        return self.identified[0]
+
+    @property
+    def parameters(self) -> Array:
+        """Its standard parameters, shape (p,), SI units, in ``robot.layout.names`` order."""
+        return self.identified[1]
+
+    @property
+    def verdict(self) -> Mapping[str, Any]:
+        """How far to trust it: "status", "reasons" and "per_joint"."""
+        verdict: Mapping[str, Any] = self.content["verdict"]
+        return verdict
+
+    @property
+    def metrics(self) -> dict[str, Mapping[str, Any]]:
+        """Metrics by joint: of the "fitted" rows, and of each log kept apart, by its file."""
+        kept = {entry["log"]: entry["per_joint"] for entry in self.content["validation"]}
+        return {"fitted": self.content["identification"]["per_joint"], **kept}
+
+
+def load_result(path: str | Path) -> Result:
+    """Load what an identification wrote.
 
     Args:
-        path: The file.
+        path: A result.json, or its folder; the URDF beside it is read when it is asked for.
 
     Returns:
-        Its content.
+        The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and all of its content.
 
     Raises:
         DataError: If it is missing, no JSON, or of another schema.
     """
     source = Path(path)
+    if source.is_dir():
+        source = source / "result.json"
     if not source.is_file():
         raise DataError(f"there is no result {str(source)!r}")
     try:
@@ -135,7 +199,7 @@ def read_result(path: str | Path) -> dict[str, Any]:
     missing = [key for key in _WANTED if key not in result]
     if missing:
         raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
-    return dict(result)
+    return Result(source, result)
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:

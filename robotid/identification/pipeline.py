@@ -303,9 +303,7 @@ def conclude(
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
             is_filter=weighing == "by age",
-            redraws=Redraws(fit, choice.draws, np.random.default_rng(0))
-            if fit is not None and isinstance(choice, BoundedSettings)
-            else None,
+            redraws=_redraws(choice, fit),
         )
     if grown != 1.0:
         estimate = replace(estimate, covariance=grown * estimate.covariance)
@@ -334,6 +332,13 @@ def conclude(
         factors=factors,
         determination=determination,
     )
+
+
+def _redraws(choice: EstimatorSettings, fit: Consistent | None) -> Redraws | None:
+    """Return the fits to redrawn data that tell the standard errors where bounds bind."""
+    if fit is None or not isinstance(choice, BoundedSettings):
+        return None
+    return Redraws(fit, choice.draws, np.random.default_rng(0))
 
 
 def _run(

@@ -2,10 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from robotid.commands.job import job_from_settings, read_job
+from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.logs.settings import LogSource
-from robotid.robot.parameters import Coupling
+from robotid.robot.model import GRAVITY
+from robotid.robot.parameters import DRIVE_TERMS, Coupling
 
 FULL = """
 urdf = "robot.urdf"
@@ -139,3 +140,9 @@ def test_a_wrong_job_names_what_is_wrong(tmp_path, old, new, message):
 def test_a_missing_job_file_is_named(tmp_path):
     with pytest.raises(SettingsError, match=r"there is no job file '.*none.toml'"):
         read_job(tmp_path / "none.toml")
+
+
+def test_gravity_and_drive_terms_default_to_those_of_the_model():
+    job = Job(urdf=Path("robot.urdf"))
+    assert job.gravity == GRAVITY
+    assert job.drives.terms == DRIVE_TERMS

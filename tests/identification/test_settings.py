@@ -1,4 +1,6 @@
 import json
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +9,11 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings, read_job
+from robotid.estimators.consistent.penalties import METRICS
+from robotid.estimators.consistent.solvers import SOLVERS
 from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
+from robotid.identification.robust import LOSSES
 from robotid.identification.settings import ESTIMATORS, EstimatorSettings, RecursiveSettings
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
@@ -121,3 +126,19 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
 def test_a_setting_that_does_not_fit_is_refused(options, text):
     with pytest.raises(SettingsError, match=text):
         EstimatorSettings(**options)
+
+
+def test_words_of_the_settings_are_those_that_the_estimators_know():
+    keys = EstimatorSettings("consistent").paths()
+    assert set(keys["prior"].among) == set(METRICS)
+    assert set(keys["solver"].among) == set(SOLVERS)
+    assert set(keys["robust"].among) == {"none", *LOSSES}
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_settings_of_each_estimator_survive_a_round_trip(name):
+    settings = EstimatorSettings(name)
+    assert type(settings) is ESTIMATORS[name]
+    assert EstimatorSettings(**settings.to_dict()) == settings
+    assert replace(settings) == settings
+    assert pickle.loads(pickle.dumps(settings)) == settings

@@ -13,7 +13,7 @@ from helpers.synthetic import exact_log, truth
 from robotid._files import write_json
 from robotid.cli import main
 from robotid.exceptions import DataError
-from robotid.export.result import read_result
+from robotid.export.result import load_result
 from robotid.logs.read import write_log
 from robotid.report.comparison import compare_results
 from robotid.report.comparison_page import write_comparison
@@ -40,7 +40,7 @@ def changed(folder, tmp_path):
     """Return a function that writes b.json with a change and compares a.json with it."""
 
     def compare(change):
-        result = copy.deepcopy(read_result(folder / "b.json"))
+        result = copy.deepcopy(load_result(folder / "b.json").content)
         change(result)
         write_json(result, tmp_path / "b.json")
         return compare_results([folder / "a.json", tmp_path / "b.json"])
@@ -49,7 +49,7 @@ def changed(folder, tmp_path):
 
 
 def test_differences_are_in_combined_standard_errors(folder):
-    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    a, b = (load_result(folder / f"{name}.json").content for name in "ab")
     found = compare_results([folder / "a.json", folder / "b.json"])
     assert len(found["base_parameters"]) == len(a["base_parameters"])
     for one, other, entry in zip(
@@ -61,7 +61,7 @@ def test_differences_are_in_combined_standard_errors(folder):
 
 
 def test_errors_of_the_same_recording_stand_side_by_side(folder):
-    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    a, b = (load_result(folder / f"{name}.json").content for name in "ab")
     found = compare_results([folder / "a.json", folder / "b.json"])
     assert found["remarks"] == []
     assert found["fitted_alike"]
@@ -149,7 +149,7 @@ def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
 
 def test_names_of_files_cannot_inject_markup(folder, tmp_path):
     path = tmp_path / "<b>x.json"
-    write_json({**read_result(folder / "b.json"), "robot": "<i>r"}, path)
+    write_json({**load_result(folder / "b.json").content, "robot": "<i>r"}, path)
     write_comparison([folder / "a.json", path], tmp_path / "c.html")
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
     assert "<b>" not in html
