@@ -6,16 +6,14 @@ time, or with --cpu the processor's, which other work on the machine changes les
 largest amount that Python and NumPy hold over the input arrays, by tracemalloc in a run of its own.
 
     python benchmarks/bench_end_to_end.py [--quick] [--million]
-    python benchmarks/bench_end_to_end.py --readme [--cpu] [--figaroh PYTHON]
+    python benchmarks/bench_end_to_end.py --panda [--cpu] [--figaroh PYTHON]
 
-The last one also writes its table into README.md, between the lines that mark it; --figaroh names
-an interpreter with FIGAROH (see bench_figaroh.py) for a column of its time.
+--figaroh names an interpreter with FIGAROH (see bench_figaroh.py) for a column of its time.
 """
 
 import argparse
 import os
 import time
-from pathlib import Path
 
 import numpy as np
 from bench_figaroh import compare
@@ -24,9 +22,7 @@ from setting import ROBOTS, full_qr, identify, machine, motion, peak_memory, rob
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.compiled import is_installed
 
-README = Path(__file__).parents[1] / "README.md"
-README_SIZES = (10_000, 100_000, 1_000_000)
-MARKS = ("<!-- speed table -->\n", "<!-- end of speed table -->\n")
+PANDA_SIZES = (10_000, 100_000, 1_000_000)
 LARGEST = 2**30  # [bytes] of W that full QR is asked to hold
 
 
@@ -34,7 +30,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="1e3 samples only, no humanoid")
     parser.add_argument("--million", action="store_true", help="1e6 samples too (half an hour)")
-    parser.add_argument("--readme", action="store_true", help="panda at 1e4, 1e5 and 1e6 only")
+    parser.add_argument("--panda", action="store_true", help="panda at 1e4, 1e5 and 1e6 only")
     parser.add_argument("--cpu", action="store_true", help="processor time, for a busy machine")
     parser.add_argument("--figaroh", metavar="PYTHON", help="interpreter with FIGAROH")
     options = parser.parse_args()
@@ -42,8 +38,8 @@ def main():
     sizes = [1_000] if options.quick else [1_000, 10_000, 100_000]
     sizes += [1_000_000] if options.million else []
     threads = len(os.sched_getaffinity(0))
-    if options.readme:
-        write_readme(readme_table(threads, clock, options.figaroh))
+    if options.panda:
+        print(panda_table(threads, clock, options.figaroh), end="")
         print(f"\n{'processor' if options.cpu else 'wall-clock'} time; {machine()}")
         return
     print(
@@ -86,14 +82,14 @@ def measure(name, samples, threads, clock):
     return dict(zip(ways, seconds, strict=True)), memory
 
 
-def readme_table(threads, clock, python):
-    """Return the README's table, panda at 1e4, 1e5 and 1e6 samples."""
+def panda_table(threads, clock, python):
+    """Return the table of the panda at 1e4, 1e5 and 1e6 samples."""
     ways = {"full": "numpy's full QR", "plain": "plain", "compiled": "with `fast`"}
     ways |= {"threads": f"`fast`, {threads} threads"} if clock is time.perf_counter else {}
     figaroh = ["FIGAROH"] if python else []
     head = ["panda, friction, armature, offset", *figaroh, *ways.values(), "memory over the input"]
     lines = [head, ["---"] * len(head)]
-    for samples in README_SIZES:
+    for samples in PANDA_SIZES:
         times, memory = measure("panda", samples, threads, clock)
         cells = [f"{samples:,} samples"]
         if python:
@@ -106,14 +102,6 @@ def readme_table(threads, clock, python):
             cells.append(text or "not run")
         lines.append([*cells, f"{memory:.0f} MiB"])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def write_readme(table):
-    """Print the table and put it between its marks."""
-    print(table, end="")
-    before, rest = README.read_text().split(MARKS[0])
-    after = rest.split(MARKS[1])[1]
-    README.write_text(before + MARKS[0] + table + MARKS[1] + after)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ Each way runs in a fresh process: a first run of 200 samples spread over the log
 imports are not counted. FIGAROH: its regressor, removal of silent columns, and double QR with the
 estimate of the base parameters. robotid: base parameters, factors, weighted least squares with
 the covariance.
-The first ratio is of processor times. "memory" is the growth of the process's largest resident set
-over that before the second run. "difference" is the root mean square of what the two predictions
-of the torque differ by, as a share of the torque.
+The first ratio is of processor times. "memory" is how far the resident set grew in the second run
+over what was held before it: Linux's peak is reset in between, so that no earlier stage hides it;
+other systems cannot reset theirs and show "-". "difference" is the root mean square of what the
+two predictions of the torque differ by, as a share of the torque.
 """
 
 import argparse
@@ -70,10 +71,15 @@ def rows(python, samples):
     for way, own in results.items():
         lines.append(
             f"| {samples:.0e} | {way} {own['version']} | {own['wall']:.3f} | {own['cpu']:.3f} "
-            f"| {theirs['cpu'] / own['cpu']:.0f} | {own['memory']:.0f} "
-            f"| {theirs['memory'] / max(own['memory'], 1.0):.0f} | {own['difference']:.0e} |"
+            f"| {theirs['cpu'] / own['cpu']:.0f} | {memory_cells(own['memory'], theirs['memory'])} "
+            f"| {own['difference']:.0e} |"
         )
     return lines
+
+
+def memory_cells(own, theirs):
+    """Return memory [MiB] and ratio, where they could be measured."""
+    return "- | -" if own is None or theirs is None else f"{own:.0f} | {theirs / max(own, 1.0):.0f}"
 
 
 def compare(python, samples):
@@ -114,10 +120,11 @@ def child(way, path):
     run, predict, version = figaroh(path) if way == "figaroh" else robotid(way == "compiled")
     every = max(1, len(arrays["t"]) // 200)
     run({key: values[::every] for key, values in arrays.items()})
-    before, wall, cpu = resident(), time.perf_counter(), time.process_time()
+    can_reset, before = reset_peak(), resident("VmRSS")
+    wall, cpu = time.perf_counter(), time.process_time()
     found = run(arrays)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    memory = resident() - before
+    memory = resident("VmHWM") - before if can_reset else None
     np.save(f"{path}.{way}.npy", predict(found, {key: x[:500] for key, x in arrays.items()}))
     return {"wall": wall, "cpu": cpu, "memory": memory, "version": version}
 
@@ -191,12 +198,22 @@ def robotid(compiled):
     return run, predict, __version__
 
 
-def resident():
-    """Return the largest resident set of this process so far [MiB]."""
-    import resource
+def reset_peak():
+    """Set the peak of this process's resident set to what it holds now; return whether it can."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
 
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+def resident(which):
+    """Return the resident set of this process, VmRSS, or its peak, VmHWM [MiB]; Linux only."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return float("nan")
+    return next(int(line.split()[1]) for line in lines if line.startswith(which)) / 2**10
 
 
 if __name__ == "__main__":

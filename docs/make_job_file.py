@@ -4,9 +4,10 @@ import math
 from dataclasses import MISSING, fields
 from pathlib import Path
 
-from robotid.commands.job import DriveSettings, Job, LogEntry
+from robotid.commands.job import Job, LogEntry
 from robotid.identification.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.robot.drives import TERMS, friction_models
 
 PAGE = Path(__file__).with_name("job_file.md")
 START = """# Job file
@@ -58,7 +59,6 @@ log = "second.csv"
 """
 TABLES = {
     "signals": SignalSettings,
-    "model": DriveSettings,
     "log": LogSource,
     "units": LogUnits,
     "estimator.constraints": ConstraintSettings,
@@ -71,7 +71,8 @@ def page():
     own = {
         key.at or field.name: (field, key)
         for field, key in keys(Job)
-        if (key.at or field.name) not in {*TABLES, "estimator", "identification", "validation"}
+        if (key.at or field.name)
+        not in {*TABLES, "model", "estimator", "identification", "validation"}
     }
     tables = {}
     for at, (field, key) in own.items():
@@ -82,6 +83,8 @@ def page():
         title = "[[identification]]` and `[[validation]]" if name[0] == "[" else f"[{name}]"
         parts += [f"\n## `{title}`\n", f"{kind.__doc__.splitlines()[0]}\n"]
         parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
+        if name == "signals":
+            parts += ["\n## `[model]`\n", "Which drive terms are identified.\n", *drive_terms()]
         if name == "units":
             for other, rows in tables.items():
                 parts += [f"\n## `[{other}]`\n", *listing(rows)]
@@ -110,6 +113,18 @@ def estimators():
                 said.setdefault(entry, []).append(f"`{name}`")
     for (name, default, words), owners in said.items():
         yield f"| `{name}` | {default} | {', '.join(owners)} | {words} |"
+
+
+def drive_terms():
+    """Return the lines on the terms of the drives."""
+    models = ", ".join(friction_models())
+    rows = [f'| `friction` | `"viscous+coulomb"` | Terms of the friction: {models} |']
+    for name, term in TERMS.items():
+        if not term.is_friction:
+            units = ", or ".join(term.units)
+            default = str(term.is_default).lower()
+            rows.append(f"| `{name}` | `{default}` | Whether it is identified [{units}] |")
+    return listing(rows)
 
 
 def listing(rows):

@@ -3,11 +3,79 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["file_sha256", "write_json"]
+from robotid.exceptions import DataError
+
+__all__ = ["file_sha256", "folder_beside", "write_json", "write_text", "written_whole"]
+
+
+@contextmanager
+def written_whole(target: str | Path) -> Iterator[Path]:
+    """Give a hidden name beside a file; what is written there is then put in its place.
+
+    After an error the target is as it was, and nothing is left beside it.
+
+    Args:
+        target: The file.
+
+    Yields:
+        Where to write.
+    """
+    path = Path(target)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield beside
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_beside(target: Path) -> Iterator[Path]:
+    """Give a hidden folder in a folder; the files made there are then put in place, by name.
+
+    After an error none of them is, and the hidden folder is gone.
+
+    Args:
+        target: The folder; it must exist.
+
+    Yields:
+        Where to write.
+    """
+    beside = Path(tempfile.mkdtemp(prefix=".robotid-", dir=target))
+    try:
+        yield beside
+        for made in sorted(beside.iterdir()):
+            os.replace(made, target / made.name)
+    finally:
+        shutil.rmtree(beside)
+
+
+def write_text(text: str, target: str | Path) -> Path:
+    """Write a page, whole or not at all.
+
+    Args:
+        text: Its content.
+        target: The file.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        DataError: If its folder does not exist.
+    """
+    path = Path(target)
+    if not path.parent.is_dir():
+        raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
+    with written_whole(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+    return path
 
 
 def write_json(content: Mapping[str, Any], target: str | Path) -> None:
@@ -17,11 +85,9 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
         content: What to write; non-finite numbers are refused.
         target: The file.
     """
-    path = Path(target)
     text = json.dumps(content, indent=1, allow_nan=False)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_text(text + "\n", encoding="utf-8")
-    os.replace(beside, path)
+    with written_whole(target) as beside:
+        beside.write_text(text + "\n", encoding="utf-8")
 
 
 def file_sha256(path: str | Path) -> str:

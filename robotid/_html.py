@@ -1,11 +1,11 @@
-"""The report's HTML: page, style, tables. Everything inline, nothing fetched."""
+"""HTML of the pages: scaffold, style, sections, tables. Everything inline, nothing fetched."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["Cell", "code", "figure", "number", "page", "percent", "table", "text"]
+__all__ = ["Cell", "code", "figure", "number", "page", "percent", "scaffold", "table", "text"]
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,39 @@ def figure(caption: str, svg: str, *, single: bool = False) -> str:
     return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
 
 
-def page(title: str, body: str) -> str:
-    """Return the whole page.
+def page(title: str, header: str, sections: Mapping[str, tuple[str, str]]) -> str:
+    """Return a page to read: its header, links to its sections, the sections.
 
     Args:
         title: Title of the window, not escaped yet.
-        body: HTML of the content.
+        header: HTML of the header.
+        sections: Title and HTML of each section by its id.
+
+    Returns:
+        HTML.
+    """
+    links = "".join(f'<a href="#{key}">{head}</a> ' for key, (head, _) in sections.items())
+    body = "".join(
+        f'<section aria-labelledby="{key}">\n<h2 id="{key}">{head}</h2>\n{html}</section>\n'
+        for key, (head, html) in sections.items()
+    )
+    return scaffold(
+        title,
+        f"<style>/*tones*/{_STYLE}</style>\n",
+        '<a class="skip" href="#content">Skip to the content</a>\n'
+        f'<main id="content" tabindex="-1">\n<header>\n{header}</header>\n'
+        f'<nav aria-label="Sections">{links}</nav>\n{body}</main>\n',
+    )
+
+
+def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
+    """Return a whole document, which fetches nothing that its policy does not allow.
+
+    Args:
+        title: Title of the window, not escaped yet.
+        head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
+        body: HTML of the body.
+        policy: What the page may do beside having styles, as a content security policy.
 
     Returns:
         HTML.
@@ -141,12 +168,11 @@ def page(title: str, body: str) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta http-equiv="Content-Security-Policy" '
-        "content=\"default-src 'none'; style-src 'unsafe-inline'\">\n"
+        f"content=\"default-src 'none'; style-src 'unsafe-inline'{policy}\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
-        '<body>\n<a class="skip" href="#content">Skip to the content</a>\n'
-        f'<main id="content" tabindex="-1">\n{body}</main>\n</body>\n</html>\n'
+        f"<title>{escape(title)}</title>\n{head.replace('/*tones*/', _TONES)}</head>\n"
+        f"<body>\n{body}</body>\n</html>\n"
     )
 
 
@@ -156,13 +182,15 @@ def _row(cells: Sequence[Cell]) -> str:
     return f"<tr>{head}{''.join(f'<td class={c.kind!r}>{c.html}</td>' for c in others)}</tr>\n"
 
 
-_STYLE = """
+_TONES = """
 :root { --page: #fff; --text: #1c2126; --quiet: #5b6570; --line: #d5dae0; --soft: #f3f5f7;
   --predicted: #0b63c5; --residual: #b4500f; --good: #1a7f37; --usable: #9a6700; --poor: #c21f2c; }
 @media (prefers-color-scheme: dark) { :root { --page: #14181c; --text: #e3e7eb; --quiet: #9aa5b0;
   --line: #353d46; --soft: #1d2328; --predicted: #3f9bff; --residual: #f2a065; --good: #56c271;
   --usable: #e0b040; --poor: #ff7b7f; } }
 * { box-sizing: border-box; }
+"""
+_STYLE = """\
 body { margin: 0; background: var(--page); color: var(--text);
   font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 main { max-width: 72rem; margin: 0 auto; padding: 1.5rem 1rem 4rem; }

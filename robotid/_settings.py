@@ -7,6 +7,7 @@ the settings in result.json all come from these fields.
 import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
+from inspect import isfunction
 from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 
 from robotid.exceptions import SettingsError
@@ -40,8 +41,8 @@ class Key:
         among: The words that it may be.
         within: The range of its numbers.
         at: Where a job file has it, tables and key with dots between; the field's name if empty.
-        reads: What a job file holds there: a type, types, a table of keys, or [a table]; what the
-            annotation says if None.
+        reads: What a job file holds there: types, a table of keys, [a table], or a function that
+            returns it; what the annotation says if None.
         load: Makes the value from what a job file holds.
         dump: Makes what result.json holds from the value.
     """
@@ -65,7 +66,7 @@ def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
     """Declare a setting, as a field of a ``Settings``.
 
     Args:
-        default: Its value if none is stated; ``dataclasses.MISSING`` if one must be.
+        default: Its value if none is stated, or a function that returns it.
         text: What it is, with its unit.
         about: The other attributes of ``Key``.
 
@@ -73,8 +74,9 @@ def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
         The field.
     """
     metadata = {"key": Key(text, **about)}
-    if isinstance(default, dict):
-        return field(default_factory=default.copy, metadata=metadata)
+    if isinstance(default, dict) or callable(default):
+        factory = default.copy if isinstance(default, dict) else default
+        return field(default_factory=factory, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
@@ -242,6 +244,8 @@ def _read_type(kind: Any) -> Any:  # noqa: ANN401
     """Return what a job file holds where a field is annotated so."""
     if isinstance(kind, dict | list | tuple):
         return kind
+    if isfunction(kind):
+        return kind()
     if _is_table(kind):
         return kind.schema()
     origin, inner = get_origin(kind), get_args(kind)

@@ -332,8 +332,7 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from robotid.report.comparison import compare_results
-    from robotid.report.comparison_page import write_comparison
+    from robotid.report.comparison import compare_results, write_comparison
 
     if options.out:
         content = write_comparison(options.results, options.out)

@@ -3,18 +3,25 @@
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-__all__ = ["__version__", "versions"]
+__all__ = ["__version__", "code_versions", "versions"]
 
 __version__ = "0.1.0"
 
-_PACKAGES = {"pinocchio": "pin", "numpy": "numpy", "scipy": "scipy", "clarabel": "clarabel"}
+_PACKAGES = {
+    "pinocchio": "pin",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "numba": "numba",
+    "clarabel": "clarabel",
+}
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of this package, of what it computes with, of Python and the platform.
+def code_versions() -> dict[str, str]:
+    """Return the versions that decide what work gives, to the last bit.
 
     Returns:
-        Versions by name; "not installed by pip" where no package of that name is recorded.
+        Versions of this package, of what it computes with and of Python, by name; "not installed
+        by pip" where no package of that name is recorded.
     """
     found = {"robotid": __version__}
     for name, package in _PACKAGES.items():
@@ -22,4 +29,9 @@ def versions() -> dict[str, str]:
             found[name] = version(package)
         except PackageNotFoundError:
             found[name] = "not installed by pip"
-    return found | {"python": platform.python_version(), "platform": platform.platform()}
+    return found | {"python": platform.python_version()}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what runs: ``code_versions`` and the platform."""
+    return code_versions() | {"platform": platform.platform()}

@@ -16,8 +16,8 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions findings versions _files _html _typing",
-    "_settings",
+    "exceptions",
+    "findings versions _files _html _settings _typing",
     "robot logs",
     "regressor",
     "estimators simulation workers",
@@ -39,6 +39,7 @@ INSIDE_FUNCTIONS = {
     "rosbags": {"logs"},
     "h5py": {"logs"},
     "distributed": {"workers"},
+    "loky": {"workers"},
     "rich": {"commands"},
     "matplotlib": {"report", "paper"},
     "clarabel": {"estimators"},
@@ -112,7 +113,7 @@ def test_estimators_load_no_physics_engine():
 @pytest.mark.parametrize("statement", ["import robotid", "from robotid import *"])
 def test_importing_the_package_is_light(statement):
     heavy = ["matplotlib", "meshcat", "cvxpy", "yourdfpy", "pyarrow", "clarabel", "rosbags", "h5py"]
-    heavy += ["rich", "distributed"]
+    heavy += ["rich", "distributed", "loky"]
     heavy += ["scs", "trimesh"]
     heavy += ["trimesh"]
     found = f"[m for m in {heavy} if m in sys.modules]"

@@ -1,20 +1,27 @@
 """The examples under docs/ run, and what they say of their output is so."""
 
+import os
 import re
 import runpy
+import subprocess
+import sys
 import tomllib
 
 import pytest
 from helpers.corruptions import CASES
-from helpers.paths import ROOT
+from helpers.paths import DOCS, ROOT
 from helpers.synthetic import exact_log, truth
 
+import robotid
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 
-DOCS, README = ROOT / "docs", ROOT / "README.md"
+sys.path.append(str(ROOT / "benchmarks"))
+from write_tables import BLOCK, PAGES, digest
+
+MACHINE = r"Python \d+\.\d+.*(x86_64|aarch64|arm64)"
 
 
 def run(name):
@@ -31,7 +38,7 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
     page = (DOCS / "job_file.md").read_text()
     written = runpy.run_path(str(DOCS / "make_job_file.py"))["page"]()
     assert page == written, "run python docs/make_job_file.py"
-    for key in Job.paths():
+    for key in Job.paths().keys() - {"model"}:
         assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(("ident", "valid"))
     text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
     job = job_from_settings(tomllib.loads(text), "job_file.md", tmp_path)
@@ -94,4 +101,70 @@ def test_doctor_lists_every_corruption_and_none_other():
     assert {name: codes for name, codes, _ in rows} == {
         name: ", ".join(case.codes) for name, case in CASES.items()
     }
-    assert f"{sum(int(found) for *_, found in rows)} of {8 * len(CASES)}" in README.read_text()
+    assert f"{sum(int(found) for *_, found in rows)} of {8 * len(CASES)}" in page
+
+
+def pages():
+    return sorted(DOCS.glob("*.md"))
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+def test_tables_of_benchmarks_are_as_these_wrote_them(page):
+    text = page.read_text()
+    blocks = list(BLOCK.finditer(text))
+    assert text.count("<!-- table of ") == len(blocks), "a mark is broken"
+    for found in blocks:
+        name, shown = found["name"], found["body"]
+        again = f"write it anew: python benchmarks/write_tables.py {name}"
+        assert PAGES[name] == page.name
+        assert digest(shown) == found["digest"], f"bench_{name} wrote other figures; {again}"
+        assert re.search(r"robotid \d.*\n", shown), f"no version under bench_{name}; {again}"
+        assert re.search(MACHINE, shown), f"no machine under bench_{name}; {again}"
+
+
+def test_every_page_of_measurements_has_its_table():
+    written = {found["name"] for page in pages() for found in BLOCK.finditer(page.read_text())}
+    assert {"validation", "end_to_end", "regressor", "startup"} <= written
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\((?!http)([^)#]+)", page.read_text())
+    assert not [link for link in links if not (DOCS / link).is_file()]
+
+
+def test_no_page_is_left_out_of_the_site():
+    config = (ROOT / ".mkdocs.yml").read_text()
+    assert {page.name for page in pages()} == set(re.findall(r"- (?:\w+: )?(\w+\.md)", config))
+
+
+def test_the_architecture_names_every_room():
+    rooms = {p.parent.name for p in (ROOT / "robotid").glob("*/__init__.py")} | {"cli"}
+    text = (DOCS / "architecture.md").read_text()
+    assert rooms == set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
+    figure = (DOCS / "pictures" / "rooms.svg").read_text()
+    assert not [room for room in rooms if f">{room}<" not in figure]
+
+
+def test_the_job_file_of_the_docs_is_accepted(tmp_path):
+    text = re.search(r"```toml\n(.*?)```", (DOCS / "job_file.md").read_text(), re.DOTALL).group(1)
+    commented = re.sub(
+        r"^# (joints|rate|topic|\[\[coupling|name = \"motor|ratios)", r"\1", text, flags=re.M
+    )
+    for version in (text, commented):
+        job = job_from_settings(tomllib.loads(version), "job_file.md", tmp_path)
+        assert job.signals.min_velocity == 0.02
+        assert job.estimator.name == "consistent"
+
+
+def test_the_site_builds_and_documents_the_public_names(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "-q", "--strict", "-f", ".mkdocs.yml"]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    run = subprocess.run(
+        [*command, "-d", str(tmp_path)], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    shown = set(re.findall(r'id="robotid\.(\w+)"', (tmp_path / "api.html").read_text()))
+    assert set(robotid.__all__) - {"__version__"} <= shown
+    home = (tmp_path / "index.html").read_text()
+    assert "fonts." not in home, "the site is read without a network"

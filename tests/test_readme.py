@@ -1,10 +1,11 @@
-"""The README is true: its quick starts run, its commands are those of CI."""
+"""The README is true: its quick starts run, its commands are those of CI, its links exist."""
 
 import re
 import tomllib
-from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
@@ -12,7 +13,6 @@ from robotid.commands.job import job_from_settings
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 
-ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
 
 
@@ -23,15 +23,36 @@ def block(marker):
     return found.group(1)
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch, ur5, rng):
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory, ur5):
     """A folder with robot.urdf, first.csv and second.csv, as the quick starts expect."""
-    (tmp_path / "robot.urdf").write_bytes(example_urdf("ur5_robot.urdf").read_bytes())
+    folder = tmp_path_factory.mktemp("readme")
+    rng = np.random.default_rng(0)
+    (folder / "robot.urdf").write_bytes(example_urdf("ur5_robot.urdf").read_bytes())
     for name in ("first", "second"):
         log = exact_log(ur5, truth(ur5), rng, samples=1500, rate=100.0, noise=0.1)
-        write_log(log, tmp_path / f"{name}.csv")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+        write_log(log, folder / f"{name}.csv")
+    return folder
+
+
+@pytest.fixture
+def folder(logs, monkeypatch):
+    monkeypatch.chdir(logs)
+    return logs
+
+
+def test_it_is_read_in_three_minutes():
+    assert len(README.splitlines()) <= 150
+
+
+def test_its_links_and_pictures_exist():
+    links = re.findall(r"\]\((?!http)([^)#]+)", README)
+    assert len(links) > 15
+    missing = [link for link in links if not (ROOT / link).is_file()]
+    assert not missing
+    pictures = [ROOT / link for link in links if link.endswith(".png")]
+    assert len(pictures) == 2
+    assert all(10_000 < picture.stat().st_size < 200_000 for picture in pictures)
 
 
 def test_the_python_quick_start_runs_and_has_ten_lines(folder, capsys):
@@ -51,24 +72,31 @@ def test_the_command_line_quick_start_runs(folder, capsys):
         assert program == "robotid"
         assert main(words) == 0, line
     assert "verdict: good" in capsys.readouterr().out
-    assert (folder / "result" / "robot.identified.urdf").is_file()
+    written = {path.name for path in (folder / "result").iterdir()}
+    table = README.partition("## What you get")[2].partition("## ")[0]
+    promised = set(re.findall(r"^\| `(\S+)`", table, re.MULTILINE))
+    assert promised <= written, "the table of what you get names what identify writes"
+    assert (folder / "replay.html").is_file()
+    assert main(["validate", "result/result.json", "second.csv"]) == 0
 
 
-def test_the_job_file_of_the_readme_is_accepted(folder):
-    text = re.search(r"```toml\n(.*?)```", README, re.DOTALL).group(1)
-    commented = re.sub(
-        r"^# (joints|rate|topic|\[\[coupling|name = \"motor|ratios)", r"\1", text, flags=re.M
-    )
-    for version in (text, commented):
-        job = job_from_settings(tomllib.loads(version), "README.md", folder)
-        assert job.signals.min_velocity == 0.02
-        assert job.estimator.name == "consistent"
+@pytest.mark.parametrize("recipe", ["gripper", "currents", "coupled"])
+def test_the_recipes_are_job_files(folder, recipe):
+    job = job_from_settings(tomllib.loads(block(f"job: {recipe}")), "README.md", folder)
+    assert job.identification
+    assert bool(job.locked) == (recipe == "gripper")
+    assert bool(job.gains) == (recipe == "currents")
+    assert bool(job.couplings) == (recipe == "coupled")
 
 
 def test_each_command_is_one_line_with_venv_and_pip():
     for marker in ("demo command", "test command"):
         (line,) = block(marker).strip().splitlines()
         assert line.startswith("python3 -m venv .venv && .venv/bin/pip install")
+
+
+def test_the_demo_needs_no_extra():
+    assert "install -q . &&" in block("demo command")
 
 
 def test_ci_runs_the_test_command_of_the_readme():

@@ -5,7 +5,7 @@ from typing import Any
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job
-from robotid.workers.task import versions
+from robotid.versions import code_versions
 
 __all__ = ["checkpoint_inputs"]
 
@@ -29,7 +29,7 @@ def checkpoint_inputs(job: Job) -> dict[str, Any]:
     settings = {key: value for key, value in job.to_dict().items() if key not in _NO_MATTER}
     settings["reduction"] = {"rows_in_memory": job.rows_in_memory}
     return {
-        "versions": versions(),
+        "versions": code_versions(),
         "settings": settings,
         "urdf_sha256": file_sha256(job.urdf),
         "logs": [_identity(entry.path) for entry in job.identification],

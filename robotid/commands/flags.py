@@ -49,7 +49,10 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--gain": ("torque.gains", {"metavar": "JOINT=N_M_PER_A", "action": "append"}),
     "--rate": ("signals.rate", {"metavar": "HZ", "type": float}),
     "--cutoff": ("signals.cutoff", {"metavar": "HZ"}),
-    "--friction": ("model.friction", {"metavar": "MODEL"}),
+    "--friction": (
+        "model.friction",
+        {"metavar": "MODEL", "help": "none, viscous or viscous+coulomb"},
+    ),
     "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
     "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
     "--time-unit": ("units.time", {"metavar": "UNIT"}),
@@ -108,7 +111,8 @@ def _add(flags: "argparse._ActionsContainer", wanted: Sequence[str]) -> None:
     keys = Job.paths()
     for flag in wanted:
         at, about = _FLAGS[flag]
-        flags.add_argument(flag, **about, help=keys[at].words)
+        help_ = keys[at].words if at in keys else about["help"]
+        flags.add_argument(flag, **(about | {"help": help_}))
 
 
 def add_work_flags(parser: argparse.ArgumentParser) -> None:

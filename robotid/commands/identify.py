@@ -1,16 +1,13 @@
 """A job from its files to the folder of results."""
 
 import logging
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robotid._files import write_json
+from robotid._files import folder_beside, write_json
 from robotid.commands.checkpoint_inputs import checkpoint_inputs
 from robotid.commands.job import Job
 from robotid.commands.logs import examine_locked, is_long, survey_logs
@@ -85,8 +82,7 @@ def run_job(
     findings += _fit_findings(identification)
     identification = replace(identification, doubts=_doubts(job, identification, findings))
     target.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=".robotid-", dir=target))
-    try:
+    with folder_beside(target) as partial:
         outputs = {"report": "report.html"}
         name = f"{Path(model.tree.path).stem}.identified.urdf"
         if identification.is_consistent:
@@ -97,13 +93,9 @@ def run_job(
         write_report(identification, partial / "report.html", findings=findings)
         result = build_result(identification, job.to_dict(), findings, outputs)
         write_json(result, partial / "result.json")
-        for made in sorted(partial.iterdir()):
-            os.replace(made, target / made.name)
-        if "urdf" not in outputs:
-            _remove_urdf(target / name)
-        identification = replace(identification, report=str(target / outputs["report"]))
-    finally:
-        shutil.rmtree(partial)
+    if "urdf" not in outputs:
+        _remove_urdf(target / name)
+    identification = replace(identification, report=str(target / outputs["report"]))
     if checkpoint is not None:
         checkpoint.remove()
     return identification, result

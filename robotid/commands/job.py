@@ -19,17 +19,47 @@ if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
     from robotid.robot.parameters import Coupling
 
-__all__ = ["DriveSettings", "Job", "LogEntry", "job_from_settings", "read_job"]
-
-_FRICTION = {
-    "none": (),
-    "viscous": ("viscous",),
-    "viscous+coulomb": ("viscous", "coulomb"),
-}
+__all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
 
 
 def _absolute(path: Path) -> str:
     return str(path.resolve())
+
+
+def _default_terms() -> tuple[str, ...]:
+    from robotid.robot.drives import DRIVE_TERMS
+
+    return DRIVE_TERMS
+
+
+def _model_keys() -> dict[str, Any]:
+    from robotid.robot.drives import TERMS
+
+    return {
+        "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
+        for name, term in TERMS.items()
+    }
+
+
+def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
+    from robotid.robot.drives import TERMS, friction_models
+
+    friction, models = table.get("friction", "viscous+coulomb"), friction_models()
+    if friction not in models:
+        raise SettingsError(f"friction is {friction!r}, wanted one of {list(models)}")
+    return tuple(
+        name
+        for name, term in TERMS.items()
+        if (name in models[friction] if term.is_friction else table.get(name, term.is_default))
+    )
+
+
+def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
+    from robotid.robot.drives import TERMS, friction_models
+
+    chosen = tuple(term for term in terms if TERMS[term].is_friction)
+    friction = next(name for name, model in friction_models().items() if model == chosen)
+    return {key: friction if key == "friction" else key in terms for key in _model_keys()}
 
 
 def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> "tuple[Coupling, ...]":
@@ -61,21 +91,6 @@ class LogEntry(Settings):
 
 
 @dataclass(frozen=True)
-class DriveSettings(Settings):
-    """Which drive terms are identified."""
-
-    armature: bool = setting(True, "motor inertia, as each joint feels it")
-    friction: str = setting("viscous+coulomb", "model of the friction", among=tuple(_FRICTION))
-    offset: bool = setting(True, "constant torque")
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """The drive terms, in the order of ``DRIVE_TERMS``."""
-        first = ("armature",) if self.armature else ()
-        return (*first, *_FRICTION[self.friction], *(("offset",) if self.offset else ()))
-
-
-@dataclass(frozen=True)
 class Job(Settings):
     """Everything that is needed to run an identification."""
 
@@ -94,7 +109,14 @@ class Job(Settings):
         "independent", "independent, or coupled: a mimic joint moves with its leader"
     )
     signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
-    drives: DriveSettings = setting(DriveSettings(), "drive terms to identify", at="model")
+    terms: tuple[str, ...] = setting(
+        _default_terms,
+        "drive terms to identify",
+        at="model",
+        reads=_model_keys,
+        load=_load_terms,
+        dump=_dump_terms,
+    )
     gains: Mapping[str, float] = setting(
         {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
     )
@@ -164,7 +186,7 @@ class Job(Settings):
             free_flyer=self.free_flyer,
             mimic=self.mimic,
             gravity=self.gravity,
-            terms=self.drives.terms,
+            terms=self.terms,
             couplings=self.couplings,
         )
 

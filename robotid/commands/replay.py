@@ -20,7 +20,7 @@ from robotid.logs.settings import LogSource
 from robotid.logs.table import prefixes
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
-from robotid.viewer.unexplained import find_surprises
+from robotid.viewer.unexplained import find_unexplained
 
 __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
 
@@ -152,7 +152,7 @@ def replay_identified(identification: Identification) -> Replay:
     Returns:
         The page: measured and predicted torque, masses before and after.
     """
-    shown = (*identification.identification, *identification.validation)[-1]
+    shown = (*identification.fitted, *identification.validation)[-1]
     motion = shown.recording.trajectory
     predicted = _sure(shown.torques["estimate"], shown.recording.mask)
     return replay(
@@ -248,7 +248,7 @@ def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
     predicted = next(iter(torques.predicted.values()))
     units = dict(zip(model.joints, model.row_units, strict=True))
     marks = []
-    for found in find_surprises(torques.t, torques.measured, predicted, model.joints):
+    for found in find_unexplained(torques.t, torques.measured, predicted, model.joints):
         size = f"{found.residual:.2g} {units[found.joint]} on average"
         label = f"unexplained torque, most at {found.joint} ({size}, for "
         label += f"{found.end - found.start:.1f} s): contact or load?"

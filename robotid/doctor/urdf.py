@@ -17,11 +17,10 @@ from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import Joint, Tree, read_with_yourdfpy
+from robotid.robot.tree import MOVABLE, Joint, Tree, numbers, parse_urdf, read_with_yourdfpy
 
 __all__ = ["Inspection", "Structure", "inspect_urdf"]
 
-_MOVABLE = ("revolute", "continuous", "prismatic")
 _ROUNDED = 1e-3  # [rad] nearer to a multiple of pi/2 than this is meant to be one
 _EXACT = 1e-7  # [rad] nearer than this is one
 _NOISE = 1e-10  # pivots below this share of the largest are rounding
@@ -105,22 +104,25 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     Returns:
         The inspection. A file that no model can be built from gives a finding, not an error.
     """
-    robot = _parse(Path(path))
-    findings = [*_numbers(robot), *negative_masses(robot)] if robot is not None else []
-    model = None
+    where = f"file {Path(path).name}"
+    try:
+        robot = parse_urdf(path)
+    except ModelError as error:
+        return Inspection("", (), None, (), (Finding("unusable", "error", where, str(error)),))
+    findings, name, model = [*_numbers(robot), *negative_masses(robot)], robot.get("name", ""), None
     try:
         model = RobotModel.from_urdf(path, free_flyer=free_flyer)
     except ModelError as error:
-        findings.append(Finding("unusable", "error", f"file {Path(path).name}", str(error)))
-    if robot is not None and robot.get("name"):
+        findings.append(Finding("unusable", "error", where, str(error)))
+    if name:
         findings += _joint_findings(Path(path))
-    if model is None or robot is None:
-        name = robot.get("name", "") if robot is not None else ""
-        return Inspection(name, _movable(robot), None, (), tuple(findings))
+    if model is None:
+        movable = [j.get("name", "") for j in robot.findall("joint") if j.get("type") in MOVABLE]
+        return Inspection(name, tuple(movable), None, (), tuple(findings))
     full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
     findings += _link_findings(model)
     findings += audit_links(model)
-    findings += _rounded_angles(model, robot, full)
+    findings += _rounded_angles(model, full)
     structure = Structure(
         standard=model.layout.n_inertial,
         base_inertial=len(inertial.K),
@@ -130,20 +132,6 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         undetermined=inertial.unidentifiable,
     )
     return Inspection(model.name, model.joints, structure, inertial.expressions, tuple(findings))
-
-
-def _parse(path: Path) -> ET.Element | None:
-    """Return the ``<robot>``; None if there is none, which building the model reports."""
-    try:
-        robot = ET.parse(path).getroot()
-    except (OSError, ET.ParseError, LookupError, ValueError):  # the last two: its encoding
-        return None
-    return robot if robot.tag == "robot" else None
-
-
-def _movable(robot: ET.Element | None) -> tuple[str, ...]:
-    joints = robot.findall("joint") if robot is not None else []
-    return tuple(j.get("name", "") for j in joints if j.get("type") in _MOVABLE)
 
 
 def _condition(model: RobotModel, mapping: BaseMapping) -> float:
@@ -160,7 +148,7 @@ def _numbers(robot: ET.Element) -> Iterator[Finding]:
             element = owner.find(inside)
             for key in keys if element is not None else ():
                 text = element.get(key) if element is not None else None
-                if text is None or _is_finite(text):
+                if text is None or numbers(text):
                     continue
                 name = owner.get("name", "")
                 message = (
@@ -168,14 +156,6 @@ def _numbers(robot: ET.Element) -> Iterator[Finding]:
                     "numbers with a decimal point and blanks between them; write the true value"
                 )
                 yield Finding("not_a_number", "error", f"{kind} {name}", message)
-
-
-def _is_finite(text: str) -> bool:
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        return False
-    return bool(values) and all(map(math.isfinite, values))
 
 
 def _joint_findings(path: Path) -> Iterator[Finding]:
@@ -186,7 +166,7 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
         message = f"{error}; limits, damping, friction and mimic of its joints were not checked"
         yield Finding("yourdfpy_refuses", "warning", f"file {path.name}", message)
         return
-    names = {joint.name for joint in joints if joint.type in _MOVABLE}
+    names = {joint.name for joint in joints if joint.type in MOVABLE}
     for joint in joints:
         if joint.type in ("revolute", "prismatic"):
             yield from _no_limits(joint)
@@ -211,7 +191,7 @@ def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
 
 
 def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # noqa: ANN401
-    if text is None or not _is_finite(text) or float(text) >= 0:
+    if not text or not numbers(text) or float(text) >= 0:
         return
     harm = "Pinocchio refuses such a file" if key == "friction" else "simulators gain energy by it"
     message = (
@@ -275,13 +255,11 @@ def _missing(link: str, having: list[str]) -> Finding:
     return Finding("missing_inertial", "warning", f"link {link}", message)
 
 
-def _rounded_angles(
-    model: RobotModel, robot: ET.Element, mapping: BaseMapping
-) -> Iterator[Finding]:
+def _rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
     """Yield the joint angles that a URDF rounds, 3.1416 for pi, and what they do to the rank."""
     seeming = int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
     carrying = _carrying(model.tree)
-    for joint in robot.findall("joint"):
+    for joint in model.tree.robot.findall("joint"):
         origin, name = joint.find("origin"), joint.get("name", "")
         angles = origin.get("rpy", "0 0 0").split() if origin is not None else []
         exact = {word: value for word in angles if (value := _exact(float(word))) is not None}

@@ -1,6 +1,5 @@
 """Inertials against the geometry that a URDF has: where no body of that shape can be so."""
 
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -50,7 +49,7 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
                 yield replace(finding, severity="note") if is_small else finding
     yield from _copies(model, points)
     unread = [body for body in model.layout.bodies if body not in points]
-    if unread and next(ET.parse(model.tree.path).getroot().iter("mesh"), None) is not None:
+    if unread and next(model.tree.robot.iter("mesh"), None) is not None:
         message = (
             f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing or in meshes that "
             "are not found: their mass and centre of mass were not compared with it; set "
@@ -99,8 +98,8 @@ def _templates(model: RobotModel) -> Iterator[Finding]:
     """Yield inertials whose numbers nobody measured."""
     for link, inertial in model.tree.inertials.items():
         ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
-        is_round = any(np.isclose(ixx, value, rtol=_ALIKE) for value in _ROUND)
-        if not (ixx == iyy == izz and ixy == ixz == iyz == 0 and is_round):
+        is_isotropic = ixx == iyy == izz and ixy == ixz == iyz == 0
+        if not (is_isotropic and np.isclose(ixx, _ROUND, rtol=_ALIKE).any()):
             continue
         if inertial.mass not in (*_ROUND, 0.5) and np.any(inertial.com):
             continue

@@ -227,8 +227,11 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
 
 def _inputs(identification: Identification) -> list[dict[str, Any]]:
     inputs = [{"role": "urdf", **_source(identification.model.tree.path)}]
-    for role in ("identification", "validation"):
-        for evaluation in getattr(identification, role):
+    for role, evaluations in (
+        ("identification", identification.fitted),
+        ("validation", identification.validation),
+    ):
+        for evaluation in evaluations:
             recording = evaluation.recording
             extent = recording.extent
             inputs.append(

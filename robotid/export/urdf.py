@@ -6,14 +6,12 @@ for, armature and friction of coupled drives above all, goes into ``<name>.drive
 
 import json
 import math
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from robotid._files import folder_beside
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export.sidecar import SCHEMA_VERSION, digest, load_identified, sidecar_facts
@@ -29,6 +27,7 @@ from robotid.export.xml_splice import (
 )
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
+from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import read_tree, read_with_yourdfpy
@@ -83,18 +82,13 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
         **sidecar_facts(model, pi, places),
         "read_back_with": readers,
     }
-    partial = Path(tempfile.mkdtemp(prefix=f".{goal.stem}-", dir=goal.parent))
-    try:
+    with folder_beside(goal.parent) as partial:
         (partial / goal.name).write_bytes(content)
         text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
         (partial / sidecar.name).write_text(text + "\n", encoding="utf-8")
         _check_torque(model, pi, partial / goal.name, partial / sidecar.name)
         if "yourdfpy" in readers:
             _check_masses(partial / goal.name)
-        os.replace(partial / sidecar.name, sidecar)
-        os.replace(partial / goal.name, goal)
-    finally:
-        shutil.rmtree(partial)
     return sidecar
 
 
@@ -179,7 +173,7 @@ def _text(value: float) -> str:
 
 
 def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
-    attributes = {"viscous": "damping", "coulomb": "friction"}
+    attributes = {name: term.dynamics for name, term in TERMS.items() if term.dynamics}
     values = dict(zip(model.layout.names, pi, strict=True))
     edits: list[Edit] = []
     for joint in document.root.find_all("joint"):

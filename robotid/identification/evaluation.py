@@ -12,7 +12,7 @@ from robotid.identification.metrics import Metrics, TorqueSums
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve, unwrap
-from robotid.regressor.columns import friction_speeds
+from robotid.regressor.columns import friction_speeds, sure_rows
 from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
 
@@ -207,17 +207,7 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
     Returns:
         Flags, shape (N, n_rows), bool.
     """
-    mask = np.ones((len(trajectory.t), model.n_rows), dtype=bool)
-    if "coulomb" not in model.layout.terms or min_velocity == 0:
-        return mask
-    first = model.n_rows - len(model.joints)
-    v = trajectory.v[:, first:]
-    mask[:, first:] = np.abs(v) >= min_velocity
-    for coupling in model.layout.couplings:
-        rows = [model.joints.index(joint) for joint, _ in coupling.ratios]
-        w = v[:, rows] @ np.array([ratio for _, ratio in coupling.ratios])
-        mask[:, [first + row for row in rows]] &= (np.abs(w) >= min_velocity)[:, None]
-    return mask
+    return sure_rows(model.layout, trajectory.v, min_velocity)
 
 
 def evaluate(

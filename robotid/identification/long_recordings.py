@@ -27,9 +27,9 @@ from robotid.logs.signals import turns_note
 from robotid.logs.smoothing import too_short
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.problem import Block, Problem
+from robotid.regressor.reduction import Reduction, join_stretches
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Reduction, join_stretches
 from robotid.workers.plan import WorkPlan
 
 __all__ = ["LongRecordings", "evaluate_long"]

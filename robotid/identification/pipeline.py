@@ -39,11 +39,11 @@ from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
+from robotid.regressor.reduction import join
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.workers.pieces import join
 
 __all__ = [
     "EstimatorSettings",
@@ -73,7 +73,7 @@ class Identification:
         standard_covariance: Their covariance given the prior, shape (p, p).
         base: Base parameters, shape (b,).
         base_error: Their standard errors, shape (b,); inf where the data say nothing.
-        identification: The recordings that were fitted, with predictions "estimate" and "wls".
+        fitted: The recordings that were fitted, with predictions "estimate" and "wls".
         validation: The same of the recordings that were kept apart.
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
@@ -94,7 +94,7 @@ class Identification:
     standard_covariance: Array
     base: Array
     base_error: Array
-    identification: tuple[Evaluation, ...]
+    fitted: tuple[Evaluation, ...]
     validation: tuple[Evaluation, ...]
     errors: StandardErrors
     factors: Factors
@@ -183,7 +183,7 @@ class Identification:
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
         """Rows of the fitted recordings that the estimate does not explain, the worst first."""
-        return find_outliers(self.model, self.identification, self.standard)
+        return find_outliers(self.model, self.fitted, self.standard)
 
     def metrics(self, name: str = "estimate") -> Metrics:
         """Return the metrics over all fitted recordings.
@@ -194,7 +194,7 @@ class Identification:
         Returns:
             The metrics.
         """
-        return pool(self.model, self.identification, name)
+        return pool(self.model, self.fitted, name)
 
     @property
     def refitted(self) -> tuple[Evaluation, ...]:
@@ -326,7 +326,7 @@ def conclude(
         standard_covariance=covariance,
         base=mapping.to_base(standard),
         base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
-        identification=fitted,
+        fitted=fitted,
         validation=kept,
         errors=errors,
         factors=factors,

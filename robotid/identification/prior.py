@@ -6,6 +6,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
+from robotid.robot.drives import DriveMotion
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -66,19 +67,13 @@ def _inertial_spread(model: RobotModel) -> Array:
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
     first = model.n_rows - len(model.joints)
     tau, v, a = (_positive(row[first:]) for row in rms)
-    carried = carried_inertia(model)
-    spread = {
-        "armature": np.maximum(carried, tau / a),
-        "viscous": tau / v,
-        "coulomb": tau,
-        "offset": tau,
-    }
-    own = [spread[term][j] for j in range(len(model.joints)) for term in model.layout.terms]
-    coupled = []
-    for coupling in model.layout.couplings:
-        rows = [model.joints.index(joint) for joint, _ in coupling.ratios]
-        coupled += [spread[term][rows].mean() for term in model.layout.coupling_terms]
-    return np.array(own + coupled)
+    usual, carried = DriveMotion(v, a, np.ones_like(v)), carried_inertia(model)
+    spread = []
+    for d, term in model.layout.drive_parameters:
+        alone = tau / np.abs(term.column(usual))
+        rows = [model.joints.index(joint) for joint, _ in model.layout.drives[d].ratios]
+        spread.append((np.maximum(carried, alone) if term.is_inertia else alone)[rows].mean())
+    return np.array(spread)
 
 
 def _positive(rms: Array) -> Array:

@@ -14,9 +14,9 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress_stretches
 from robotid.regressor.problem import Problem, concatenate
+from robotid.regressor.reduction import Reduction
 from robotid.regressor.torque import build_problem
 from robotid.robot.model import RobotModel
-from robotid.workers.pieces import Reduction
 
 __all__ = ["LoadedRecordings", "Recordings", "base_problem", "independent_share"]
 

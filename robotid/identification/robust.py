@@ -13,10 +13,10 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.recordings import LoadedRecordings, Recordings
 from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.columns import drive_columns
 from robotid.regressor.prediction import predict
+from robotid.regressor.reduction import Reduction, join
+from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
-from robotid.workers.pieces import Reduction, join
 
 __all__ = [
     "LOSSES",
@@ -47,15 +47,11 @@ class Reweighted:
         recordings: The recordings with their rows' weights.
         reductions: What the weighted rows come down to.
         loss_of_efficiency: By how much the weighted rows understate standard errors [-].
-        share: Share of the rows with less than half their weight [-].
-        n_iter: Number of passes over the rows.
     """
 
     recordings: Recordings
     reductions: tuple[Reduction, ...]
     loss_of_efficiency: float
-    share: float
-    n_iter: int
 
 
 @dataclass(frozen=True)
@@ -151,7 +147,6 @@ def reweigh(
             f"robust is {loss!r}: its weights are found in several passes over rows in memory; "
             "raise rows_in_memory in [reduction], cut the log with start and end, or leave it out"
         )
-    passes = 0
     weighted, stages = recordings, ["huber"] if loss == "huber" else ["huber", "tukey"]
     for stage in stages:
         before = None
@@ -168,7 +163,6 @@ def reweigh(
             weights = tuple(loss_weight(stage, r) for r in residuals)
             weighted = replace(recordings, weights=weights)
             reductions = weighted.reduce(mapping)
-            passes += 1
         else:
             raise NotConvergedError(
                 f"the weights of the {stage} loss still change after {_MAX_ITERATIONS} passes; "
@@ -179,9 +173,7 @@ def reweigh(
     scaled = np.concatenate([r.ravel() for r in residuals])[used]
     weight = loss_weight(loss, scaled)
     slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
-    return Reweighted(
-        weighted, reductions, float(weight.mean()) / slope, float((weight < 0.5).mean()), passes
-    )
+    return Reweighted(weighted, reductions, float(weight.mean()) / slope)
 
 
 def find_outliers(
@@ -232,12 +224,11 @@ def find_outliers(
 
 def _friction_step(model: RobotModel, standard: Array) -> Array:
     """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
-    step = np.zeros(model.n_rows)
-    drives = drive_columns(model.layout, model.n_rows)
-    for value, drive in zip(standard[model.layout.n_inertial :], drives, strict=True):
-        if drive.term == "coulomb":
-            for row, ratio in drive.ratios.items():
-                step[row] += 2.0 * abs(ratio * value)
+    layout, still, step = model.layout, np.zeros(1), np.zeros(model.n_rows)
+    forth, back = (DriveMotion(still, still, sign * np.ones(1)) for sign in (1.0, -1.0))
+    for term, values in layout.by_drive(standard):
+        change = np.abs((term.column(forth) - term.column(back)) * values)  # (d,)
+        step[model.n_rows - len(model.joints) :] += np.abs(layout.drive_ratios.T) @ change
     return step
 
 

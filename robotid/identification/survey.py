@@ -28,9 +28,10 @@ from robotid.logs.time_stamps import TimeStamps
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
+from robotid.regressor.reduction import Reduction
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.robot.model import RobotModel
-from robotid.workers.pieces import Piece, Reduction
+from robotid.workers.pieces import Piece
 
 __all__ = ["PIECE", "LogPiece", "LongLog", "survey"]
 

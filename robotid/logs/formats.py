@@ -1,10 +1,10 @@
 """Tables in files: named columns of numbers in any format that is known by its suffix."""
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from robotid._files import written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.arrays import open_hdf5, open_mat, open_npz, write_hdf5, write_mat, write_npz
@@ -130,12 +130,8 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
         raise DataError(
             f"{path.name}: logs are written as {_listed(list(written))} files, not {suffix!r}"
         )
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        written[suffix](table, partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with written_whole(path) as beside:
+        written[suffix](table, beside)
 
 
 def _listed(words: list[str]) -> str:

@@ -21,6 +21,7 @@ from robotid.online.change_detection import (
 from robotid.online.settings import Change, OnlineSettings, Reading
 from robotid.online.signals import Instant, LiveSignals
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.columns import sure_rows
 from robotid.regressor.problem import Sample
 from robotid.regressor.torque import InstantRegressor
 from robotid.robot.model import RobotModel
@@ -258,13 +259,7 @@ class OnlineIdentifier:
             self._reopen(now, onset)
 
     def _rows_used(self, v: Array) -> Array:
-        if "coulomb" not in self.model.layout.terms:
-            return np.ones(len(v), dtype=bool)
-        used: Array = np.abs(v) >= self.settings.min_velocity
-        for coupling in self.model.layout.couplings:
-            rows = [self.model.joints.index(joint) for joint, _ in coupling.ratios]
-            w = v[rows] @ np.array([ratio for _, ratio in coupling.ratios])
-            used[rows] &= abs(w) >= self.settings.min_velocity
+        used: Array = sure_rows(self.model.layout, v[None], self.settings.min_velocity)[0]
         return used
 
     def _reopen(self, now: float, onset: float) -> None:

@@ -1,4 +1,4 @@
-"""Dynamics that are linear in their parameters, G(q, v, a) P = u: closed forms and any robot."""
+"""Dynamics that are linear in their parameters, G(q, v, a) P = u: the paper's closed forms."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -6,14 +6,9 @@ from typing import Protocol
 import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import DataError
 from robotid.paper import planar_2r
-from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.torque import joint_torque_regressor
-from robotid.robot.model import RobotModel
 
 __all__ = [
-    "BaseDynamics",
     "LinearDynamics",
     "LinearPlant",
     "PlanarDynamics",
@@ -65,7 +60,7 @@ class Plant(Protocol):
 
 
 @dataclass(frozen=True)
-class PlanarDynamics:
+class PlanarDynamics(LinearDynamics):
     """The paper's arm in closed form.
 
     Attributes:
@@ -76,80 +71,18 @@ class PlanarDynamics:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the c parameters."""
         return planar_2r.PARAMETER_NAMES[self.form]
 
     @property
     def n_joints(self) -> int:
-        """Number of joints."""
         return 2
 
     def regressor(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the regressor.
-
-        Args:
-            q: Joint angles, shape (R, 2) [rad].
-            v: Joint velocities, shape (R, 2) [rad/s].
-            a: Joint accelerations, shape (R, 2) [rad/s^2].
-
-        Returns:
-            Regressor, shape (R, 2, c).
-
-        References:
-            Tzvetkova, (13).
-        """
         return planar_2r.regressor(q, v, a, form=self.form)
 
 
-@dataclass(frozen=True, eq=False)
-class BaseDynamics:
-    """Any robot, in its base parameters.
-
-    Attributes:
-        model: The robot, with a fixed base.
-        mapping: Its base parameters, over all standard parameters or the inertial ones alone.
-    """
-
-    model: RobotModel
-    mapping: BaseMapping
-
-    def __post_init__(self) -> None:
-        if self.model.free_flyer:
-            raise DataError("the base floats; the procedure needs a torque in every row")
-        names = self.model.layout.names
-        if self.mapping.names != names[: len(self.mapping.names)]:
-            raise DataError("the mapping is not one of this model; build both from one model")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the b base parameters."""
-        return self.mapping.base_names
-
-    @property
-    def n_joints(self) -> int:
-        """Number n of joints."""
-        return self.model.n_rows
-
-    def regressor(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the base regressor W_b.
-
-        Args:
-            q: Joint coordinates, shape (R, n) [rad or m].
-            v: Joint velocities, shape (R, n) [rad/s or m/s].
-            a: Joint accelerations, shape (R, n) [rad/s^2 or m/s^2].
-
-        Returns:
-            Regressor, shape (R, n, b).
-
-        References:
-            Tzvetkova, (13).
-        """
-        W = joint_torque_regressor(self.model, q, v, a)  # (R n, p)
-        return W[:, self.mapping.independent].reshape(*q.shape, -1)
-
-
 @dataclass(frozen=True)
-class LinearPlant:
+class LinearPlant(Plant):
     """A plant whose dynamics are linear in its parameters; it need not be a rigid body.
 
     Attributes:
@@ -161,19 +94,7 @@ class LinearPlant:
     P: Array
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
-        """Return a = D(q, P)^-1 (u - C(q, v, P)).
-
-        Args:
-            q: Positions, shape (R, n) [rad or m].
-            v: Velocities, shape (R, n) [rad/s or m/s].
-            u: Torques, shape (R, n) [N m or N].
-
-        Returns:
-            Accelerations, shape (R, n) [rad/s^2 or m/s^2].
-
-        References:
-            Tzvetkova, (11).
-        """
+        # a = D(q, P)^-1 (u - C(q, v, P)), (11)
         D, C = _mass_and_bias(self.dynamics, q, v, self.P)
         a: Array = np.linalg.solve(D, (u - C)[..., None])[..., 0]
         return a

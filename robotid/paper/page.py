@@ -12,17 +12,6 @@ from robotid.versions import __version__
 
 __all__ = ["paper_page"]
 
-_SECTIONS = {
-    "result": "What the simulation reaches",
-    "figures": "The paper's figures",
-    "convergence": "Proximity and error",
-    "disturbance": "Disturbance and noise",
-    "trajectories": "Numerous trajectories",
-    "errata": "Errata",
-    "energy": "Energy",
-    "settings": "Settings",
-}
-
 
 def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]]) -> str:
     """Return the page.
@@ -34,29 +23,22 @@ def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]
     Returns:
         HTML that fetches nothing.
     """
-    shown = {name: _figure(*figure) for name, figure in figures.items()}
+    shown = {name: figure(escape(said), svg) for name, (said, svg) in figures.items()}
     first = [shown[name] for name in ("figure_3a", "figure_3b", "figure_4a", "figure_4b")]
-    contents = {
-        "result": _result_table(content) + _parameter_tables(content),
-        "figures": "".join([*first, shown["figure_5"]]),
-        "convergence": shown["convergence"],
-        "disturbance": _disturbance(content) + shown["disturbance"],
-        "trajectories": _trajectories(content) + shown["trajectories"],
-        "errata": _errata(content),
-        "energy": _energy(content) + shown["energy"],
-        "settings": _settings(content),
+    sections = {
+        "result": (
+            "What the simulation reaches",
+            _result_table(content) + _parameter_tables(content) + _vector_table(content),
+        ),
+        "figures": ("The paper's figures", "".join([*first, shown["figure_5"]])),
+        "convergence": ("Proximity and error", shown["convergence"]),
+        "disturbance": ("Disturbance and noise", _disturbance(content) + shown["disturbance"]),
+        "trajectories": ("Numerous trajectories", _trajectories(content) + shown["trajectories"]),
+        "errata": ("Errata", _errata(content)),
+        "energy": ("Energy", _energy(content) + shown["energy"]),
+        "settings": ("Settings", _settings(content)),
     }
-    links = "".join(f'<a href="#{key}">{title}</a> ' for key, title in _SECTIONS.items())
-    sections = "".join(
-        f'<section aria-labelledby="{key}">\n<h2 id="{key}">{title}</h2>\n'
-        f"{contents[key]}</section>\n"
-        for key, title in _SECTIONS.items()
-    )
-    return page("The paper's simulation", f"{_summary(content)}<nav>{links}</nav>\n{sections}")
-
-
-def _figure(caption: str, svg: str) -> str:
-    return figure(escape(caption), svg)
+    return page("The paper's simulation", _summary(content), sections)
 
 
 def _summary(content: Mapping[str, Any]) -> str:
@@ -71,7 +53,7 @@ def _summary(content: Mapping[str, Any]) -> str:
         for name, error in last.items()
     )
     return (
-        "<header>\n<h1>Extracting inertial parameters: the paper's simulation</h1>\n"
+        "<h1>Extracting inertial parameters: the paper's simulation</h1>\n"
         f'<div class="verdict {status}"><p>After <strong>{count} iterations</strong> from half of '
         f"the parameters</p><ul>{reached}</ul></div>\n"
         "<p>The planar arm of G. V. Tzvetkova's paper, whose parameters are found while it moves "
@@ -79,7 +61,7 @@ def _summary(content: Mapping[str, Any]) -> str:
         "taken as printed, with the regressor corrected (five columns), and as the physical arm "
         "(four parameters).</p>\n"
         f'<p class="note">Written by robotid {__version__}. Numbers of equations are those of the '
-        "paper.</p>\n</header>\n"
+        "paper.</p>\n"
     )
 
 
@@ -123,6 +105,19 @@ def _parameter_tables(content: Mapping[str, Any]) -> str:
         headers = ["parameter", "true", "estimate", "difference"]
         parts.append(table(f"{name}: parameters at the end [kg m²]", headers, rows))
     return "".join(parts)
+
+
+def _vector_table(content: Mapping[str, Any]) -> str:
+    vector = content["inertial_vector"]
+    values = zip(vector["names"], vector["true"], vector["identified"], strict=True)
+    rows = [[code(name), number(true), number(found, ".7g")] for name, true, found in values]
+    return (
+        "<p>The physical arm's inertial parameters in the order of (9)-(10), about the joint "
+        "frames. Torque shows four sums of the twenty; identified are the values nearest to the "
+        "first guess, half of the true ones, that have the four sums P̂. What no torque of the arm "
+        "depends on stays at the guess.</p>\n"
+        + table("Inertial vector (9)-(10), SI units", ["parameter", "true", "identified"], rows)
+    )
 
 
 def _disturbance(content: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """The paper's planar two-joint arm in closed form, as printed and as mechanics has it.
 
 Its axes are vertical, so gravity does no work; at q = 0 it is stretched along x. The form
-``"printed"`` keeps three errata of the paper (Tzvetkova), the other forms mend them:
+``"printed"`` keeps three errata of the paper (Tzvetkova), the other forms correct them:
 
 1. (26) gives C122 = C211 = h and no C112, where h = L1 s2 (L2 m2 + m2 xbar2) + L1 c2 m2 ybar2;
    mechanics gives C122 = -h, C211 = h, C112 = -2 h.
@@ -17,7 +17,6 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
-from robotid.simulation.program import ProgramMotion
 
 __all__ = [
     "PAPER_LINKS",
@@ -25,16 +24,13 @@ __all__ = [
     "PARAMETER_NAMES",
     "Form",
     "PlanarLinks",
-    "mass_matrix",
     "parameters",
     "printed_velocity_coefficient",
-    "program_motion",
     "regressor",
     "urdf_text",
-    "velocity_vector",
 ]
 
-#: As printed; errata 1 to 3 mended but p3 and p4 kept apart; columns 3 and 4 added up.
+#: As printed; errata 1 to 3 corrected but p3 and p4 kept apart; columns 3 and 4 added up.
 Form: TypeAlias = Literal["printed", "corrected_five", "corrected"]
 #: Names of the c parameters of each form.
 PARAMETER_NAMES: dict[Form, tuple[str, ...]] = {
@@ -164,51 +160,6 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
     return G
 
 
-def mass_matrix(q: Array, P: Array, *, form: Form = "corrected") -> Array:
-    """Return the mass matrix D(q, P), with the columns G(q, 0, e_j) P; none depends on p4.
-
-    Args:
-        q: Joint angles, shape (2,) [rad].
-        P: Parameters, shape (c,) [kg m^2].
-        form: Which of the three regressors P belongs to.
-
-    Returns:
-        Mass matrix, shape (2, 2) [kg m^2].
-
-    Raises:
-        DataError: If q does not have two entries, or P not c.
-        SettingsError: If there is no such form.
-
-    References:
-        Tzvetkova, (11) and (26), where "Ixx + Iyy" means second moments of mass, that is Izz.
-    """
-    M = np.stack([regressor(q, 0 * e_j, e_j, form=form) for e_j in np.eye(2)], axis=1)  # (2, 2, c)
-    return np.asarray(M @ _vector("P", P, len(PARAMETER_NAMES[form])))
-
-
-def velocity_vector(q: Array, v: Array, P: Array, *, form: Form = "corrected") -> Array:
-    """Return the centrifugal and Coriolis torques of (11), C(q, v, P) = G(q, v, 0) P.
-
-    Args:
-        q: Joint angles, shape (2,) [rad].
-        v: Joint velocities, shape (2,) [rad/s].
-        P: Parameters, shape (c,) [kg m^2].
-        form: Which of the three regressors P belongs to.
-
-    Returns:
-        Torques, shape (2,) [N m].
-
-    Raises:
-        DataError: If q or v does not have two entries, or P not c.
-        SettingsError: If there is no such form.
-
-    References:
-        Tzvetkova, (11); the printed G disagrees with (26) too.
-    """
-    G = regressor(q, v, np.zeros(2), form=form)  # (2, c)
-    return np.asarray(G @ _vector("P", P, len(PARAMETER_NAMES[form])))
-
-
 def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> float:
     """Return h of erratum 1, which (26) prints for both C122 and C211.
 
@@ -228,32 +179,6 @@ def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> float:
     _, q2 = _vector("q", q, 2)
     along, across = links.L2 * links.m2 + links.m2 * links.xbar2, links.m2 * links.ybar2  # [kg m]
     return float(links.L1 * (np.sin(q2) * along + np.cos(q2) * across))
-
-
-def program_motion(
-    t: Array | float, amplitude: Array, duration: float
-) -> tuple[Array, Array, Array]:
-    """Return the program motion q(t) = A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
-
-    The coefficients a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 take q from 0 to A and leave no
-    velocity and no acceleration at either end. Before 0 and after T the arm rests.
-
-    Args:
-        t: Times, any shape, as () or (N,) [s].
-        amplitude: A, the angle each joint moves through, shape (2,) [rad].
-        duration: T [s].
-
-    Returns:
-        q [rad], v [rad/s] and a [rad/s^2], each of the shape of t with an axis of 2 behind.
-
-    Raises:
-        DataError: If the amplitude does not have two entries.
-        SettingsError: If the duration is not a positive number.
-
-    References:
-        Tzvetkova, (28).
-    """
-    return ProgramMotion(_vector("amplitude", amplitude, 2), duration).evaluate(t)
 
 
 def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:

@@ -9,7 +9,7 @@ from robotid._typing import Array
 from robotid.paper.errata import EnergyDrift
 from robotid.paper.random_motions import RandomRuns
 from robotid.paper.study import AMPLITUDE, CASES, DURATION, ModelStudy
-from robotid.report.plots import INK, STYLE
+from robotid.report.svg import INK, STYLE
 from robotid.simulation.program import ProgramMotion
 
 __all__ = [

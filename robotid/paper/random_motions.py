@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
-from robotid.paper.closed_loop import run_procedure
 from robotid.paper.dynamics import LinearDynamics, LinearPlant
-from robotid.paper.procedure import History, LoopSettings
+from robotid.paper.procedure import History, LoopSettings, run_procedure
 from robotid.simulation.program import ProgramMotion
 
 __all__ = ["TOLERANCE", "RandomRuns", "random_runs"]

@@ -1,22 +1,21 @@
 """Run the paper's simulation and write its figures, tables and numbers."""
 
-import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from robotid._files import folder_beside, write_json
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.paper import plots
+from robotid.paper.dynamics import PlanarDynamics, torque
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
 from robotid.paper.page import paper_page
+from robotid.paper.planar_2r import urdf_text
 from robotid.paper.procedure import LoopSettings
 from robotid.paper.random_motions import RandomRuns, random_runs
-from robotid.paper.replay import write_paper_replay
 from robotid.paper.study import (
     AMPLITUDE,
     CASES,
@@ -27,12 +26,19 @@ from robotid.paper.study import (
     paper_arm,
     study_model,
 )
-from robotid.report.plots import STYLE, svg_element
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.report.svg import STYLE, svg_element
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import PAPER_TERMS, to_paper_order
+from robotid.simulation.program import ProgramMotion
 from robotid.versions import __version__
+from robotid.viewer.replays import Torques, write_replay
 
 __all__ = ["run_paper"]
 
 _ENOUGH = 1e-4  # [-] relative error at which the simulation has converged
+_SAMPLES = 241  # of the replay
 _CAPTIONS = {
     "figure_3a": "Figure 3(a). The program motion of link 1, (28)",
     "figure_3b": "Figure 3(b). The program motion of link 2, (28)",
@@ -79,10 +85,11 @@ def run_paper(
     near = _trajectories(chosen, "beside", 0.05, chosen.patience, report)
     exact = _trajectories(chosen, "on", 0.0, min(chosen.patience, chosen.iterations), report)
     drift = energy_drift()
+    arm, physical = _arm(), studies[list(MODELS).index("physical")]
     content = _content(chosen, studies, near, exact, drift)
+    content["inertial_vector"] = _inertial_vector(arm, physical)
     report("drawing", 0, 1, "pages")
-    physical = studies[list(MODELS).index("physical")]
-    _write(target, content, _figures(studies, near, drift), physical)
+    _write(target, content, _figures(studies, near, drift), arm, physical)
     return content
 
 
@@ -189,6 +196,33 @@ def _reason(case: str, errors: Array) -> str:
     )
 
 
+def _arm() -> RobotModel:
+    """Return the physical arm, read from its URDF."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "planar_2r.urdf"
+        path.write_text(urdf_text(), encoding="utf-8")
+        return RobotModel.from_urdf(path)
+
+
+def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
+    """Return the arm's inertial parameters in the order of (9)-(10), true and identified.
+
+    Identified are those nearest to the first guess, half of the true ones, whose torque is that of
+    the estimate, W_b beta = G P^: the torque shows four sums of the twenty.
+    """
+    pi = arm.standard_parameters()[: arm.layout.n_inertial]
+    q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 20, 2))
+    mapping = structural_mapping(arm, inertial_only=True)
+    W_b = joint_torque_regressor(arm, q, v, a)[:, mapping.independent]  # (40, b)
+    u = torque(study.dynamics, q, v, a, study.history.estimates[-1, 0])  # (20, 2)
+    beta = np.linalg.lstsq(W_b, u.ravel())[0]
+    return {
+        "names": [f"{body}.{term}" for body in arm.layout.bodies for term in PAPER_TERMS],
+        "true": to_paper_order(pi).tolist(),
+        "identified": to_paper_order(mapping.to_standard(beta, pi / 2)).tolist(),
+    }
+
+
 def _figures(
     studies: list[ModelStudy], runs: Mapping[str, RandomRuns], drift: EnergyDrift
 ) -> dict[str, Any]:
@@ -206,13 +240,16 @@ def _figures(
 
 
 def _write(
-    target: Path, content: Mapping[str, Any], figures: Mapping[str, Any], study: ModelStudy
+    target: Path,
+    content: Mapping[str, Any],
+    figures: Mapping[str, Any],
+    arm: RobotModel,
+    study: ModelStudy,
 ) -> None:
     """Write all files beside their places, then put each in place."""
     import matplotlib
 
-    beside = Path(tempfile.mkdtemp(prefix=".paper.", dir=target))
-    try:
+    with folder_beside(target) as beside:
         shown = {}
         with matplotlib.rc_context(STYLE):
             for name, figure in figures.items():
@@ -220,14 +257,32 @@ def _write(
                 figure.set_layout_engine("none")  # it is laid out now
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
                 shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
-        write_paper_replay(study, beside)
+        (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
+        _write_replay(arm, study, beside / "replay.html")
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
-        text = json.dumps(content, allow_nan=False, indent=1)
-        (beside / "paper.json").write_text(text + "\n", encoding="utf-8")
-        for file in sorted(beside.iterdir()):
-            os.replace(file, target / file.name)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        write_json(content, beside / "paper.json")
+
+
+def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
+    """Write the replay of the program motion (28), with the torques of the estimates."""
+    t = np.linspace(0.0, DURATION, _SAMPLES)
+    q, v, a = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(t)
+    dynamics = PlanarDynamics("corrected")
+    estimates = study.history.estimates[:, 0]
+    last = len(estimates) - 1
+    guesses = {"first guess": estimates[0], f"after {last} iterations": estimates[-1]}
+    write_replay(
+        arm,
+        t,
+        q,
+        target,
+        torques=Torques(
+            t,
+            torque(dynamics, q, v, a, study.P),
+            {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
+        ),
+        notes=["Program motion (28); arcs are coloured by the residual of the first guess."],
+    )
 
 
 def _counter(what: str, most: int, report: ProgressCallback) -> Callable[[int], None]:

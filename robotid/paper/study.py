@@ -12,10 +12,9 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.paper.closed_loop import run_procedure
 from robotid.paper.dynamics import LinearPlant, PlanarDynamics, torque
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
-from robotid.paper.procedure import History, Influences, LoopSettings, random_torque
+from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
 from robotid.simulation.program import ProgramMotion
 
 __all__ = [

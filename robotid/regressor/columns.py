@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.robot.drives import TERMS, DriveMotion, DriveTerm
 from robotid.robot.parameters import ParameterLayout
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "friction_directions",
     "friction_speeds",
     "plan_rows",
+    "sure_rows",
 ]
 
 
@@ -25,17 +26,17 @@ class DriveColumn:
     """One drive parameter: row r of the regressor holds ratio_r f(w), w = sum_r ratio_r v_r.
 
     Attributes:
-        term: Which f, one of ``DRIVE_TERMS``.
+        term: Which f.
         ratios: Ratio by row [-]; a drive of one joint has a single row and ratio 1.
-        number: Which of the directions a Coulomb column follows; None for other terms.
+        number: Which of the directions the drive follows; None if f follows none.
     """
 
-    term: str
+    term: DriveTerm
     ratios: dict[int, float]
     number: int | None = None
 
     def values(self, v: Array, a: Array, direction: Array) -> Array:
-        """Return f(w) at each instant: dw/dt, w, sign w or 1.
+        """Return f(w) at each instant.
 
         Args:
             v: Velocities, shape (N, n_rows) [rad/s, m/s].
@@ -45,12 +46,9 @@ class DriveColumn:
         Returns:
             Values, shape (N,).
         """
-        if self.term == "offset":
-            return np.ones(len(v))
-        if self.number is not None:
-            sign: Array = direction[:, self.number]
-            return sign
-        return self.speed(a if self.term == "armature" else v)
+        w = self.speed(v)
+        signs = w if self.number is None else direction[:, self.number]
+        return self.term.column(DriveMotion(w, self.speed(a), signs))
 
     def speed(self, v: Array) -> Array:
         """Return w = sum_r ratio_r v_r, shape (N,).
@@ -97,39 +95,48 @@ def drive_columns(layout: ParameterLayout, n_rows: int) -> tuple[DriveColumn, ..
     """
     first = n_rows - len(layout.joints)
     rows = {joint: first + j for j, joint in enumerate(layout.joints)}
-    own = [(term, {rows[joint]: 1.0}) for joint in layout.joints for term in layout.terms]
-    coupled = [
-        (term, {rows[joint]: ratio for joint, ratio in coupling.ratios})
-        for coupling in layout.couplings
-        for term in layout.coupling_terms
-    ]
-    numbers = count()
+    ratios = [{rows[joint]: ratio for joint, ratio in drive.ratios} for drive in layout.drives]
     return tuple(
-        DriveColumn(term, ratios, next(numbers) if term == "coulomb" else None)
-        for term, ratios in own + coupled
+        DriveColumn(term, ratios[d], d if term.follows_direction else None)
+        for d, term in layout.drive_parameters
     )
 
 
 def friction_speeds(layout: ParameterLayout) -> Array:
-    """Return the speeds that Coulomb friction follows: those of joints, then of couplings.
+    """Return the speeds whose direction friction follows: those of joints, then of couplings.
 
     Args:
         layout: The standard parameters of a robot with n joints.
 
     Returns:
         Their ratios to the speeds of the joints, w = ratios v, shape (c, n) [-]; c is the number of
-        Coulomb parameters.
+        drives, or 0 if no term of the layout follows a direction.
     """
-    n = len(layout.joints)
-    drives = [drive for drive in drive_columns(layout, n) if drive.number is not None]
-    ratios = np.zeros((len(drives), n))
-    for row, drive in zip(ratios, drives, strict=True):
-        row[list(drive.ratios)] = list(drive.ratios.values())
-    return ratios
+    is_followed = any(TERMS[name].follows_direction for name in layout.terms)
+    return layout.drive_ratios if is_followed else layout.drive_ratios[:0]
+
+
+def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
+    """Return which rows are sure: those where no drive with friction is too slow to tell its sign.
+
+    Args:
+        layout: The standard parameters.
+        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
+        least: Speed from which the sign is sure [rad/s or m/s].
+
+    Returns:
+        Flags, shape (N, n_rows), bool.
+    """
+    ratios = friction_speeds(layout)
+    first = v.shape[1] - ratios.shape[1]
+    slow = np.abs(v[:, first:] @ ratios.T) < least  # (N, c)
+    sure = np.ones(v.shape, dtype=bool)
+    sure[:, first:] = ~(slow @ (ratios != 0.0))
+    return sure
 
 
 def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
-    """Return what the Coulomb columns hold: the directions given, or else the signs of the speeds.
+    """Return the directions that friction follows: those given, or else the signs of the speeds.
 
     Args:
         layout: The standard parameters.

@@ -5,7 +5,6 @@ R(q) = A + B cos q + C sin q, p(q) = p0 + d q, with the axis measured from Pinoc
 that aligned and unaligned, turning and sliding joints are one case.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -92,8 +91,10 @@ class CompiledWriter:
         bodies, depth = tree.rows.shape
         self._model, self._tree, self._out = model, tree, out
         self._places = _places(tree, plan)
-        self._couplings = _couplings(plan)
-        self._terms, self._ratios = _terms(plan, self._couplings, lanes.KINDS)
+        self._drives = [
+            (j, place, drive) for j, row in enumerate(plan.drives) for place, drive in row
+        ]
+        self._ends = np.array([*(place for _, place, _ in self._drives), *plan.torques])
         self._widths = np.diff(plan.first)
         self._root = np.zeros(out.shape[1])
         self._work = np.zeros(lanes.state_size(bodies, depth))
@@ -110,20 +111,19 @@ class CompiledWriter:
             v: Velocities, shape (N, n_rows) [rad/s, m/s].
             a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
             tau: Torques, shape (N, n_rows) [N m, N].
-            direction: Signs that the Coulomb columns hold, shape (N, c).
+            direction: Directions that friction follows, shape (N, c).
             weights: Weights, shape (N, n_rows); None: all 1.
         """
         self._base = np.zeros((12, 0))
         if self._model.free_flyer:
             self._base = _base_state(self._model, q, v, a)
             q = q[:, 1:]  # the pose has one entry more than the twist
-        drives = np.zeros((len(self._couplings), v.shape[1]))
-        for row, drive in zip(drives, self._couplings, strict=True):
-            row[list(drive)] = list(drive.values())
         # copies that Numba finds writable and in C order: another kind would be compiled again
-        self._q, self._tau = np.array(q, dtype=float, order="C"), np.array(tau, float, order="C")
-        self._v, self._a = np.hstack([v, v @ drives.T]), np.hstack([a, a @ drives.T])
-        self._direction = np.array(direction, float, order="C")
+        self._q, self._v, self._a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
+        self._values = np.empty((len(self._ends), len(v)))
+        for values, (j, _, drive) in zip(self._values, self._drives, strict=False):
+            np.multiply(drive.ratios[j], drive.values(v, a, direction), out=values)
+        self._values[len(self._drives) :] = tau.T
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:
@@ -139,8 +139,8 @@ class CompiledWriter:
             *motion, self._base, self._work, self._out, (start, stop),
         )  # fmt: skip
         lanes.finish_rows(
-            self._terms, self._ratios, self._widths, self._v, self._a, self._direction, self._tau,
-            self._weights, self._root, self._out, (start, stop),
+            self._values, self._ends, self._widths, self._weights, self._root, self._out,
+            (start, stop),
         )  # fmt: skip
 
 
@@ -206,35 +206,6 @@ def _places(tree: Tree, plan: "RowPlan") -> Array:
         slot = np.argmax(tree.rows[body] == j, axis=1)
         table[body, slot, wanted % 10] = place
     return table
-
-
-def _couplings(plan: "RowPlan") -> list[dict[int, float]]:
-    """Return the ratios of each drive that turns with several joints."""
-    found: list[dict[int, float]] = []
-    for row in plan.drives:
-        for _, drive in row:
-            if (len(drive.ratios) > 1 or 1.0 not in drive.ratios.values()) and (
-                drive.ratios not in found
-            ):
-                found.append(drive.ratios)
-    return found
-
-
-def _terms(
-    plan: "RowPlan", couplings: list[dict[int, float]], kinds: Sequence[str]
-) -> tuple[Array, Array]:
-    """Return place, kind and source column of drive columns and torques, and their factors."""
-    terms, ratios, n_rows = [], [], len(plan.torques)
-    for j, row in enumerate(plan.drives):
-        for place, drive in row:
-            coupled = drive.ratios in couplings
-            source = n_rows + couplings.index(drive.ratios) if coupled else j
-            source = source if drive.number is None else drive.number
-            terms.append((place, kinds.index(drive.term), source))
-            ratios.append(drive.ratios[j])
-        terms.append((plan.torques[j], kinds.index("torque"), j))
-        ratios.append(1.0)
-    return np.array(terms), np.array(ratios)
 
 
 def _prepare(state: Array, model: "RobotModel", tree: Tree) -> None:

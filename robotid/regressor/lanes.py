@@ -18,11 +18,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["KINDS", "LANES", "finish_rows", "inertial_rows", "state_size"]
+__all__ = ["LANES", "finish_rows", "inertial_rows", "state_size"]
 
 LANES = 64
-#: What ``finish_rows`` writes, by number.
-KINDS = ("armature", "viscous", "coulomb", "offset", "torque")
 _STATE = 12  # w, v, dw, a of a body
 _SHARED = 9 + 3 + 18 + 10 + 5  # placement, what rows of a body share, ten columns, joint's motion
 _MOTION = 40  # cos q, sin q, q, v, a of the joint
@@ -278,38 +276,22 @@ def inertial_rows(parents, depths, slots, leaders, joints, places, q, v, a, base
 
 
 @_compile
-def finish_rows(terms, ratios, widths, v, a, direction, tau, weights, root, out, span):
+def finish_rows(values, places, widths, weights, root, out, span):
     """Write drive columns and torques of a block, and weigh its rows.
 
     Args:
-        terms: Place, kind (see ``KINDS``) and source column of each, shape (E, 3), int.
-        ratios: Factor of each, shape (E,).
+        values: Drive columns and torques, shape (E, N).
+        places: Place of each, shape (E,), int.
         widths: Number of columns that each row has in ``out``, shape (n_rows,), int.
-        v: Velocities, then those of coupled drives, shape (N, n_rows + couplings) [rad/s, m/s].
-        a: Accelerations likewise [rad/s^2, m/s^2].
-        direction: Signs that the Coulomb columns hold, shape (N, c).
-        tau: Torques, shape (N, n_rows) [N m, N].
         weights: Weights, shape (N, n_rows), or (0, 0) if all are 1.
         root: Work space, shape (k,).
         out: The columns, shape (columns, k); written.
         span: First sample, and the one after the last.
     """
     first, count = span[0], span[1] - span[0]
-    for e in range(len(ratios)):
-        place, kind, column = terms[e]
-        ratio = ratios[e]
+    for e in range(len(places)):
         for k in range(count):
-            if kind == 0:
-                value = a[first + k, column]
-            elif kind == 1:
-                value = v[first + k, column]
-            elif kind == 2:
-                value = direction[first + k, column]
-            elif kind == 3:
-                value = 1.0
-            else:
-                value = tau[first + k, column]
-            out[place, k] = ratio * value
+            out[places[e], k] = values[e, first + k]
     end = 0
     for j in range(len(widths) if len(weights) else 0):
         begin, end = end, end + widths[j]

@@ -32,6 +32,7 @@ COMPILED = "compiled by Numba"
 
 _LANES = 64  # the compiled path works on whole groups of so many samples
 _BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, if that leaves it a group of samples
+_LOADED = 32  # blocks that a writer takes at once
 
 _log = logging.getLogger(__name__)
 
@@ -147,18 +148,20 @@ class TrajectoryRows(RowSource):
         plan = self._plan
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))
-        writer = self._writer(out)
-        motion, part = self.trajectory, slice(start, stop)
-        weights = self.weights[part] if self._is_weighted else None
-        direction = None if motion.direction is None else motion.direction[part]
-        direction = friction_directions(self.model.layout, motion.v[part], direction)
-        writer.load(
-            motion.q[part], motion.v[part], motion.a[part], motion.tau[part], direction, weights
-        )
-        for k in range(0, stop - start, length):
-            end = min(k + length, stop - start)
-            writer.write(k, end)
-            yield [out[i:j, : end - k].T for i, j in pairwise(plan.first)]
+        writer, motion = self._writer(out), self.trajectory
+        for first in range(start, stop, _LOADED * length):
+            last = min(first + _LOADED * length, stop)
+            part = slice(first, last)
+            weights = self.weights[part] if self._is_weighted else None
+            direction = None if motion.direction is None else motion.direction[part]
+            direction = friction_directions(self.model.layout, motion.v[part], direction)
+            writer.load(
+                motion.q[part], motion.v[part], motion.a[part], motion.tau[part], direction, weights
+            )
+            for k in range(0, last - first, length):
+                end = min(k + length, last - first)
+                writer.write(k, end)
+                yield [out[i:j, : end - k].T for i, j in pairwise(plan.first)]
 
     @cached_property
     def _tree(self) -> Tree:

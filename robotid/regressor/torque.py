@@ -14,6 +14,7 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.columns import drive_columns, friction_directions
 from robotid.regressor.problem import Block, Problem
 from robotid.regressor.rows import BLOCK, trajectory_rows
+from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -113,9 +114,11 @@ class InstantRegressor:
         layout = model.layout
         self._Y = np.zeros((model.n_rows, len(layout.names)))
         # place of each drive term of each joint, couplings aside: they follow behind
-        count = len(layout.terms)
-        joints = np.arange(len(layout.joints))
-        self._places = [layout.n_inertial + joints * count + k for k in range(count)]
+        count, joints = len(layout.terms), np.arange(len(layout.joints))
+        self._terms = [
+            (TERMS[name], layout.n_inertial + joints * count + k)
+            for k, name in enumerate(layout.terms)
+        ]
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the regressor of one instant.
@@ -138,9 +141,9 @@ class InstantRegressor:
                 model.pin_model, self._data, x, G @ v, G @ a
             )
         Y[:, : layout.n_inertial] = inertial
-        rows, value = np.arange(len(v)), {"armature": a, "viscous": v, "offset": np.ones(1)}
-        for term, place in zip(layout.terms, self._places, strict=True):
-            Y[rows, place] = np.sign(v) if term == "coulomb" else value[term]
+        rows, motion = np.arange(len(v)), DriveMotion(v, a, np.sign(v))
+        for term, place in self._terms:
+            Y[rows, place] = term.column(motion)
         if layout.couplings:
             _write_drives(model, v[None], a[None], None, Y[None, :, layout.n_inertial :])
         return Y[:, self._columns]
@@ -245,7 +248,7 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
 def _write_drives(
     model: RobotModel, v: Array, a: Array, direction: Array | None, out: Array
 ) -> None:
-    """Write the columns of armature, viscous, coulomb, offset, shape (N, n_rows, drive)."""
+    """Write the columns of the drive parameters, shape (N, n_rows, drive)."""
     out[:] = 0.0
     signs = friction_directions(model.layout, v, direction)
     for k, drive in enumerate(drive_columns(model.layout, model.n_rows)):

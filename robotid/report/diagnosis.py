@@ -5,26 +5,25 @@ from html import escape
 
 import numpy as np
 
-from robotid._html import code, figure, number, table, text
+from robotid._html import code, figure, number, table
 from robotid._typing import Array
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.information import Information, information
 from robotid.identification.pipeline import Identification
-from robotid.report.diagnosis_plots import (
-    plot_correlation,
+from robotid.report.plots import (
+    correlation_map,
     plot_drives,
     plot_friction,
     plot_residual,
     plot_singular,
 )
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
-from robotid.versions import versions
+from robotid.report.svg import svg_element
 
 __all__ = [
     "drive_figures",
     "information_section",
     "residual_section",
-    "version_table",
 ]
 
 _DOTS = 1200  # of one friction plot
@@ -74,7 +73,7 @@ def drive_figures(found: Identification) -> str:
         return ""
     bars = "".join(_drive_figure(found, term) for term in layout.terms)
     curves = ""
-    if set(layout.terms) - {"armature"}:
+    if not all(term.is_inertia for _, term in layout.drive_parameters):
         curves = (
             "<h3>Friction against speed</h3>\n<p>Torque that inertia, gravity and armature leave, "
             f"on {escape(_shown(found).recording.name)}, and the friction and offset identified. "
@@ -110,7 +109,8 @@ def information_section(found: Identification) -> str:
         else "<p>The data settle every base parameter by 99 % or more.</p>\n"
     )
     title = "Singular values of the regressor, columns scaled to unit norm"
-    singular = plot_singular(said.singular_values, found.wls.rank, title=title, key="singular")
+    plot = plot_singular(said.singular_values, found.wls.rank)
+    singular = svg_element(plot, title, "singular")
     return (
         f"<p>Condition number {found.wls.condition:.3g}; singular values from "
         f"{said.singular_values[0]:.3g} to {said.singular_values[-1]:.2g}. Of what is known about "
@@ -121,19 +121,9 @@ def information_section(found: Identification) -> str:
     )
 
 
-def version_table() -> str:
-    """Return the table of the versions that ran.
-
-    Returns:
-        HTML.
-    """
-    rows = [[text(name), code(version)] for name, version in versions().items()]
-    return table("Versions that ran", ["what", "version"], rows)
-
-
 def _shown(found: Identification) -> Evaluation:
     """Return the recording that is looked into: the first one that was not fitted."""
-    return (found.validation or found.identification)[0]
+    return (found.validation or found.fitted)[0]
 
 
 def _residual_figure(e: Evaluation, row: int, name: str, unit: str) -> str:
@@ -150,18 +140,10 @@ def _residual_figure(e: Evaluation, row: int, name: str, unit: str) -> str:
     inside = np.flatnonzero(np.abs(correlation) < 0.2)
     falls = f"falls below 0.2 after {step * dt * inside[0]:.2g} s" if len(inside) else "stays high"
     title = f"Spectrum and autocorrelation of the residual of {name}, which {falls}"
-    svg = plot_residual(
-        density,
-        torque,
-        correlation,
-        step * dt,
-        cutoff=e.recording.signals.cutoff,
-        unit=unit,
-        title=title,
-        key=f"residual{row}",
-    )
+    cutoff = e.recording.signals.cutoff
+    plot = plot_residual(density, torque, correlation, step * dt, cutoff=cutoff, unit=unit)
     caption = f"<strong>{escape(name)}</strong>: correlation {falls}"
-    return figure(caption, svg)
+    return figure(caption, svg_element(plot, title, f"residual{row}"))
 
 
 def _period(t: Array, segment: Array) -> float:
@@ -179,14 +161,11 @@ def _friction_figures(found: Identification) -> str:
         if not len(rows):
             figures.append(f"<p>{escape(name)}: no rows used.</p>\n")
             continue
-        svg = plot_friction(
-            evaluation.recording.trajectory.v[rows, row],
-            left[rows, row],
-            friction[rows, row],
-            units=("m/s" if unit == "N" else "rad/s", unit),
-            title=f"Friction of {name} against speed, measured and identified",
-            key=f"friction{row}",
-        )
+        v = evaluation.recording.trajectory.v[rows, row]
+        units = ("m/s" if unit == "N" else "rad/s", unit)
+        plot = plot_friction(v, left[rows, row], friction[rows, row], units=units)
+        title = f"Friction of {name} against speed, measured and identified"
+        svg = svg_element(plot, title, f"friction{row}")
         figures.append(figure(f"<strong>{escape(name)}</strong>", svg))
     return "".join(figures)
 
@@ -198,17 +177,11 @@ def _drive_figure(found: Identification, term: str) -> str:
     chosen = [i for i, name in enumerate(layout.names) if name.endswith(f".{term}")]
     for k, unit in enumerate(dict.fromkeys(layout.units[i] for i in chosen)):
         part = np.array([i for i in chosen if layout.units[i] == unit])
-        svg = plot_drives(
-            [layout.names[i].rsplit(".", 1)[0] for i in part],
-            found.prior[part],
-            found.standard[part],
-            found.standard_error[part],
-            found.prior_std[part],
-            label=f"{term} [{unit}]",
-            title=f"{term} of each drive with error bars, beside the value before the fit",
-            key=f"{term}{k}",
+        label = f"{term} [{unit}]"
+        title = f"{term} of each drive with error bars, beside the value before the fit"
+        figures.append(
+            figure(label, svg_element(plot_drives(found, part, label), title, f"{term}{k}"))
         )
-        figures.append(figure(f"{term} [{unit}]", svg))
     return "".join(figures)
 
 
@@ -224,7 +197,7 @@ def _correlations(said: Information, names: Sequence[str]) -> str:
     ]
     strong = int((lower >= _STRONG).sum())
     title = f"Correlation of the errors of {len(names)} base parameters; {strong} pairs above 0.8"
-    image = plot_correlation(said.correlation, names, title=title, key="correlation")
+    image = correlation_map(said.correlation, names, title=title, key="correlation")
     caption = "Blue: errors rise together; orange: one rises as the other falls; full colour at 1."
     listed = (
         table(

@@ -1,36 +1,34 @@
 """The report: one HTML file that reads without a network, on a screen, a phone or paper."""
 
-import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from robotid._files import write_text
 from robotid._html import code, figure, number, page, percent, table, text
-from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
 from robotid.logs.settings import SignalSettings
-from robotid.report.consistency import consistency_notes
 from robotid.report.diagnosis import (
     drive_figures,
     information_section,
     residual_section,
-    version_table,
 )
 from robotid.report.plots import plot_body, plot_torque
+from robotid.report.svg import svg_element
 from robotid.report.tables import (
     base_table,
-    consistency_table,
+    consistency_section,
     drive_table,
     input_table,
     open_section,
     settings_tables,
     standard_table,
+    version_table,
 )
-from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import __version__
 
 __all__ = ["write_report"]
@@ -39,21 +37,6 @@ _POINTS = 120_000  # points of all lines together: about 2 MB
 _LONGEST = 2000  # points of one line
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 _SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
-_SECTIONS = {
-    "errors": "Prediction errors",
-    "torques": "Torques over time",
-    "residuals": "What the residuals hold",
-    "drives": "Drive parameters",
-    "base": "Base parameters",
-    "standard": "Standard parameters",
-    "consistency": "Physical consistency",
-    "information": "Excitation and correlation",
-    "open": "What the data do not determine",
-    "warnings": "Warnings and notes",
-    "settings": "Settings",
-    "inputs": "Inputs",
-    "versions": "Versions",
-}
 
 
 def write_report(
@@ -74,44 +57,30 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    path = Path(target)
-    if not path.parent.is_dir():
-        raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
-    contents = {
-        "errors": _errors(identification),
-        "torques": _torques(identification),
-        "residuals": residual_section(identification),
-        "drives": drive_figures(identification) + drive_table(identification),
-        "base": base_table(identification),
-        "standard": _standard(identification),
-        "consistency": consistency_table(identification) + consistency_notes(identification),
-        "information": information_section(identification),
-        "open": open_section(identification),
-        "warnings": _warnings(identification, findings),
-        "settings": settings_tables(identification),
-        "inputs": input_table(identification),
-        "versions": version_table(),
+    sections = {
+        "errors": ("Prediction errors", _errors(identification)),
+        "torques": ("Torques over time", _torques(identification)),
+        "residuals": ("What the residuals hold", residual_section(identification)),
+        "drives": (
+            "Drive parameters",
+            drive_figures(identification) + drive_table(identification),
+        ),
+        "base": ("Base parameters", base_table(identification)),
+        "standard": ("Standard parameters", _standard(identification)),
+        "consistency": ("Physical consistency", consistency_section(identification)),
+        "information": ("Excitation and correlation", information_section(identification)),
+        "open": ("What the data do not determine", open_section(identification)),
+        "warnings": ("Warnings and notes", _warnings(identification, findings)),
+        "settings": ("Settings", settings_tables(identification)),
+        "inputs": ("Inputs", input_table(identification)),
+        "versions": ("Versions", version_table()),
     }
-    links = "".join(f'<a href="#{key}">{title}</a> ' for key, title in _SECTIONS.items())
-    nav = f'<nav aria-label="Sections">{links}</nav>'
-    sections = "".join(
-        f'<section aria-labelledby="{key}">\n<h2 id="{key}">{title}</h2>\n'
-        f"{contents[key]}</section>\n"
-        for key, title in _SECTIONS.items()
-    )
     title = f"{identification.model.name}: identified parameters"
-    html = page(title, f"{_summary(identification)}{nav}\n{sections}")
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(html, encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
-    return path
+    return write_text(page(title, _summary(identification), sections), target)
 
 
 def _summary(found: Identification) -> str:
-    verdict, fitted, kept = found.verdict, found.identification, found.validation
+    verdict, fitted, kept = found.verdict, found.fitted, found.validation
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
@@ -124,11 +93,11 @@ def _summary(found: Identification) -> str:
         + f"Signals: {'; or '.join(chains)}."
     )
     return (
-        f"<header>\n<h1>{escape(found.model.name)}</h1>\n"
+        f"<h1>{escape(found.model.name)}</h1>\n"
         f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
         f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n"
         f'<p class="note">Written by robotid {__version__}. SI units throughout; inertial '
-        "parameters in Pinocchio's order, inertias about the joint frame.</p>\n</header>\n"
+        "parameters in Pinocchio's order, inertias about the joint frame.</p>\n"
     )
 
 
@@ -154,8 +123,8 @@ def _errors(found: Identification) -> str:
         )
         for e in found.validation
     ]
-    count = len(found.identification)
-    fitted = "All fitted rows together" if count > 1 else f"{_names(found.identification)}: fitted"
+    count = len(found.fitted)
+    fitted = "All fitted rows together" if count > 1 else f"{_names(found.fitted)}: fitted"
     tables.append(_error_table(fitted, found, found.metrics(), found.metrics("wls")))
     return (
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
@@ -206,7 +175,7 @@ def _remark(measured: JointMetrics) -> str:
 
 
 def _torques(found: Identification) -> str:
-    model, evaluations = found.model, found.validation or found.identification
+    model, evaluations = found.model, found.validation or found.fitted
     shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
     points = min(_LONGEST, max(200, _POINTS // (3 * model.n_rows * len(shown))))
     parts = [
@@ -251,15 +220,16 @@ def _torque_figure(
             f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band holds {100 * held:.0f} %"
         )
     title = f"Measured and predicted torque and residual of {name} over time; {said}"
-    svg = plot_torque(e, row, band, unit=unit, title=title, key=key, points=points)
+    svg = svg_element(plot_torque(e, row, band, unit=unit, points=points), title, key)
     return figure(f"<strong>{escape(name)}</strong>: {said}", svg)
 
 
 def _standard(found: Identification) -> str:
-    figures = "".join(
-        figure(f"<strong>{escape(body)}</strong>", _body_plot(found, i))
-        for i, body in enumerate(found.model.layout.bodies)
-    )
+    figures = ""
+    for i, body in enumerate(found.model.layout.bodies):
+        title = f"Parameters of {body} with error bars, beside the URDF's"
+        svg = svg_element(plot_body(found, i), title, f"body{i}")
+        figures += figure(f"<strong>{escape(body)}</strong>", svg)
     return (
         "<p>One of many sets with the same torque: the data fix the base parameters only, the "
         "rest follows the URDF. Source: data, where the standard error is below 30 % of the "
@@ -268,24 +238,11 @@ def _standard(found: Identification) -> str:
     )
 
 
-def _body_plot(found: Identification, i: int) -> str:
-    part = slice(10 * i, 10 * i + 10)
-    return plot_body(
-        INERTIAL_TERMS,
-        found.prior[part],
-        found.standard[part],
-        found.standard_error[part],
-        found.prior_std[part],
-        title=f"Parameters of {found.model.layout.bodies[i]} with error bars, beside the URDF's",
-        key=f"body{i}",
-    )
-
-
 def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
     known = [finding.message for finding in findings]
     notes = [
         Finding("log_note", "note", str(e.recording.log.path), note)
-        for e in (*found.identification, *found.validation)
+        for e in (*found.fitted, *found.validation)
         for note in e.recording.log.notes
         if not any(message.endswith(note) for message in known)
     ]

@@ -96,8 +96,9 @@ def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tupl
         Torque left and friction identified, shape (N, n) each [N m or N]; an offset counts as
         friction.
     """
-    stiff = np.array([name.endswith(".armature") for name in model.layout.names])
-    stiff[: model.layout.n_inertial] = True
+    layout = model.layout
+    inertial = [True] * layout.n_inertial
+    stiff = np.array(inertial + [term.is_inertia for _, term in layout.drive_parameters])
     trajectory = evaluation.recording.trajectory
     moved, whole = predict(model, [np.where(stiff, pi, 0.0), pi], trajectory)
     return trajectory.tau - moved, whole - moved

@@ -1,4 +1,4 @@
-"""The report's tables of parameters, settings and inputs."""
+"""The report's tables and lists: parameters, consistency, what is open, settings, inputs."""
 
 from collections.abc import Sequence
 from html import escape
@@ -11,16 +11,28 @@ from robotid._html import Cell, code, number, percent, table, text
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import Identification
 from robotid.robot.parameters import pseudo_inertia
+from robotid.versions import versions
 
 __all__ = [
     "base_table",
-    "consistency_table",
+    "consistency_section",
     "drive_table",
     "input_table",
     "open_section",
     "settings_tables",
     "standard_table",
+    "version_table",
 ]
+
+_METRICS = {
+    "euclidean": "each parameter over its own spread (euclidean)",
+    "riemannian": "the pull-back metric at the URDF's pseudo-inertias (riemannian)",
+    "entropic": "the divergence of the pseudo-inertias (entropic)",
+}
+_CHOSEN = {
+    "cv": "chosen by predicting stretches of the fitted logs from the others",
+    "evidence": "chosen by the evidence of the fitted logs",
+}
 
 
 def drive_table(found: Identification) -> str:
@@ -101,8 +113,8 @@ def standard_table(found: Identification) -> str:
     return table("Standard parameters of the bodies", headers, rows)
 
 
-def consistency_table(found: Identification) -> str:
-    """Return masses and pseudo-inertias, before and after, and their totals.
+def consistency_section(found: Identification) -> str:
+    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix.
 
     Args:
         found: The identification.
@@ -135,6 +147,7 @@ def consistency_table(found: Identification) -> str:
         f"<p>{said} physically possible. A body is possible when the smallest eigenvalue of its "
         "pseudo-inertia is positive; a drive, when armature and friction are not negative.</p>\n"
         + table("Mass and pseudo-inertia of each body", headers, rows, foot)
+        + _consistency_notes(found)
     )
 
 
@@ -223,7 +236,7 @@ def settings_tables(found: Identification) -> str:
         pairs[f"coupling {coupling.name}"] = ratios
     rows = [[text(key), text(value)] for key, value in pairs.items()]
     headers = ["log", "filter", "rate Hz", "velocity", "trim s", "least speed", "gap s"]
-    signals = [_signal_row(e.recording) for e in (*found.identification, *found.validation)]
+    signals = [_signal_row(e.recording) for e in (*found.fitted, *found.validation)]
     return table("Model and estimator", ["setting", "value"], rows) + table(
         "Signals, as used for each log; least speed in rad/s or m/s", headers, signals
     )
@@ -240,10 +253,20 @@ def input_table(found: Identification) -> str:
     """
     urdf = found.model.tree.path
     rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
-    for role, evaluations in (("fitted", found.identification), ("validation", found.validation)):
+    for role, evaluations in (("fitted", found.fitted), ("validation", found.validation)):
         rows += [[text(role), *_input_row(e.recording)] for e in evaluations]
     headers = ["role", "file", "samples", "rate Hz", "from s", "to s", "stretches", "SHA-256"]
     return table("Files read", headers, rows)
+
+
+def version_table() -> str:
+    """Return the table of the versions that ran.
+
+    Returns:
+        HTML.
+    """
+    rows = [[text(name), code(version)] for name, version in versions().items()]
+    return table("Versions that ran", ["what", "version"], rows)
 
 
 def _value(value: float, error: float) -> list[Cell]:
@@ -287,3 +310,58 @@ def _sha256(path: str) -> str:
     if not path or not Path(path).exists():
         return "not read from a file"
     return file_sha256(path)
+
+
+def _consistency_notes(found: Identification) -> str:
+    """Return paragraphs on the fit's prior, bounds and mass matrix, and on what the data carry."""
+    said = [_reach(found), _mass_matrix(found)]
+    details = found.estimate.details
+    if "prior" in details:
+        prior = details["prior"]
+        chosen = _CHOSEN.get(prior.get("chosen_by", ""), "as set")
+        said.append(
+            f"The distance from the URDF's values is measured by {_METRICS[prior['metric']]}; its "
+            f"weight is {prior['weight']:.3g}, {chosen}."
+        )
+        active = ", ".join(details["active"])
+        said.append(f"Constraints that bind: {active}." if active else "No constraint binds.")
+        if details["pinned"]:
+            said.append(f"Kept at the URDF's values: {', '.join(details['pinned'])}.")
+    if "check" in details:
+        check = details["check"]
+        difference = check.get("torque_difference")
+        said.append(
+            f"Second opinion of {check['solver']}: {check['status']}"
+            + ("." if difference is None else f"; torques differ by {100 * difference:.2g} %.")
+        )
+    if "gaps" in details:
+        gaps = ", ".join(f"{gap:.1e}" for gap in details["gaps"])
+        said.append(f"Gap of log-Cholesky to the cone programme, per start: {gaps}.")
+    return "".join(f"<p>{escape(text)}</p>\n" for text in said)
+
+
+def _reach(found: Identification) -> str:
+    counts = {kind: found.sources.count(kind) for kind in ("data", "mixed", "prior")}
+    carried = [
+        body
+        for body in found.model.layout.bodies
+        if all(
+            source == "prior"
+            for name, source in zip(found.model.layout.names, found.sources, strict=True)
+            if name.rsplit(".", 1)[0] == body
+        )
+    ]
+    text = (
+        f"How far the data carry: of {len(found.sources)} parameters {counts['data']} come from "
+        f"the data, {counts['mixed']} from data and URDF together, {counts['prior']} from the URDF."
+    )
+    return text + (f" Nothing is known of {', '.join(carried)} but the URDF." if carried else "")
+
+
+def _mass_matrix(found: Identification) -> str:
+    check = found.mass_matrix
+    where = "at every one" if check.is_positive else f"at {100 * check.positive_share:.3g} %"
+    return (
+        f"The mass matrix, armatures included, is positive definite {where} of {check.poses} "
+        f"random poses (smallest eigenvalue {check.smallest_eigenvalue:.3g})."
+    )

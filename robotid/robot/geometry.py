@@ -1,6 +1,6 @@
 """The extent of each body by the URDF's collision or visual geometry, for bounds on its mass."""
 
-import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.robot.bodies import link_places
-from robotid.robot.meshes import find_mesh
+from robotid.robot.meshes import Shape, find_mesh, read_shapes
 from robotid.robot.model import RobotModel
 
 __all__ = ["body_points", "box_half_spaces", "geometry_half_spaces", "hull_half_spaces"]
@@ -57,15 +57,15 @@ def body_points(model: RobotModel) -> dict[str, Array]:
     Returns:
         Points by name of the body, shape (k, 3) [m].
     """
-    source = Path(model.tree.path)
-    links = {element.get("name"): element for element in ET.parse(source).getroot().iter("link")}
+    robot = model.tree.robot
+    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
     found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
     open_bodies = set()
     for place in link_places(model):
         if place.body < 0:
             continue
         body = model.layout.bodies[place.body]
-        points = _link_points(links[place.link], source)
+        points = _link_points(shapes.get(place.link, ()), Path(model.tree.path))
         if points is None or (not len(points) and place.parameters.any()):
             open_bodies.add(body)
         elif len(points):
@@ -115,56 +115,50 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
     return A, (A @ points.T).max(axis=1)
 
 
-def _link_points(link: ET.Element, source: Path) -> Array | None:
-    """Return points of a link's geometry in its frame; None if a mesh is not found."""
-    elements = link.findall("collision") or link.findall("visual")
+def _by_link(shapes: Iterable[Shape]) -> dict[str, list[Shape]]:
+    by_link: dict[str, list[Shape]] = {}
+    for shape in shapes:
+        by_link.setdefault(shape.link, []).append(shape)
+    return by_link
+
+
+def _link_points(shapes: Sequence[Shape], urdf: Path) -> Array | None:
+    """Return points of a link's shapes in its frame; None if one is not understood or found."""
     parts = [np.zeros((0, 3))]
-    for element in elements:
-        shape = element.find("geometry/*")
-        points = None if shape is None else _shape_points(shape, source)
+    for shape in shapes:
+        points = _shape_points(shape, urdf)
         if points is None:
             return None
-        parts.append(_moved(points, _origin(element)))
+        parts.append(_moved(points, shape.placement))
     return np.vstack(parts)
 
 
-def _shape_points(shape: ET.Element, source: Path) -> Array | None:
-    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
-    if shape.tag == "box":
-        return 0.5 * corners * _three(shape.get("size", ""))
-    if shape.tag == "sphere":
-        return corners * float(shape.get("radius", "nan"))
-    if shape.tag == "cylinder":
-        turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
-        radius = float(shape.get("radius", "nan")) / np.cos(np.pi / _SIDES)
-        ring = radius * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-        half = 0.5 * float(shape.get("length", "nan")) * np.array([0.0, 0.0, 1.0])
-        return np.vstack([ring - half, ring + half])
-    if shape.tag != "mesh":
-        return None
-    path = find_mesh(shape.get("filename", ""), source)
+def _shape_points(shape: Shape, urdf: Path) -> Array | None:
+    corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    size: Array = np.array(shape.size)
+    match shape.kind:
+        case "box":
+            corners *= 0.5 * size
+            return corners
+        case "sphere":
+            corners *= size[0]
+            return corners
+        case "cylinder":
+            turn = 2 * np.pi * np.arange(_SIDES) / _SIDES
+            radius, length = size
+            ring = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+            ring *= radius / np.cos(np.pi / _SIDES)
+            half = 0.5 * length * np.array([0.0, 0.0, 1.0])
+            return np.vstack([ring - half, ring + half])
+    path = find_mesh(shape.file, urdf) if shape.kind == "mesh" else None
     if path is None:
         return None
     import trimesh
 
     vertices: Array = np.array(trimesh.load_mesh(path).vertices)
-    scaled: Array = vertices * _three(shape.get("scale", "1 1 1"))
-    return scaled
-
-
-def _origin(element: ET.Element) -> Array:
-    origin = element.find("origin")
-    H = np.eye(4)
-    if origin is not None:
-        H[:3, :3] = pin.rpy.rpyToMatrix(*_three(origin.get("rpy", "0 0 0")))
-        H[:3, 3] = _three(origin.get("xyz", "0 0 0"))
-    return H
+    return vertices * size
 
 
 def _moved(points: Array, H: Array) -> Array:
     moved: Array = points @ H[:3, :3].T + H[:3, 3]
     return moved
-
-
-def _three(text: str) -> Array:
-    return np.array([float(word) for word in text.split()]).reshape(3)

@@ -7,8 +7,16 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import ParameterLayout
 
-__all__ = ["MassMatrixCheck", "carried_inertia", "check_mass_matrix", "joint_mass_matrices"]
+__all__ = [
+    "MassMatrixCheck",
+    "carried_inertia",
+    "check_mass_matrix",
+    "drive_inertia",
+    "joint_mass_matrices",
+    "rigid_mass_matrices",
+]
 
 POSES = 10_000
 
@@ -76,30 +84,47 @@ def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
     Returns:
         Matrices, shape (N, n_rows, n_rows).
     """
-    pin_model = model.with_parameters(pi).pin_model
-    data, G = pin_model.createData(), model.velocity_map
-    M = np.empty((len(q), pin_model.nv, pin_model.nv))
-    for k, configuration in enumerate(model.configurations(q)):
-        M[k] = pin.crba(pin_model, data, configuration, pin.Convention.LOCAL)
-    upper = np.triu(M)
-    full = upper + np.triu(M, 1).transpose(0, 2, 1)
-    drives: Array = G.T @ full @ G + _armatures(model, pi)
-    return drives
-
-
-def _armatures(model: RobotModel, pi: Array) -> Array:
-    """Return what the drives' inertias add, shape (n_rows, n_rows)."""
-    added = np.zeros((model.n_rows, model.n_rows))
+    bodies = model.with_parameters(pi)
+    M = rigid_mass_matrices(bodies, bodies.configurations(q))
     first = model.n_rows - len(model.joints)
-    ratios = {joint: {joint: 1.0} for joint in model.joints}
-    ratios |= {coupling.name: dict(coupling.ratios) for coupling in model.layout.couplings}
-    for name, value in zip(model.layout.names, pi, strict=True):
-        owner, term = name.rsplit(".", 1)
-        if term == "armature":
-            w = np.zeros(model.n_rows)
-            for joint, ratio in ratios[owner].items():
-                w[first + model.joints.index(joint)] = ratio
-            added += value * np.outer(w, w)
+    M[:, first:, first:] += drive_inertia(model.layout, pi)
+    return M
+
+
+def rigid_mass_matrices(
+    model: RobotModel, configurations: Array, data: pin.Data | None = None
+) -> Array:
+    """Return the mass matrix of the bodies alone, without drives, in the joints' coordinates.
+
+    Args:
+        model: The robot.
+        configurations: Pinocchio's configurations, shape (N, nq), as of ``model.configurations``.
+        data: Pinocchio's work space of the model; a new one if None.
+
+    Returns:
+        Matrices, shape (N, n_rows, n_rows).
+    """
+    data = model.pin_model.createData() if data is None else data
+    M = np.empty((len(configurations), model.pin_model.nv, model.pin_model.nv))
+    for M_k, configuration in zip(M, configurations, strict=True):
+        M_k[:] = pin.crba(model.pin_model, data, configuration)
+    mass: Array = model.velocity_map.T @ M @ model.velocity_map
+    return mass
+
+
+def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
+    """Return what the drives' inertias add to the mass matrix of the joints.
+
+    Args:
+        layout: The standard parameters of a robot with n joints.
+        pi: Their values, shape (p,).
+
+    Returns:
+        Matrix, shape (n, n) [kg m^2, or kg].
+    """
+    R = layout.drive_ratios  # (d, n)
+    Ia = sum((x for term, x in layout.by_drive(pi) if term.is_inertia), np.zeros(len(R)))
+    added: Array = R.T @ (Ia[:, None] * R)
     return added
 
 
@@ -112,9 +137,5 @@ def carried_inertia(model: RobotModel) -> Array:
     Returns:
         Inertias, shape (n,), at least 0 [kg m^2, or kg].
     """
-    pin_model = model.pin_model
-    M = pin.crba(pin_model, pin_model.createData(), pin.neutral(pin_model))
-    M = np.triu(M) + np.triu(M, 1).T
-    G = model.velocity_map
-    diagonal = np.diag(G.T @ M @ G)[model.n_rows - len(model.joints) :]
-    return np.maximum(diagonal, 0.0)
+    (M,) = rigid_mass_matrices(model, pin.neutral(model.pin_model)[None])
+    return np.maximum(np.diag(M)[model.n_rows - len(model.joints) :], 0.0)

@@ -1,4 +1,4 @@
-"""What a robot looks like: the ``<visual>`` shapes of its URDF, meshes found, read and thinned."""
+"""What a robot looks like: the shapes in its URDF, meshes found, read and thinned."""
 
 import os
 import re
@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import MissingDependencyError
 from robotid.robot.examples import example_urdfs
+from robotid.robot.tree import numbers
 
-__all__ = ["Surface", "Visual", "find_mesh", "read_surfaces", "read_visuals", "thin"]
+__all__ = ["Shape", "Surface", "find_mesh", "read_shapes", "read_surfaces", "thin"]
 
 GREY = (0.6, 0.65, 0.7, 1.0)  # what has no colour
 _CREASE = np.radians(30.0)  # faces that meet at a sharper angle than this show an edge
@@ -36,13 +38,13 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Visual:
-    """One ``<visual>`` of a link.
+class Shape:
+    """One ``<visual>`` or ``<collision>`` of a link.
 
     Attributes:
         link: Name of the link.
         placement: Pose in the link's frame, shape (4, 4).
-        shape: "mesh", "box", "cylinder" or "sphere".
+        kind: "mesh", "box", "cylinder" or "sphere"; "" if it is not understood.
         size: Scale of a mesh [-]; edges of a box, radius and length of a cylinder, radius of a
             sphere [m].
         file: What the URDF calls the mesh; empty if it is none.
@@ -51,35 +53,33 @@ class Visual:
 
     link: str
     placement: Array
-    shape: str
+    kind: str
     size: tuple[float, ...]
     file: str
     rgba: tuple[float, ...] | None
 
 
-def read_visuals(path: str | Path) -> tuple[Visual, ...]:
-    """Return the visual shapes of a URDF; one that is not understood is left out.
+def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
+    """Return the shapes in a URDF.
 
     Args:
-        path: The URDF file, which a model was built from.
+        robot: The ``<robot>`` of the file.
+        tag: Which of them: "visual" or "collision".
 
     Returns:
         The shapes, in the order of the file.
     """
-    root = ET.fromstring(Path(path).read_bytes())
-    colours = {m.get("name"): _colour(m) for m in root.findall("material")}
+    colours = {m.get("name"): _colour(m) for m in robot.findall("material")}
     found = []
-    for link in root.findall("link"):
-        for visual in link.findall("visual"):
-            shape = _shape(visual)
-            if shape is None:
-                continue
-            material = visual.find("material")
+    for link in robot.findall("link"):
+        for element in link.findall(tag):
+            material = element.find("material")
             rgba = None
             if material is not None:
                 rgba = _colour(material) or colours.get(material.get("name"))
-            placement = _placement(visual.find("origin"))
-            found.append(Visual(link.get("name", ""), placement, *shape, rgba))
+            placement, known = _placement(element.find("origin"))
+            kind, size, file = _geometry(element) if known else ("", (), "")
+            found.append(Shape(link.get("name", ""), placement, kind, size, file, rgba))
     return tuple(found)
 
 
@@ -181,52 +181,41 @@ def _folders(urdf: Path) -> Iterator[Path]:
         yield root
 
 
-def _shape(visual: ET.Element) -> tuple[str, tuple[float, ...], str] | None:
-    for element in visual.iterfind("geometry/*"):
-        get = element.get
-        match element.tag:
+def _geometry(element: ET.Element) -> tuple[str, tuple[float, ...], str]:
+    """Return the kind, size and file of what a shape shows."""
+    for shape in element.iterfind("geometry/*"):
+        get = shape.get
+        match shape.tag:
             case "mesh":
-                size, count = _numbers(get("scale", "1 1 1")), 3
+                size, count = numbers(get("scale", "1 1 1")), 3
             case "box":
-                size, count = _numbers(get("size", "")), 3
+                size, count = numbers(get("size", "")), 3
             case "cylinder":
-                size, count = _numbers(f"{get('radius', '')} {get('length', '')}"), 2
+                size, count = numbers(f"{get('radius', '')} {get('length', '')}"), 2
             case "sphere":
-                size, count = _numbers(get("radius", "")), 1
+                size, count = numbers(get("radius", "")), 1
             case _:
                 continue
-        if len(size) == count and (element.tag != "mesh" or get("filename")):
-            return element.tag, size, get("filename", "")
-    return None
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(word) for word in text.split())
-    except ValueError:
-        return ()
-    return numbers if np.isfinite(numbers).all() else ()
+        if len(size) == count and (shape.tag != "mesh" or get("filename")):
+            return shape.tag, size, get("filename", "")
+    return "", (), ""
 
 
 def _colour(material: ET.Element) -> tuple[float, ...] | None:
     colour = material.find("color")
-    rgba = () if colour is None else _numbers(colour.get("rgba", ""))
+    rgba = () if colour is None else numbers(colour.get("rgba", ""))
     return tuple(min(max(x, 0.0), 1.0) for x in rgba) if len(rgba) == 4 else None
 
 
-def _placement(origin: ET.Element | None) -> Array:
+def _placement(origin: ET.Element | None) -> tuple[Array, bool]:
+    """Return the pose, shape (4, 4), and whether it is understood."""
     M = np.eye(4)
-    if origin is None:
-        return M
-    roll, pitch, yaw = _numbers(origin.get("rpy", "0 0 0")) or (0.0, 0.0, 0.0)
-    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(x), np.sin(x)) for x in (roll, pitch, yaw))
-    M[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    M[:3, 3] = _numbers(origin.get("xyz", "0 0 0")) or (0.0, 0.0, 0.0)
-    return M
+    pose = {} if origin is None else origin.attrib
+    xyz, rpy = (numbers(pose.get(key, "0 0 0")) for key in ("xyz", "rpy"))
+    known = len(xyz) == len(rpy) == 3
+    if known:
+        M[:3, :3], M[:3, 3] = pin.rpy.rpyToMatrix(*rpy), xyz
+    return M, known
 
 
 def _mesh_colour(mesh: "object") -> tuple[float, ...] | None:

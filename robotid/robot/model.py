@@ -12,7 +12,8 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
-from robotid.robot.parameters import DRIVE_TERMS, Coupling, ParameterLayout
+from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.parameters import Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
 
 __all__ = ["GRAVITY", "RobotModel"]
@@ -233,10 +234,8 @@ class RobotModel:
         inertial = (np.abs(self.velocity_map.T) > 0).astype(float) @ carried > 0
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
         first = self.n_rows - len(self.joints)
-        for k, name in enumerate(self.layout.drive_names):
-            owner = name.rsplit(".", 1)[0]
-            coupled = {c.name: [j for j, _ in c.ratios] for c in self.layout.couplings}
-            for joint_name in coupled.get(owner, [owner]):
+        for k, (d, _) in enumerate(self.layout.drive_parameters):
+            for joint_name, _ratio in self.layout.drives[d].ratios:
                 drive[first + self.joints.index(joint_name), k] = True
         return np.hstack([inertial, drive])
 

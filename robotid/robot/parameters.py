@@ -8,9 +8,9 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 
 __all__ = [
-    "DRIVE_TERMS",
     "INERTIAL_TERMS",
     "PAPER_TERMS",
     "Coupling",
@@ -26,23 +26,13 @@ __all__ = [
 INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 #: The same ten in the paper's order (9).
 PAPER_TERMS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
-#: Parameters of one drive.
-DRIVE_TERMS = ("armature", "viscous", "coulomb", "offset")
-
-_ROTARY_UNITS = {
-    "armature": "kg m^2",
-    "viscous": "N m s/rad",
-    "coulomb": "N m",
-    "offset": "N m",
-}
-_LINEAR_UNITS = {"armature": "kg", "viscous": "N s/m", "coulomb": "N", "offset": "N"}
 
 
 @dataclass(frozen=True)
 class Coupling:
     """A drive that turns with several joints, at the speed w = sum_j ratio_j v_j.
 
-    Its armature Ia, viscous Fv and Coulomb Fc load every joint it turns with:
+    Its drive terms load every joint it turns with:
     ``tau_j += ratio_j (Ia dw/dt + Fv w + Fc sign w)``.
 
     Attributes:
@@ -64,7 +54,7 @@ class ParameterLayout:
     Attributes:
         bodies: Names of the bodies, one per movable joint (and one for a floating base).
         joints: Names of the driven joints.
-        terms: The drive terms that are identified, a subset of ``DRIVE_TERMS`` in its order.
+        terms: The drive terms that are identified, names in ``TERMS`` in its order.
         couplings: Drives that turn with several joints.
         prismatic: Names of the joints that slide.
     """
@@ -76,9 +66,9 @@ class ParameterLayout:
     prismatic: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        unknown = [term for term in self.terms if term not in DRIVE_TERMS]
+        unknown = [term for term in self.terms if term not in TERMS]
         if unknown:
-            raise SettingsError(f"unknown drive terms {unknown}; known: {list(DRIVE_TERMS)}")
+            raise SettingsError(f"unknown drive terms {unknown}; known: {list(TERMS)}")
         for coupling in self.couplings:
             missing = [joint for joint, _ in coupling.ratios if joint not in self.joints]
             if missing:
@@ -99,7 +89,32 @@ class ParameterLayout:
     @property
     def coupling_terms(self) -> tuple[str, ...]:
         """Drive terms of a coupling: those of a joint without the offset."""
-        return tuple(term for term in self.terms if term != "offset")
+        return tuple(term for term in self.terms if TERMS[term].is_shared)
+
+    @cached_property
+    def drives(self) -> tuple[Coupling, ...]:
+        """The drives: one per joint, which turns with it alone, then the couplings."""
+        return (*(Coupling(joint, ((joint, 1.0),)) for joint in self.joints), *self.couplings)
+
+    @cached_property
+    def drive_ratios(self) -> Array:
+        """Ratios of the d drives' speeds to those of the joints, w = ratios v, shape (d, n) [-]."""
+        ratios = np.zeros((len(self.drives), len(self.joints)))
+        for row, drive in zip(ratios, self.drives, strict=True):
+            for joint, ratio in drive.ratios:
+                row[self.joints.index(joint)] = ratio
+        ratios.setflags(write=False)
+        return ratios
+
+    @cached_property
+    def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
+        """Which of ``drives`` each drive parameter belongs to, and its term."""
+        n = len(self.joints)
+        return tuple(
+            (d, TERMS[term])
+            for d in range(len(self.drives))
+            for term in (self.terms if d < n else self.coupling_terms)
+        )
 
     @cached_property
     def inertial_names(self) -> tuple[str, ...]:
@@ -109,9 +124,7 @@ class ParameterLayout:
     @cached_property
     def drive_names(self) -> tuple[str, ...]:
         """Names of the drive parameters, as ``"elbow.viscous"``."""
-        own = [f"{joint}.{term}" for joint in self.joints for term in self.terms]
-        coupled = [f"{c.name}.{term}" for c in self.couplings for term in self.coupling_terms]
-        return tuple(own + coupled)
+        return tuple(f"{self.drives[d].name}.{term.name}" for d, term in self.drive_parameters)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -121,7 +134,23 @@ class ParameterLayout:
     @cached_property
     def units(self) -> tuple[str, ...]:
         """Unit of each of the p parameters."""
-        return tuple(self._unit(*name.rsplit(".", 1)) for name in self.names)
+        inertial = ["kg", *["kg m"] * 3, *["kg m^2"] * 6] * len(self.bodies)
+        drive = [term.units[self._slides(d)] for d, term in self.drive_parameters]
+        return tuple(inertial + drive)
+
+    def by_drive(self, pi: Array) -> list[tuple[DriveTerm, Array]]:
+        """Return the drive parameters term by term.
+
+        Args:
+            pi: Standard parameters, shape (p,).
+
+        Returns:
+            Each term with its values in the d drives, shape (d,); 0 where a drive lacks it.
+        """
+        values = {name: np.zeros(len(self.drives)) for name in self.terms}
+        for (d, term), value in zip(self.drive_parameters, pi[self.n_inertial :], strict=True):
+            values[term.name][d] = value
+        return [(TERMS[name], of_drives) for name, of_drives in values.items()]
 
     def owned_by(self, owners: Sequence[str]) -> Array:
         """Return which parameters belong to some bodies or joints.
@@ -144,11 +173,10 @@ class ParameterLayout:
             Scales, shape (p,): 1 for a mass, length for m c, length^2 for an inertia and for the
             armature of a rotary joint, 1 for other drive terms.
         """
-        powers = {"m": 0, **dict.fromkeys(("mcx", "mcy", "mcz"), 1)}
-        inertial = [length ** powers.get(term, 2) for term in INERTIAL_TERMS]
+        inertial = [1.0, *[length] * 3, *[length**2] * 6]
         drive = [
-            length**2 if name.endswith(".armature") and not self._is_linear(name) else 1.0
-            for name in self.drive_names
+            length**2 if term.is_inertia and not self._slides(d) else 1.0
+            for d, term in self.drive_parameters
         ]
         return np.array(inertial * len(self.bodies) + drive)
 
@@ -161,8 +189,8 @@ class ParameterLayout:
         Returns:
             Factors, shape (p,).
         """
-        favour = {"m": 0.1, "mcx": 0.3, "mcy": 0.3, "mcz": 0.3, "armature": 0.3}
-        return np.array([favour.get(name.rsplit(".", 1)[1], 1.0) for name in self.names])
+        inertial = [0.1, *[0.3] * 3, *[1.0] * 6] * len(self.bodies)
+        return np.array(inertial + [term.preference for _, term in self.drive_parameters])
 
     def is_nonnegative(self) -> Array:
         """Return which parameters cannot be negative by physics: armature, viscous, coulomb.
@@ -170,18 +198,11 @@ class ParameterLayout:
         Returns:
             Flags, shape (p,), bool.
         """
-        return np.array([n.endswith((".armature", ".viscous", ".coulomb")) for n in self.names])
+        drive = [term.is_nonnegative for _, term in self.drive_parameters]
+        return np.array([False] * self.n_inertial + drive)
 
-    def _is_linear(self, name: str) -> bool:
-        owner = name.rsplit(".", 1)[0]
-        coupled = {c.name: {joint for joint, _ in c.ratios} for c in self.couplings}
-        return coupled.get(owner, {owner}) <= self.prismatic
-
-    def _unit(self, owner: str, term: str) -> str:
-        if term in DRIVE_TERMS:
-            units = _LINEAR_UNITS if self._is_linear(f"{owner}.{term}") else _ROTARY_UNITS
-            return units[term]
-        return {"m": "kg"}.get(term, "kg m" if term.startswith("mc") else "kg m^2")
+    def _slides(self, d: int) -> bool:
+        return {joint for joint, _ in self.drives[d].ratios} <= self.prismatic
 
 
 def to_paper_order(pi: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What of a URDF the dynamics need: links, inertials, joints; read strictly, the rest ignored.
+"""The one parse of a URDF, and what of it the dynamics need: links, inertials, joints.
 
 Pinocchio's parser wants meshes' neighbours, limits and ``<dynamics>`` to be right, although the
 dynamics never use them, and only prints what it misses. So the XML is read here, every fault that
@@ -8,16 +8,26 @@ matters is refused by name, and Pinocchio gets the kinematic tree alone.
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from robotid.exceptions import ModelError
 
-__all__ = ["Inertial", "Joint", "Tree", "read_tree", "read_with_yourdfpy"]
+__all__ = [
+    "MOVABLE",
+    "Inertial",
+    "Joint",
+    "Tree",
+    "numbers",
+    "parse_urdf",
+    "read_tree",
+    "read_with_yourdfpy",
+]
 
-_MOVABLE = ("revolute", "continuous", "prismatic")
+#: The types of joint that have a degree of freedom.
+MOVABLE = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,7 @@ class Joint:
     @property
     def is_movable(self) -> bool:
         """Whether the joint has a degree of freedom."""
-        return self.type in _MOVABLE
+        return self.type in MOVABLE
 
     @property
     def has_limits(self) -> bool:
@@ -90,7 +100,7 @@ class Tree:
         links: Names of the links, in the file's order.
         joints: The joints, in the file's order.
         inertials: The ``<inertial>`` of each link that has one, by its name.
-        xml: A URDF with nothing but links, inertials and joints.
+        robot: The ``<robot>`` as parsed, for what the dynamics do not need.
     """
 
     path: str
@@ -99,7 +109,7 @@ class Tree:
     links: tuple[str, ...]
     joints: tuple[Joint, ...]
     inertials: Mapping[str, Inertial]
-    xml: str
+    robot: ET.Element = field(repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "inertials": dict(self.inertials)}
@@ -111,6 +121,14 @@ class Tree:
     def movable(self) -> tuple[Joint, ...]:
         """The joints that have a degree of freedom, in the file's order."""
         return tuple(joint for joint in self.joints if joint.is_movable)
+
+    @property
+    def xml(self) -> str:
+        """A URDF with nothing but the links, inertials and joints."""
+        minimal = ET.Element("robot", name=self.name)
+        minimal.extend(_copy(link, ("inertial",)) for link in self.robot.findall("link"))
+        minimal.extend(_minimal_joint(joint) for joint in self.robot.findall("joint"))
+        return ET.tostring(minimal, encoding="unicode")
 
 
 def read_tree(path: str | Path) -> Tree:
@@ -127,7 +145,7 @@ def read_tree(path: str | Path) -> Tree:
             number that the dynamics use is missing, not a number or not finite.
     """
     source = Path(path)
-    robot = _parse(source)
+    robot = parse_urdf(source)
     where = source.name
     name = robot.get("name")
     if not name:
@@ -147,11 +165,6 @@ def read_tree(path: str | Path) -> Tree:
         for link, element in links.items()
         if (inertial := element.find("inertial")) is not None
     }
-    minimal = ET.Element("robot", name=name)
-    for element in links.values():
-        minimal.append(_copy(element, ("inertial",)))
-    for element in elements.values():
-        minimal.append(_minimal_joint(element))
     return Tree(
         path=str(source),
         name=name,
@@ -159,11 +172,23 @@ def read_tree(path: str | Path) -> Tree:
         links=tuple(links),
         joints=joints,
         inertials=MappingProxyType(inertials),
-        xml=ET.tostring(minimal, encoding="unicode"),
+        robot=robot,
     )
 
 
-def _parse(path: Path) -> ET.Element:
+def parse_urdf(path: str | Path) -> ET.Element:
+    """Return the ``<robot>`` of a URDF file, whatever is in it.
+
+    Args:
+        path: The URDF file.
+
+    Returns:
+        The element.
+
+    Raises:
+        ModelError: If the file is missing, or is no XML or another one.
+    """
+    path = Path(path)
     if not path.is_file():
         raise ModelError(f"there is no URDF file {str(path)!r}")
     if path.suffix == ".xacro":
@@ -192,7 +217,7 @@ def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.E
 def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joint:
     name, kind = element.get("name", ""), element.get("type", "")
     at = f"{where}: joint {name!r}"
-    if kind not in (*_MOVABLE, "fixed"):
+    if kind not in (*MOVABLE, "fixed"):
         raise ModelError(
             f"{at} has type {kind!r}; robotid handles fixed, revolute, continuous and prismatic "
             "joints (a floating base is asked for with free_flyer=True, not with a joint)"
@@ -260,16 +285,29 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
     ]
     (value,) = _numbers(mass.get("value", ""), 1, f"{at} mass")
     if value < 0:
-        raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; mend the sign")
-    return Inertial(value, tuple(com), tuple(rpy), tuple(moments))
+        raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; correct the sign")
+    return Inertial(value, com, rpy, tuple(moments))
 
 
-def _numbers(text: str, count: int, what: str) -> list[float]:
+def numbers(text: str) -> tuple[float, ...]:
+    """Return the numbers of an attribute.
+
+    Args:
+        text: The attribute, numbers with blanks between them.
+
+    Returns:
+        The numbers; none if a word is no finite number.
+    """
     try:
-        values = [float(word) for word in text.split()]
-    except ValueError as error:
-        raise ModelError(f"{what} is {text!r}, wanted {count} number(s)") from error
-    if len(values) != count or not all(map(math.isfinite, values)):
+        values = tuple(float(word) for word in text.split())
+    except ValueError:
+        return ()
+    return values if all(map(math.isfinite, values)) else ()
+
+
+def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
+    values = numbers(text)
+    if len(values) != count:
         raise ModelError(f"{what} is {text!r}, wanted {count} finite number(s)")
     return values
 
@@ -282,7 +320,7 @@ def _copy(element: ET.Element, children: tuple[str, ...]) -> ET.Element:
 
 def _minimal_joint(element: ET.Element) -> ET.Element:
     copy = _copy(element, ("origin", "parent", "child", "axis"))
-    if element.get("type") in _MOVABLE:
+    if element.get("type") in MOVABLE:
         # the parser demands limits; the dynamics do not use them, `Joint` keeps the stated ones
         ET.SubElement(copy, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")
     return copy

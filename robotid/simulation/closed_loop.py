@@ -128,10 +128,8 @@ def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
     tool = [mass, 0.0, mass * reach, 0.0, mass * reach**2, 0.0, 0.0, 0.0, 0.0, mass * reach**2]
     by_body[-1] += tool
     by_body[-1] += [0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-3]  # a tool has an extent
-    size_of = {"armature": (0.1, 0.5), "viscous": (0.5, 4.0), "coulomb": (0.5, 5.0)}
-    for i, name in enumerate(model.layout.names[size:], start=size):
-        low, high = size_of.get(name.rsplit(".", 1)[1], (-0.3, 0.3))
-        pi[i] = rng.uniform(low, high)
+    for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
+        pi[i] = rng.uniform(*term.usual)
     return pi
 
 

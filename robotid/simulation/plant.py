@@ -5,6 +5,8 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.robot.drives import DriveMotion
+from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
 __all__ = ["RobotPlant"]
@@ -15,8 +17,8 @@ _SIGN_SPEED = 2e-3  # [rad/s or m/s] speed over which the plant's Coulomb fricti
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    sign(v) is tanh(v / 2 mm/s), so that it can be integrated; drives that turn with several joints
-    load all of them.
+    The drives' terms are those of the model; sign(v) is tanh(v / 2 mm/s), so that it can be
+    integrated; drives that turn with several joints load all of them.
 
     Attributes:
         model: The robot.
@@ -37,9 +39,10 @@ class RobotPlant:
         if pi.shape != (len(model.layout.names),):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
         self.model = model
-        self._pin_model = model.with_parameters(pi).pin_model
-        self._data = self._pin_model.createData()
-        self._drives = _drives(model, pi)
+        self._bodies = model.with_parameters(pi)
+        self._data = self._bodies.pin_model.createData()
+        self._drives = model.layout.by_drive(pi)
+        self._armature = drive_inertia(model.layout, pi)
 
     def mass_matrix(self, q: Array) -> Array:
         """Return D(q), the mass matrix with the drives' armature.
@@ -50,11 +53,8 @@ class RobotPlant:
         Returns:
             Mass matrix, shape (n, n).
         """
-        G = self.model.velocity_map
-        M = pin.crba(self._pin_model, self._data, self.model.configurations(q[None])[0])
-        M = np.triu(M) + np.triu(M, 1).T
-        armature = sum(Ia * np.outer(r, r) for r, Ia, _, _, _ in self._drives)
-        mass: Array = G.T @ M @ G + armature
+        x = self.model.configurations(q[None])
+        mass: Array = rigid_mass_matrices(self._bodies, x, self._data)[0] + self._armature
         return mass
 
     def bias(self, q: Array, v: Array) -> Array:
@@ -67,12 +67,12 @@ class RobotPlant:
         Returns:
             Torque, shape (n,) [N m or N].
         """
-        G = self.model.velocity_map
-        configuration = self.model.configurations(q[None])[0]
-        bias: Array = G.T @ pin.nonLinearEffects(self._pin_model, self._data, configuration, G @ v)
-        for r, _, Fv, Fc, offset in self._drives:
-            speed = r @ v
-            bias = bias + r * (Fv * speed + Fc * np.tanh(speed / _SIGN_SPEED) + offset)
+        G, R = self.model.velocity_map, self.model.layout.drive_ratios
+        pin_model, x = self._bodies.pin_model, self.model.configurations(q[None])[0]
+        w = R @ v  # (d,)
+        motion = DriveMotion(w, np.zeros_like(w), np.tanh(w / _SIGN_SPEED))
+        drives = sum((theta * term.column(motion) for term, theta in self._drives), 0.0 * w)
+        bias: Array = G.T @ pin.nonLinearEffects(pin_model, self._data, x, G @ v) + R.T @ drives
         return bias
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
@@ -92,17 +92,3 @@ class RobotPlant:
         if q.ndim == 1:
             return np.linalg.solve(self.mass_matrix(q), u - self.bias(q, v))
         return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
-
-
-def _drives(model: RobotModel, pi: Array) -> list[tuple[Array, float, float, float, float]]:
-    """Return ratios over the joints, armature, viscous, Coulomb and offset of each drive."""
-    value = dict(zip(model.layout.names, pi.tolist(), strict=True))
-    ratios = {joint: {joint: 1.0} for joint in model.joints}
-    ratios.update({c.name: dict(c.ratios) for c in model.layout.couplings})
-    drives = []
-    for owner, by_joint in ratios.items():
-        r = np.array([by_joint.get(joint, 0.0) for joint in model.joints])
-        terms = (value.get(f"{owner}.{term}", 0.0) for term in ("armature", "viscous", "coulomb"))
-        Ia, Fv, Fc = terms
-        drives.append((r, Ia, Fv, Fc, value.get(f"{owner}.offset", 0.0)))
-    return drives

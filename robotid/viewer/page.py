@@ -7,6 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from robotid._html import scaffold
+
 __all__ = ["frame", "page"]
 
 _ASSETS = Path(__file__).parent / "assets"
@@ -22,23 +24,22 @@ def page(data: Mapping[str, Any]) -> str:
     Returns:
         The HTML.
     """
-    title = escape(f"{data['title']}: {'live' if data['live'] else 'replay'}")
+    title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
     notes = " ".join(f"<p>{escape(note)}</p>" for note in data["notes"])
-    policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    policy += "img-src data: blob:; " + ("connect-src 'self'" if data["live"] else "")
+    policy = "; script-src 'unsafe-inline'; img-src data: blob:"
+    policy += "; connect-src 'self'" if data["live"] else ""
     # "<" is an escape in JSON, so no text in it can end the script
     text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<title>{title}</title>\n<link rel="icon" href="data:,">\n'
-        f"<style>{_asset('uPlot.min.css')}\n{_asset('replay.css')}</style>\n</head>\n<body>\n"
-        f'<header><h1>{title}</h1>{notes}<p id="state" role="status"></p></header>\n'
+    return scaffold(
+        title,
+        '<link rel="icon" href="data:,">\n'
+        f"<style>{_asset('uPlot.min.css')}\n/*tones*/{_asset('replay.css')}</style>\n",
+        f'<header><h1>{escape(title)}</h1>{notes}<p id="state" role="status"></p></header>\n'
         f"{_BODY}\n"
         f'<script type="application/json" id="data">{text}</script>\n'
         f"<script>{_viewer()}</script>\n<script>{_asset('uPlot.iife.min.js')}</script>\n"
-        f"<script>{_asset('replay.js')}</script>\n</body>\n</html>\n"
+        f"<script>{_asset('replay.js')}</script>\n",
+        policy=policy,
     )
 
 

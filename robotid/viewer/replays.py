@@ -4,7 +4,6 @@ Meshcat's own export asks a server process for the page. Here its viewer is writ
 with what it shows, so that no process, no socket and no port is opened.
 """
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
@@ -108,16 +108,7 @@ class Replay:
         Raises:
             DataError: If its folder does not exist.
         """
-        path = Path(target)
-        if not path.parent.is_dir():
-            raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            beside.write_text(self.html, encoding="utf-8")
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
-        return path
+        return write_text(self.html, target)
 
     def _repr_html_(self) -> str:
         return frame(self.html, f"{self.data['title']}: replay", 620)

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.robot.meshes import Surface, Visual, find_mesh, read_surfaces, read_visuals, thin
+from robotid.robot.meshes import Shape, Surface, find_mesh, read_shapes, read_surfaces, thin
 from robotid.robot.model import RobotModel
 from robotid.viewer.ellipsoids import ellipsoids
 
@@ -146,10 +146,10 @@ class _Library:
         self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
         surfaces: list[Surface] = []
         ranges: dict[tuple[str, tuple[float, ...]], range] = {}
-        visuals = [v for v in read_visuals(model.tree.path) if v.link in model.tree.links]
+        visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
         for visual in visuals:
             key = (visual.file, visual.size)
-            if visual.shape == "mesh" and key not in ranges:
+            if visual.kind == "mesh" and key not in ranges:
                 new = self._read(model, visual)
                 ranges[key] = range(len(surfaces), len(surfaces) + len(new))
                 surfaces += new
@@ -162,7 +162,7 @@ class _Library:
             which = ranges.get((visual.file, visual.size), range(0))
             self.parts += _visual_parts(model, visual, which, surfaces)
 
-    def _read(self, model: RobotModel, visual: Visual) -> list[Surface]:
+    def _read(self, model: RobotModel, visual: Shape) -> list[Surface]:
         path = find_mesh(visual.file, model.tree.path)
         try:
             found = () if path is None else read_surfaces(path)
@@ -174,19 +174,19 @@ class _Library:
 
 
 def _visual_parts(
-    model: RobotModel, visual: Visual, which: range, surfaces: Sequence[Surface]
+    model: RobotModel, visual: Shape, which: range, surfaces: Sequence[Surface]
 ) -> Iterator[dict[str, Any]]:
     tree = model.pin_model
     frame = tree.frames[tree.getFrameId(visual.link, pin.FrameType.BODY)]
     M = frame.placement.homogeneous @ visual.placement
-    if visual.shape == "cylinder":  # of a URDF: along z
+    if visual.kind == "cylinder":  # of a URDF: along z
         M = M @ _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
-    if visual.shape == "mesh":
+    if visual.kind == "mesh":
         for k in which:
             colour = _hex(surfaces[k].rgba or visual.rgba)
             yield _part(frame.parentJoint, "mesh", [k], colour, M)
     else:
-        yield _part(frame.parentJoint, visual.shape, visual.size, _hex(visual.rgba), M)
+        yield _part(frame.parentJoint, visual.kind, visual.size, _hex(visual.rgba), M)
 
 
 def _corners(part: Mapping[str, Any], boxes: Sequence[Array]) -> Array:

@@ -7,17 +7,17 @@ import numpy as np
 
 from robotid._typing import Array
 
-__all__ = ["Surprise", "find_surprises"]
+__all__ = ["Unexplained", "find_unexplained"]
 
 _WINDOW = 0.2  # [s] over which a residual is averaged
 _TIMES = 6.0  # a mean residual so many times its median ...
-_SHARE = 0.3  # ... and above this share of the joint's torque is a surprise
-_APART = 1.0  # [s] surprises closer than this are one
+_SHARE = 0.3  # ... and above this share of the joint's torque is unexplained
+_APART = 1.0  # [s] stretches closer than this are one
 _SHORTEST = 0.05  # [s] what is shorter is a spike
 
 
 @dataclass(frozen=True)
-class Surprise:
+class Unexplained:
     """A stretch of unexplained torque.
 
     Attributes:
@@ -33,12 +33,12 @@ class Surprise:
     residual: float
 
 
-def find_surprises(
+def find_unexplained(
     t: Array, tau: Array, predicted: Array, joints: Sequence[str]
-) -> tuple[Surprise, ...]:
+) -> tuple[Unexplained, ...]:
     """Return where measured and predicted torque disagree as nowhere else in a motion.
 
-    The root mean square of each joint's residual over 0.2 s is a surprise if it is six times its
+    The root mean square of each joint's residual over 0.2 s is unexplained if it is six times its
     median over the motion and 0.3 of the torque's root mean square, for 0.05 s at least.
 
     Args:
@@ -48,7 +48,7 @@ def find_surprises(
         joints: Names of the n joints.
 
     Returns:
-        The surprises, in order of time.
+        The stretches, in order of time.
     """
     if len(t) < 2:
         return ()
@@ -70,7 +70,7 @@ def find_surprises(
         if end - start < _SHORTEST:
             continue
         k, j = divmod(int(np.argmax(np.where(is_large, share, 0.0)[part])), len(joints))
-        found.append(Surprise(start, end, joints[j], float(level[part[k], j])))
+        found.append(Unexplained(start, end, joints[j], float(level[part[k], j])))
     return tuple(found)
 
 

@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from robotid._files import written_whole
 from robotid.exceptions import DataError
-from robotid.workers.pieces import Piece, Reduction
+from robotid.regressor.reduction import Reduction
+from robotid.workers.pieces import Piece
 
 __all__ = ["FOLDER", "Checkpoint"]
 
@@ -74,7 +76,8 @@ class Checkpoint:
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-        _write(folder / "inputs.json", text.encode())
+        with written_whole(folder / "inputs.json") as beside:
+            beside.write_text(text)
         return found
 
     def finished(self) -> frozenset[int]:
@@ -114,15 +117,12 @@ class Checkpoint:
             name: Name of the piece.
             reduction: What it came down to.
         """
-        path = self._path(index)
-        beside = path.with_suffix(".partial")
         content: dict[str, Any] = reduction.to_arrays()
         content |= {"key": self.key, "piece": name}
-        with beside.open("wb") as file:
+        with written_whole(self._path(index)) as beside, beside.open("wb") as file:
             np.savez(file, **content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(beside, path)
 
     def remove(self) -> None:
         """Remove the folder, as when the run is complete."""
@@ -164,9 +164,3 @@ def _differences(kept: object, now: object, name: str = "") -> Iterator[str]:
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _write(path: Path, content: bytes) -> None:
-    beside = path.with_suffix(".partial")
-    beside.write_bytes(content)
-    os.replace(beside, path)

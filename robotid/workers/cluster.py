@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from robotid.exceptions import MissingDependencyError, WorkerError
-from robotid.versions import __version__
-from robotid.workers.processes import Backend
-from robotid.workers.task import Outcome, Work, Workload, run_task, versions
+from robotid.versions import __version__, code_versions
+from robotid.workers.pieces import Outcome, Work, Workload, run_task
+from robotid.workers.processes import Backend, named
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -24,7 +24,9 @@ class ClusterBackend(Backend):
     """Works on pieces on a Dask cluster; results come home as they are finished.
 
     Logs must be reachable from every worker under the same path. A piece whose worker is lost is
-    done again by another one; a result counts once, by the index of its piece.
+    done again by another one; a result counts once, by the index of its piece. At most two pieces
+    per thread of the cluster are under way. What cannot be done is a ``WorkerError``: no cluster,
+    workers with another robotid, a piece that loses every worker that tries it.
 
     Args:
         address: Address of the scheduler, as ``tcp://host:8786``.
@@ -37,25 +39,9 @@ class ClusterBackend(Backend):
 
     @property
     def description(self) -> str:
-        """What messages call it."""
         return f"the Dask cluster {self.address}, one BLAS thread per piece"
 
     def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
-        """Work on pieces, at most two per thread of the cluster under way.
-
-        Args:
-            work: What to do with a piece.
-            pieces: Index and piece.
-
-        Yields:
-            Index and result of each piece once, as they come.
-
-        Raises:
-            DataError: If a row cannot be used.
-            MissingDependencyError: If Dask is not installed.
-            WorkerError: If the cluster cannot be reached, its robotid is of another version, or it
-                loses the workers that try the same piece over and over.
-        """
         try:
             if self._client is None:
                 self._client = self._connect()
@@ -66,7 +52,6 @@ class ClusterBackend(Backend):
             raise
 
     def close(self) -> None:
-        """Leave the cluster; the next work comes back to it."""
         if self._client is not None:
             self._client.close(timeout=5)
             self._client = None
@@ -117,7 +102,8 @@ class ClusterBackend(Backend):
                 future = next(results)
                 index, piece, _ = running[future.key]
                 try:
-                    outcome: Outcome = future.result()
+                    with named(piece):
+                        outcome: Outcome = future.result()
                 except KilledWorker as error:
                     raise WorkerError(
                         f"the cluster lost every worker that worked on {piece.name} (killed, or "
@@ -127,9 +113,6 @@ class ClusterBackend(Backend):
                     raise WorkerError(
                         f"the cluster {self.address} was lost while it worked on {piece.name}"
                     ) from error
-                except Exception as error:
-                    error.add_note(f"while working on {piece.name}")
-                    raise
                 del running[future.key]
                 future.release()
                 outcome.log()
@@ -154,12 +137,12 @@ def _run(work: Work, piece: Workload, level: int, wanted: str) -> Outcome:
 
 
 def _about() -> dict[str, str]:
-    return {"host": socket.gethostname(), **versions()}
+    return {"host": socket.gethostname(), **code_versions()}
 
 
 def _require_same_version(address: str, client: "Client") -> None:
     """Refuse workers with another robotid; warn of those whose last bits may differ."""
-    here = versions()
+    here = code_versions()
     workers: Mapping[str, Any] = client.run(_about, on_error="return")
     broken = {name: about for name, about in workers.items() if isinstance(about, BaseException)}
     if broken:

@@ -1,90 +1,24 @@
-"""Long logs as pieces: each comes down to its factors, by itself, in any process, in any order.
+"""Pieces of long logs, and what a worker does with one, in whichever process or machine it runs.
 
 A piece is a fixed stretch of rows of one log, whatever the number of workers: what it comes down
 to never depends on who reduces it, nor on what else is reduced beside it.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+import logging
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
 
-import numpy as np
+from threadpoolctl import threadpool_limits
 
-from robotid._typing import Array
-from robotid.exceptions import DataError
-from robotid.logs.data import Trajectory
-from robotid.regressor.factors import Factors, compress, merge
-from robotid.regressor.problem import Problem
+from robotid.regressor.reduction import Reduction
 
-__all__ = ["Piece", "Reduction", "join", "join_stretches"]
+__all__ = ["Outcome", "Piece", "Work", "Workload", "reduce_piece", "run_task"]
 
 
-@dataclass(frozen=True, eq=False)
-class Reduction:
-    """What the rows of a piece, or of many, come down to.
-
-    Attributes:
-        factors: Their triangular factors.
-        squares: Sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows).
-        samples: Number of these samples.
-    """
-
-    factors: Factors
-    squares: Array
-    samples: int
-
-    @classmethod
-    def of(
-        cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
-    ) -> "Reduction":
-        """Reduce the problem of one trajectory.
-
-        Args:
-            problem: The base problem of the trajectory, rows weighted.
-            trajectory: The trajectory.
-            threads: As of ``compress``.
-
-        Returns:
-            The reduction.
-
-        Raises:
-            DataError: If a row is not finite.
-        """
-        return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
-
-    def to_arrays(self) -> dict[str, Array]:
-        """Return the reduction as plain arrays by name, as for a checkpoint."""
-        return {
-            **{f"R_{j}": R for j, R in enumerate(self.factors.triangles)},
-            **{f"columns_{j}": own for j, own in enumerate(self.factors.columns)},
-            "rows": self.factors.rows,
-            "names": np.array(self.factors.names),
-            "squares": self.squares,
-            "samples": np.array(self.samples),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
-        """Return the reduction that arrays hold; see ``to_arrays``.
-
-        Args:
-            arrays: The arrays by name.
-
-        Returns:
-            The reduction, to the same bits.
-        """
-        rows, joints = arrays["rows"], range(len(arrays["rows"]))
-        factors = Factors(
-            tuple(np.asfortranarray(arrays[f"R_{j}"]) for j in joints),
-            tuple(arrays[f"columns_{j}"] for j in joints),
-            rows,
-            tuple(arrays["names"].tolist()),
-        )
-        return cls(factors, arrays["squares"], int(arrays["samples"]))
-
-
-class Piece(ABC):
-    """A stretch of a log that is reduced by itself. Pieces can be pickled, and are small."""
+class Workload(Protocol):
+    """Something to work on, as a piece of a log; can be pickled."""
 
     @property
     @abstractmethod
@@ -95,6 +29,10 @@ class Piece(ABC):
     @abstractmethod
     def samples(self) -> int:
         """About how many samples it has, for progress."""
+
+
+class Piece(Workload):
+    """A stretch of a log that is reduced by itself. Pieces can be pickled, and are small."""
 
     @abstractmethod
     def reduce(self, *, threads: int | None = None) -> Reduction:
@@ -111,60 +49,77 @@ class Piece(ABC):
         """
 
 
-def join(reductions: Sequence[Reduction]) -> Reduction:
-    """Return what all the rows of several reductions come down to.
+#: What is done with a piece, given the number of threads or None for any; can be pickled.
+Work: TypeAlias = Callable[[Any, int | None], Any]
 
-    Neighbours are joined, then their neighbours, and so on: the order never depends on timing.
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a worker sends home.
+
+    Attributes:
+        result: What it made of its piece.
+        messages: Logger, level and text of what was logged meanwhile.
+    """
+
+    result: Any
+    messages: tuple[tuple[str, int, str], ...]
+
+    def log(self) -> None:
+        """Log in this process what the worker had to say."""
+        for name, level, text in self.messages:
+            logging.getLogger(name).log(level, "%s", text)
+
+
+class _Memory(logging.Handler):
+    """Keeps records as plain text, which can be sent anywhere."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.messages: list[tuple[str, int, str]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append((record.name, record.levelno, record.getMessage()))
+
+
+def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
+    """Return what a piece comes down to.
 
     Args:
-        reductions: At least one; all with the same columns and joints.
+        piece: The piece.
+        threads: As of ``Piece.reduce``.
 
     Returns:
         The reduction.
 
     Raises:
-        DataError: If there is none, or their columns or joints differ.
+        DataError: If a row cannot be used.
     """
-    if not reductions:
-        raise DataError("no reduction was given; at least one log is needed")
-    level = list(reductions)
-    while len(level) > 1:
-        level = [_join_neighbours(level[k : k + 2]) for k in range(0, len(level), 2)]
-    return level[0]
+    return piece.reduce(threads=threads)
 
 
-def _join_neighbours(reductions: Sequence[Reduction]) -> Reduction:
-    """Return what one or two reductions come down to."""
-    if len(reductions) == 1:
-        return reductions[0]
-    return Reduction(
-        merge([r.factors for r in reductions]),
-        np.sum([r.squares for r in reductions], axis=0),
-        sum(r.samples for r in reductions),
-    )
-
-
-def join_stretches(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
-    """Return the reductions of at most so many stretches of neighbouring pieces.
-
-    They are joined as they come, so that no more are in memory.
+def run_task(work: Work, piece: Workload, level: int) -> Outcome:
+    """Work on a piece with one thread, and keep what is logged.
 
     Args:
-        reductions: One per piece, in order.
-        count: Number of pieces, at least 1.
-        most: Largest number of stretches, at least 1.
+        work: What to do with the piece.
+        piece: The piece.
+        level: Level from which on messages are kept.
 
     Returns:
-        One per stretch, in order; the last stretch may be shorter.
+        What the work returns, with the messages.
 
     Raises:
-        DataError: If their columns or joints differ.
+        DataError: If a row cannot be used.
     """
-    length = -(-count // most)
-    stretches: list[Reduction] = []
-    for k, reduction in enumerate(reductions):
-        if k % length:
-            stretches[-1] = join([stretches[-1], reduction])
-        else:
-            stretches.append(reduction)
-    return stretches
+    logger, memory = logging.getLogger("robotid"), _Memory(level)
+    before = logger.level
+    logger.addHandler(memory)
+    logger.setLevel(level)
+    try:
+        with threadpool_limits(limits=1, user_api="blas"):
+            result = work(piece, 1)
+    finally:
+        logger.removeHandler(memory)
+        logger.setLevel(before)
+    return Outcome(result, tuple(memory.messages))

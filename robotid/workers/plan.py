@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from robotid._typing import ProgressCallback
-from robotid.exceptions import SettingsError
+from robotid.regressor.reduction import Reduction
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
-from robotid.workers.pieces import Piece, Reduction
+from robotid.workers.pieces import Piece, Work, Workload
 from robotid.workers.processes import (
     Backend,
     ProcessBackend,
@@ -17,8 +17,8 @@ from robotid.workers.processes import (
     choose_workers,
     map_pieces,
     reduce_pieces,
+    require_workers,
 )
-from robotid.workers.task import Work, Workload
 
 __all__ = ["WorkPlan"]
 
@@ -44,8 +44,8 @@ class WorkPlan:
     _keeps: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise SettingsError(f"workers is {self.workers}, wanted at least 1")
+        if self.workers is not None:
+            require_workers(self.workers)
 
     @property
     def is_asked_for(self) -> bool:

@@ -5,28 +5,30 @@ wherever that is done; results come back in the order of the pieces.
 """
 
 import logging
-import multiprocessing
 import os
 import signal
 import threading
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import islice
-from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from threadpoolctl import threadpool_limits
 
 from robotid._typing import ProgressCallback, ignore_progress
 from robotid.exceptions import SettingsError, WorkerError
 from robotid.regressor.factors import available_cores
+from robotid.regressor.reduction import Reduction
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Piece, Reduction
-from robotid.workers.task import Outcome, Work, Workload, reduce_piece, run_task
+from robotid.workers.pieces import Outcome, Piece, Work, Workload, reduce_piece, run_task
+
+if TYPE_CHECKING:
+    from loky import ProcessPoolExecutor
 
 __all__ = [
     "Backend",
@@ -34,7 +36,9 @@ __all__ = [
     "SerialBackend",
     "choose_workers",
     "map_pieces",
+    "named",
     "reduce_pieces",
+    "require_workers",
 ]
 
 _WORTH_WORKERS = 500_000  # samples from which workers pay their start, about a second each
@@ -80,26 +84,15 @@ class Backend(ABC):
 class SerialBackend(Backend):
     """Works on pieces one after the other in this process."""
 
-    def close(self) -> None:
-        """Do nothing; there are no workers."""
+    def close(self) -> None: ...
 
     @property
     def description(self) -> str:
-        """What messages call it."""
         return "this process"
 
     def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
-        """Work on pieces; see ``Backend.run``.
-
-        Args:
-            work: What to do with a piece.
-            pieces: Index and piece.
-
-        Yields:
-            Index and result of each piece, in order.
-        """
         for index, piece in pieces:
-            with threadpool_limits(limits=1, user_api="blas"), _named(piece):
+            with threadpool_limits(limits=1, user_api="blas"), named(piece):
                 result = work(piece, None)
             yield index, result
 
@@ -118,61 +111,69 @@ class ProcessBackend(Backend):
     """
 
     def __init__(self, workers: int) -> None:
-        if workers < 1:
-            raise SettingsError(f"workers is {workers}, wanted at least 1")
-        self.workers = workers
+        self.workers = require_workers(workers)
         self._pool: ProcessPoolExecutor | None = None
-        self._lifeline: tuple[Connection, Connection] | None = None
 
     @property
     def description(self) -> str:
-        """What messages call it."""
         return f"{self.workers} worker processes, one BLAS thread each"
 
     def run(self, work: Work, pieces: Sequence[tuple[int, Workload]]) -> Iterator[tuple[int, Any]]:
-        """Work on pieces, at most two per worker under way; see ``Backend.run``.
-
-        Args:
-            work: What to do with a piece.
-            pieces: Index and piece.
-
-        Yields:
-            Index and result of each piece, as they come.
-
-        Raises:
-            DataError: If a row cannot be used.
-            WorkerError: If a worker ends before its work.
-        """
         try:
-            yield from _collect(self._pool or self._start(), work, pieces, 2 * self.workers)
+            yield from self._collect(work, pieces)
         except BaseException:
-            self._cut_lifeline()  # ends the workers in the middle of their work
-            if self._pool is not None:
-                # a worker may end in the middle of a result: without this end of the pipe, the pool
-                # would wait for the rest for ever
-                results: Any = self._pool
-                results._result_queue._writer.close()
-            self.close()
+            self._end(kill_workers=True)
             raise
 
     def close(self) -> None:
-        """Let the workers go; the next work starts them anew."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-            self._pool = None
-        self._cut_lifeline()
+        self._end(kill_workers=False)
 
-    def _start(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        self._lifeline = context.Pipe(duplex=False)
-        lifeline, _ = self._lifeline
-        self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (lifeline,))
+    def _start(self) -> "ProcessPoolExecutor":
+        from loky import ProcessPoolExecutor
+
+        self._pool = ProcessPoolExecutor(
+            self.workers,
+            initializer=_start_worker,
+            initargs=(os.getpid(),),
+            env={"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"},  # [bytes]: pieces bound the memory
+        )
         return self._pool
 
-    def _cut_lifeline(self) -> None:
-        for end in reversed(self._lifeline or ()):
-            end.close()
-        self._lifeline = None
+    def _end(self, *, kill_workers: bool) -> None:
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(wait=True, kill_workers=kill_workers)
+
+    def _collect(
+        self, work: Work, pieces: Iterable[tuple[int, Workload]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield what the workers return, with at most two pieces per worker under way."""
+        waiting, level = iter(pieces), _log.getEffectiveLevel()
+        running: dict[Future[Outcome], tuple[int, Workload]] = {}
+        finished: SimpleQueue[Future[Outcome]] = SimpleQueue()
+        try:
+            while True:
+                for index, piece in islice(waiting, 2 * self.workers - len(running)):
+                    with _interrupts_held():
+                        pool = self._pool or self._start()
+                        future = pool.submit(run_task, work, piece, level)
+                        running[future] = index, piece
+                        future.add_done_callback(finished.put)
+                if not running:
+                    return
+                done = finished.get()
+                index, piece = running[done]
+                with named(piece):
+                    outcome = done.result()
+                del running[done]
+                outcome.log()
+                yield index, outcome.result
+        except BrokenProcessPool as error:
+            names = [piece.name for _, piece in running.values()]
+            raise WorkerError(
+                "a worker process ended in the middle of its work (killed from outside, or short "
+                f"of memory); under way: {names}"
+            ) from error
 
 
 def reduce_pieces(
@@ -281,100 +282,74 @@ def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> in
     Raises:
         SettingsError: If fewer than one is asked for.
     """
-    if workers is not None and workers < 1:
-        raise SettingsError(f"workers is {workers}, wanted at least 1")
     if workers is None:
         is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS
         workers = available_cores() if is_long else 1
-    return max(1, min(workers, len(pieces)))
+    return max(1, min(require_workers(workers), len(pieces)))
 
 
-def _collect(
-    pool: ProcessPoolExecutor, work: Work, pieces: Iterable[tuple[int, Workload]], most: int
-) -> Iterator[tuple[int, Any]]:
-    """Yield what the workers return, with at most so many pieces under way."""
-    waiting, level = iter(pieces), _log.getEffectiveLevel()
-    running: dict[Future[Outcome], tuple[int, Workload]] = {}
-    finished: SimpleQueue[Future[Outcome] | None] = SimpleQueue()
-    try:
-        with _interrupts_to(lambda: finished.put(None)) as interrupt:
-            while True:
-                for index, piece in islice(waiting, most - len(running)):
-                    with _unheard_interrupts():
-                        future = pool.submit(run_task, work, piece, level)
-                    running[future] = index, piece
-                    future.add_done_callback(finished.put)
-                if not running:
-                    return
-                done = finished.get()
-                if done is None:
-                    interrupt()
-                    continue
-                index, piece = running[done]
-                with _named(piece):
-                    outcome = done.result()
-                del running[done]
-                outcome.log()
-                yield index, outcome.result
-    except BrokenProcessPool as error:
-        names = [piece.name for _, piece in running.values()]
-        raise WorkerError(
-            "a worker process ended in the middle of its work (killed from outside, short of "
-            f"memory, or a script without the guard if __name__ == '__main__'); under way: {names}"
-        ) from error
+def require_workers(workers: int) -> int:
+    """Return a number of workers.
+
+    Args:
+        workers: The number.
+
+    Returns:
+        The same.
+
+    Raises:
+        SettingsError: If it is less than 1.
+    """
+    if workers < 1:
+        raise SettingsError(f"workers is {workers}, wanted at least 1")
+    return workers
 
 
 @contextmanager
-def _named(piece: Workload) -> Iterator[None]:
-    """Note on an error which piece it met."""
+def named(piece: Workload) -> Iterator[None]:
+    """Note on an error which piece it met.
+
+    Args:
+        piece: The piece that is worked on.
+    """
     try:
         yield
-    except BrokenProcessPool:
-        raise
     except Exception as error:
         error.add_note(f"while working on {piece.name}")
         raise
 
 
 @contextmanager
-def _interrupts_to(notify: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C call ``notify`` and nothing else, as long as the context lasts.
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back until the context ends; workers started meanwhile never hear it.
 
-    In the middle of the pool's own functions it would leave locks that nobody opens. Yields what
-    does what Ctrl-C was to do, to be called where that harms nothing.
+    In the middle of the pool's own functions it would leave locks that nobody opens.
     """
+    heard: list[int] = []
     before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield lambda: None
-        return
-    signal.signal(signal.SIGINT, lambda *_: notify())
-    try:
-        yield lambda: before(signal.SIGINT, None)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _unheard_interrupts() -> Iterator[None]:
-    """Hold Ctrl-C back; workers started meanwhile never see it: they end with this process."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    is_ours = threading.current_thread() is threading.main_thread() and before is not None
+    can_mask = hasattr(signal, "pthread_sigmask")
+    if is_ours:
+        signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_mask else None
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if mask is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if is_ours:
+            signal.signal(signal.SIGINT, before)
+        if heard:
+            signal.raise_signal(signal.SIGINT)
 
 
-def _start_worker(lifeline: Connection) -> None:
-    """Set a worker up: one BLAS thread, deaf to Ctrl-C, gone when the lifeline is cut."""
+def _start_worker(parent: int) -> None:
+    """Set a worker up: deaf to Ctrl-C, gone when the process that started it is."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
 
 
-def _end_with(lifeline: Connection) -> None:
-    try:
-        lifeline.recv()
-    finally:
-        os._exit(1)
+def _end_after(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.1)  # [s]
+    os._exit(1)

@@ -5,8 +5,9 @@ import pytest
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.logs.settings import LogSource
+from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.model import GRAVITY
-from robotid.robot.parameters import DRIVE_TERMS, Coupling
+from robotid.robot.parameters import Coupling
 
 FULL = """
 urdf = "robot.urdf"
@@ -74,7 +75,7 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.gravity == (0.0, -9.81, 0.0)
     assert job.signals.rate == 200.0
     assert job.signals.acceleration == "differentiated"
-    assert job.drives.terms == ("armature", "viscous")
+    assert job.terms == ("armature", "viscous")
     assert job.gains == {"a": 14.87}
     assert job.units.time == "ms"
     assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
@@ -145,4 +146,4 @@ def test_a_missing_job_file_is_named(tmp_path):
 def test_gravity_and_drive_terms_default_to_those_of_the_model():
     job = Job(urdf=Path("robot.urdf"))
     assert job.gravity == GRAVITY
-    assert job.drives.terms == DRIVE_TERMS
+    assert job.terms == DRIVE_TERMS

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 from helpers.paths import ROOT
+from helpers.piecework import local_cluster
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
@@ -24,6 +25,7 @@ from robotid.workers.plan import WorkPlan
 
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
 CHECKPOINT = ".robotid-checkpoint"
+HELD = ROOT / "tests" / "helpers" / "held.py"
 
 
 def write_job(folder, rows_in_memory, *tables):
@@ -73,51 +75,48 @@ def test_two_workers_give_the_same_result_to_the_last_bit(job, expected, tmp_pat
 
 
 def test_a_cluster_gives_the_same_result_to_the_last_bit(job, expected, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as cluster:
+    pytest.importorskip("distributed")
+    with local_cluster() as cluster:
         words = ["identify", job, "--scheduler", cluster.scheduler_address]
         assert main([*words, "--out", str(tmp_path)]) == 0
     assert (tmp_path / "result.json").read_text() == expected
 
 
 def cut_off(job, out, number, workers):
-    """Start the command line, send it a signal once some pieces are done; code and stderr."""
-    command = [sys.executable, "-m", "robotid", "identify", job, "--out", str(out)]
-    run = subprocess.Popen(
-        [*command, "--workers", workers], stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    while len(list((out / CHECKPOINT).glob("*.npz"))) < 3:
+    """Start the command line, send it a signal once three pieces are kept; code and stderr."""
+    mark = out.with_name("three pieces are kept")
+    command = [sys.executable, HELD, mark, "3", "identify", job, "--out", out, "--workers", workers]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    while not mark.exists():
         assert run.poll() is None, run.stderr.read()
-        time.sleep(0.002)
+        time.sleep(0.01)
     (os.killpg if number == signal.SIGINT else os.kill)(run.pid, number)
-    _, error = run.communicate(timeout=20)
+    _, error = run.communicate(timeout=60)
     return run.returncode, error
 
 
 def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
     job, expected, tmp_path, capsys
 ):
-    assert cut_off(job, tmp_path, signal.SIGKILL, "1")[0] == -signal.SIGKILL
-    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
-    done = len(list((tmp_path / CHECKPOINT).glob("*.npz")))
-    assert 3 <= done < 24
-    words = ["identify", job, "--workers", "2", "--out", str(tmp_path)]
+    out = tmp_path / "out"
+    assert cut_off(job, out, signal.SIGKILL, "1")[0] == -signal.SIGKILL
+    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+    words = ["identify", job, "--workers", "2", "--out", str(out)]
     assert main([*words, "--resume", "--verbose"]) == 0
-    assert f"reducing 24 pieces, {done} of them kept from before" in capsys.readouterr().err
-    assert (tmp_path / "result.json").read_text() == expected
-    assert not (tmp_path / CHECKPOINT).exists()
+    assert "reducing 24 pieces, 3 of them kept from before" in capsys.readouterr().err
+    assert (out / "result.json").read_text() == expected
+    assert not (out / CHECKPOINT).exists()
 
 
 def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, tmp_path):
-    code, error = cut_off(job, tmp_path, signal.SIGINT, "2")
+    out = tmp_path / "out"
+    code, error = cut_off(job, out, signal.SIGINT, "2")
     assert code == 130
     assert error.count("\n") == 1
     assert error.startswith("robotid: interrupted; finished pieces are kept in ")
-    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
-    assert main(["identify", job, "--out", str(tmp_path), "--resume"]) == 0
-    assert (tmp_path / "result.json").read_text() == expected
+    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+    assert main(["identify", job, "--out", str(out), "--resume"]) == 0
+    assert (out / "result.json").read_text() == expected
 
 
 def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):

@@ -100,13 +100,13 @@ def test_no_stretch_kept_apart_is_taken_for_a_fitted_one(run, name):
 def test_late_velocities_are_not_used(run):
     # TIAGo reports velocity 140 to 190 ms late, the Panda 6 ms, like its torque
     tiago, panda = run("tiago")[0], run("panda_inria")[0]
-    assert tiago.identification[0].recording.signals.velocity == "differentiated"
-    assert panda.identification[0].recording.signals.velocity == "measured"
+    assert tiago.fitted[0].recording.signals.velocity == "differentiated"
+    assert panda.fitted[0].recording.signals.velocity == "measured"
 
 
 def test_gaps_stay_gaps(run):
     identification, _, _ = run("kinova_gen3")
-    trajectory = identification.identification[0].recording.trajectory
+    trajectory = identification.fitted[0].recording.trajectory
     assert trajectory.segment[-1] >= 2  # its longest gaps: 0.94, 0.56 and 0.03 s
     for number in np.unique(trajectory.segment):
         steps = np.diff(trajectory.t[trajectory.segment == number])

@@ -171,9 +171,7 @@ def continuous_joint(here):
     beta = found.mapping.to_base(pi)
     error = np.abs(found.base - beta).max() / np.abs(beta).max()
     assert error < 1e-8
-    note = next(
-        note for e in found.identification for note in e.recording.log.notes if "turn" in note
-    )
+    note = next(note for e in found.fitted for note in e.recording.log.notes if "turn" in note)
     return f"one angle per joint, whatever Pinocchio stores; exact parameters come back; {note}"
 
 
@@ -194,7 +192,7 @@ def missing_mesh(here):
 
 def filter_off(here):
     found, _ = here.identified(here.write(here.log), signals={"cutoff": False})
-    assert found.identification[0].recording.signals.cutoff is None
+    assert found.fitted[0].recording.signals.cutoff is None
     return "`cutoff = false`, `--cutoff false`"
 
 
@@ -237,7 +235,7 @@ def urdf_that_misses_torque(here):
     target = here.folder / "identified.urdf"
     sidecar = write_urdf(here.model, found.standard, target)
     model, pi = load_identified(target, sidecar)
-    motion = found.identification[0].recording.trajectory
+    motion = found.fitted[0].recording.trajectory
     shipped, fitted = (
         predict(model, [pi], motion)[0],
         predict(here.model, [found.standard], motion)[0],

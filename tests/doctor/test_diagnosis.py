@@ -70,7 +70,7 @@ BESIDES = {
 def test_each_corruption_is_found_by_its_own_code(name, table, tmp_path):
     case, job = spoil(name, table, tmp_path)
     findings = examine(job)
-    assert set(case.codes) & {f.code for f in findings}
+    assert set(case.codes) & loud(findings)  # a note is not read
     assert loud(findings) - set(case.codes) <= BESIDES.get(name, set())
     json.dumps(findings_to_dict(findings), allow_nan=False)
 

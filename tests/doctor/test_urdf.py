@@ -6,7 +6,7 @@ import pytest
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import ModelError
-from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.examples import example_urdf
 from robotid.robot.tree import read_with_yourdfpy
 
 CLEAN = """<robot name="two">
@@ -78,13 +78,10 @@ def test_a_floating_base_adds_its_body(tmp_path):
     assert (finding["link"], finding["severity"]) == ("base", "warning")
 
 
-def test_every_example_robot_can_be_inspected():
-    # the 69 files hold a few twice; the largest, of 101 joints, only costs time here
+@pytest.mark.xdist_group("every example robot")
+def test_every_example_robot_can_be_inspected(inspections):
     unusable = {}
-    for path in example_urdfs():
-        if path.name == "tiago_dual.urdf":
-            continue
-        inspection = inspect_urdf(path)
+    for path, inspection in inspections.items():
         content = json.loads(json.dumps(inspection.to_dict(), allow_nan=False))
         assert set(content) == {"robot", "joints", "structure", "base_groups", "findings"}
         for finding in content["findings"]:

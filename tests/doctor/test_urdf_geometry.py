@@ -7,7 +7,7 @@ import pytest
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.doctor.urdf_geometry import audit_links
-from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 DOCS = Path(__file__).parents[2] / "docs" / "urdf_audit.md"
@@ -107,10 +107,10 @@ def test_the_panda_of_the_examples_has_an_inertia_that_its_shape_cannot_have():
     assert ("gyration", "link panda_link1") in codes
 
 
-def test_the_table_of_all_example_robots_is_the_documents():
+@pytest.mark.xdist_group("every example robot")
+def test_the_table_of_all_example_robots_is_the_documents(inspections):
     lines = ["| robot | joints | errors | warnings | which |", "|---|---|---|---|---|"]
-    for path in example_urdfs():
-        found = inspect_urdf(path)
+    for path, found in inspections.items():
         graves = [f for f in found.findings if f.severity != "note"]
         counts = Counter(f.code for f in graves)
         errors = sum(f.severity == "error" for f in graves)

@@ -1,70 +1,72 @@
-"""Laws that every estimator obeys. A new estimator joins by one line in ESTIMATORS."""
+"""Laws that every estimator obeys: those of all, of those with errors, of recursive ones."""
+
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from helpers.synthetic import exact_log, truth
+from helpers.estimation import ESTIMATORS, NOISE, Case, RandomStates
 
-from robotid.estimators import OLS, WLS, Consistent
-from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
-from robotid.identification.prior import prior_spread
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.estimators import (
+    OLS,
+    PRX,
+    RLS,
+    BatchEstimator,
+    Consistent,
+    DescentState,
+    Kalman,
+    KalmanState,
+    NormalisedGradient,
+    RecursiveEstimator,
+    RLSState,
+    fold,
+    load_state,
+    save_state,
+)
+from robotid.exceptions import DataError
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-
-
-class Case:
-    """A robot, its true parameters and a problem made of them."""
-
-    def __init__(self, model, rng, noise=None, **options):
-        self.model = model
-        self.pi = truth(model)
-        self.mapping = structural_mapping(model)
-        self.beta = self.mapping.to_base(self.pi)
-        log = exact_log(model, self.pi, rng, noise=noise, **options)
-        self.trajectory = process(log, EXACT)
-        self.problem = self.mapping.reduce(build_problem(model, self.trajectory))
-
-    def base(self, estimate):
-        theta = estimate.theta
-        return theta if len(theta) == len(self.beta) else self.mapping.to_base(theta)
-
-    def covariance(self, estimate):
-        K = self.mapping.K
-        same = len(estimate.theta) == len(self.beta)
-        return estimate.covariance if same else K @ estimate.covariance @ K.T
+BATCH = ("ols", "wls", "tls", "consistent", "log_cholesky")
+RECURSIVE = tuple(name for name in ESTIMATORS if name not in BATCH)
+STATES = {RLS: RLSState, Kalman: KalmanState, PRX: DescentState, NormalisedGradient: DescentState}
+EXACT_COVARIANCE = ("ols", "wls", "consistent", "rls", "kalman")
 
 
-def consistent(case, **options):
-    prior = case.model.standard_parameters()
-    spread = prior_spread(case.model, [case.trajectory])
-    return Consistent(case.model.layout, case.mapping.K, prior, spread, **options)
+def makers(names):
+    return pytest.mark.parametrize("make", [ESTIMATORS[name][0] for name in names], ids=names)
 
 
-ESTIMATORS = {
-    "ols": lambda case: OLS(),
-    "wls": lambda case: WLS(),
-    "consistent": lambda case: consistent(case),
-}
-NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+@pytest.fixture(scope="module")
+def states():
+    model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"))
+    return RandomStates(model, np.random.default_rng(0))
 
 
-@pytest.fixture(params=ESTIMATORS.values(), ids=ESTIMATORS)
-def make(request):
-    return request.param
+@pytest.mark.parametrize(("make", "tolerance"), ESTIMATORS.values(), ids=ESTIMATORS)
+def test_truth_is_recovered_without_noise(make, tolerance, states):
+    theta = states.base(make(states).fit(states.problem))
+    assert np.linalg.norm(theta - states.beta) < tolerance * np.linalg.norm(states.beta)
 
 
-def test_truth_is_recovered_without_noise(make, panda, rng):
+@makers(("ols", "wls", "consistent"))
+def test_truth_is_recovered_from_one_motion(make, panda, rng):
     case = Case(panda, rng)
     beta = case.base(make(case).fit(case.problem))
     # 1e-8 relative: rounding of 4200 rows and, for the cone solver, its own tolerance
     assert np.linalg.norm(beta - case.beta) < 1e-8 * np.linalg.norm(case.beta)
 
 
+@makers(ESTIMATORS)
+def test_it_says_what_it_reads(make, states):
+    estimator = make(states)
+    kind = BatchEstimator if estimator.reads == "factors" else RecursiveEstimator
+    assert estimator.reads in ("factors", "samples")
+    assert isinstance(estimator, kind)
+
+
+@makers(BATCH)
 def test_factors_and_problem_give_the_same_estimate(make, ur5, rng):
     case = Case(ur5, rng, NOISE)
     one = make(case).fit(case.problem)
@@ -72,6 +74,7 @@ def test_factors_and_problem_give_the_same_estimate(make, ur5, rng):
     np.testing.assert_array_equal(one.theta, other.theta)
 
 
+@makers(BATCH)
 def test_input_is_not_changed(make, ur5, rng):
     case = Case(ur5, rng, NOISE)
     factors = compress(case.problem)
@@ -80,6 +83,7 @@ def test_input_is_not_changed(make, ur5, rng):
     np.testing.assert_array_equal(factors.R, before)
 
 
+@makers(EXACT_COVARIANCE)
 def test_noise_level_of_each_joint_is_found(make, ur5, rng):
     case = Case(ur5, rng, NOISE, samples=3000)
     sigma = make(case).fit(case.problem).sigma
@@ -88,18 +92,21 @@ def test_noise_level_of_each_joint_is_found(make, ur5, rng):
     np.testing.assert_allclose(sigma, NOISE, rtol=rtol)
 
 
+@makers(ESTIMATORS)
 def test_fewer_rows_than_parameters_are_refused(make, ur5, rng):
     case = Case(ur5, rng, samples=9)
     with pytest.raises(DataError, match=r"54 torque rows for 58 parameters: too few rows to fit"):
         make(case).fit(case.problem)
 
 
+@makers(EXACT_COVARIANCE)
 def test_standard_errors_match_monte_carlo(make, ur5, rng):
     case = Case(ur5, rng, np.zeros(6), samples=400)
+    case.sigma = NOISE
     estimates, stated = [], []
     for _ in range(60):
         noisy = NOISE * rng.standard_normal(case.trajectory.tau.shape)
-        trajectory = exchange(case.trajectory, case.trajectory.tau + noisy)
+        trajectory = replace(case.trajectory, tau=case.trajectory.tau + noisy)
         problem = case.mapping.reduce(build_problem(ur5, trajectory))
         estimate = make(case).fit(problem)
         estimates.append(case.base(estimate))
@@ -110,120 +117,80 @@ def test_standard_errors_match_monte_carlo(make, ur5, rng):
     assert ratio.min() > 0.65
 
 
-def exchange(trajectory, tau):
-    from dataclasses import replace
-
-    return replace(trajectory, tau=tau)
-
-
-def test_wls_beats_ols_where_joints_are_unequally_noisy(ur5, rng):
-    errors = {"ols": [], "wls": []}
-    for _ in range(10):
-        case = Case(ur5, rng, NOISE)
-        for name, errors_of in errors.items():
-            estimate = ESTIMATORS[name](case).fit(case.problem)
-            errors_of.append(np.abs(estimate.theta - case.beta) / np.abs(estimate.std_error))
-            if name == "wls":
-                wrist = [i for i, n in enumerate(estimate.names) if n.startswith("wrist_3")]
-                ols = OLS().fit(case.problem)
-                assert estimate.std_error[wrist].sum() < ols.std_error[wrist].sum()
-    assert np.mean(errors["wls"]) < 1.2  # errors are of the size that is stated
-
-
-def test_ols_is_plain_least_squares(ur5, rng):
-    case = Case(ur5, rng, NOISE)
-    W, tau, _ = (np.concatenate(x) for x in zip(*case.problem.blocks(), strict=True))
-    expected = np.linalg.lstsq(W, tau, rcond=None)[0]
-    np.testing.assert_allclose(OLS().fit(case.problem).theta, expected, rtol=1e-9, atol=1e-11)
-
-
-def still_wrist(model, rng):
-    case = Case(model, rng, NOISE)
-    v = np.array(case.trajectory.v)
-    v[:, 5] = 0.0
-    a = np.array(case.trajectory.a)
-    a[:, 5] = 0.0
-    q = np.array(case.trajectory.q)
-    q[:, 5] = 0.3
-    from dataclasses import replace
-
-    case.trajectory = replace(case.trajectory, q=q, v=v, a=a)
-    case.problem = case.mapping.reduce(build_problem(model, case.trajectory))
-    return case
-
-
-@pytest.mark.parametrize("estimator", [OLS(), WLS()])
-def test_what_the_data_do_not_excite_is_refused_by_name(ur5, rng, estimator):
-    case = still_wrist(ur5, rng)
-    with pytest.raises(RankDeficientError) as caught:
-        estimator.fit(case.problem)
-    assert "wrist_3_joint.viscous" in caught.value.undetermined
-    assert "shoulder_pan_joint.viscous" not in caught.value.undetermined
-    assert f"the data excite {caught.value.rank} of 58 base parameters" in str(caught.value)
-
-
-def test_with_a_prior_the_rest_is_kept(ur5, rng):
-    case = still_wrist(ur5, rng)
-    prior = case.mapping.to_base(ur5.standard_parameters())
-    estimate = WLS(prior=prior).fit(case.problem)
-    i = estimate.names.index("wrist_3_joint.viscous")
-    assert estimate.theta[i] == pytest.approx(prior[i], abs=1e-12)
-    assert np.isinf(estimate.std_error[i])
-    assert estimate.rank < 58
-
-
-def test_consistent_fit_names_what_it_took_from_the_prior(ur5, rng):
-    case = still_wrist(ur5, rng)
-    assert "wrist_3_joint.viscous" in consistent(case).fit(case.problem).undetermined
-
-
-def test_consistent_fit_is_physical_where_least_squares_is_not(ur5, rng):
-    case = Case(ur5, rng, 40 * NOISE, samples=200)
-    free = case.mapping.to_standard(WLS().fit(case.problem).theta, ur5.standard_parameters())
-    assert np.linalg.eigvalsh(pseudo_inertia(free[:60])).min() < 0
-    estimate = consistent(case).fit(case.problem)
-    assert np.linalg.eigvalsh(pseudo_inertia(estimate.theta[:60])).min() > 0
-    assert (estimate.theta[ur5.layout.is_nonnegative()] >= 0).all()
-
-
-def test_consistent_fit_agrees_with_wls_where_physics_does_not_bind(ur5, rng):
-    case = Case(ur5, rng, 0.01 * NOISE, samples=2000)
-    wls, ours = WLS().fit(case.problem), consistent(case).fit(case.problem)
-    difference = np.abs(case.base(ours) - wls.theta) / wls.std_error
-    assert difference.max() < 1.0
-
-
-def test_the_held_share_of_a_body_is_respected(ur5, rng):
-    case = Case(ur5, rng, NOISE)
-    held = np.zeros(60)
-    # the last link is known to carry a 5 kg part, more than it has: the rest must stay possible
-    held[50:] = [5.0, 0, 0, 0, 0.05, 0, 0.05, 0, 0, 0.05]
-    estimate = consistent(case, held=held).fit(case.problem)
-    rest = pseudo_inertia(estimate.theta[:60] - held)
-    assert np.linalg.eigvalsh(rest).min() > 0
-    assert estimate.theta[50] > 5.0
-
-
-def test_a_solver_that_fails_says_so(ur5, rng):
-    case = Case(ur5, rng, 40 * NOISE, samples=200)
-    with pytest.raises(NotConvergedError, match="was not solved by Clarabel") as caught:
-        consistent(case, max_iterations=1).fit(case.problem)
-    assert caught.value.status == "MaxIterations"
-
-
-def test_a_prior_that_is_not_finite_is_refused(ur5, rng):
-    case = Case(ur5, rng, NOISE)
-    with pytest.raises(DataError, match="prior and held must be finite"):
-        consistent(case, held=np.full(60, np.nan))
-
-
+@makers(EXACT_COVARIANCE)
 def test_fewer_independent_rows_widen_the_errors(make, ur5, rng):
     case = Case(ur5, rng, NOISE)
     estimator = make(case)
-    from dataclasses import replace
-
     wide = replace(estimator, independent_share=0.25).fit(case.problem)
     narrow = estimator.fit(case.problem)
     ratio = np.sqrt(np.diag(case.covariance(wide)) / np.diag(case.covariance(narrow)))
     # the consistent fit also finds the noise larger: fewer rows are left to tell it
     assert 1.5 < np.median(ratio) <= (2.1 if isinstance(estimator, Consistent) else 2.0001)
+
+
+def started(make, case):
+    estimator = make(case)
+    return estimator, estimator.init(len(case.beta))
+
+
+def bits(state):
+    return {f.name: np.asarray(getattr(state, f.name)).tobytes() for f in fields(state)}
+
+
+@makers(RECURSIVE)
+def test_a_nan_sample_is_refused_without_harm(make, states):
+    problem = states.problem
+    estimator, state = started(make, states)
+    samples = list(problem.samples())
+    state = fold(estimator, samples[:50], state)
+    before = bits(state)
+    for name in ("Y", "tau", "weight"):
+        broken = getattr(samples[50], name).copy()
+        broken.flat[1] = np.nan
+        with pytest.raises(DataError, match="refused"):
+            estimator.update(state, replace(samples[50], **{name: broken}))
+    assert bits(state) == before
+    after = estimator.update(state, samples[50])
+    assert bits(state) == before
+    assert bits(after) != before
+
+
+@makers(RECURSIVE)
+def test_a_sample_of_another_shape_is_refused(make, states):
+    problem = states.problem
+    estimator, state = started(make, states)
+    sample = next(problem.samples())
+    with pytest.raises(DataError, match=r"the sample has Y \(6, 57\), .*wanted \(6, 58\)"):
+        estimator.update(state, replace(sample, Y=sample.Y[:, 1:]))
+
+
+@makers(RECURSIVE)
+def test_a_row_of_weight_zero_is_as_if_it_had_never_been(make, states):
+    problem = states.problem
+    estimator, state = started(make, states)
+    sample = next(problem.samples())
+    weight = np.array([1.0, 0, 1, 1, 0, 1])
+    absurd = np.where(weight > 0, sample.tau, np.nan)
+    theta = [
+        estimator.estimate(
+            estimator.update(state, replace(sample, tau=tau, weight=weight)), problem.names
+        ).theta
+        for tau in (sample.tau, absurd)
+    ]
+    np.testing.assert_array_equal(*theta)
+    none = replace(sample, weight=np.zeros(6))
+    still = estimator.estimate(estimator.update(state, none), problem.names)
+    np.testing.assert_array_equal(still.theta, estimator.estimate(state, problem.names).theta)
+
+
+@makers(RECURSIVE)
+def test_saved_and_resumed_gives_the_same_bits(make, states, tmp_path):
+    problem = states.problem
+    estimator, state = started(make, states)
+    samples = list(problem.samples())[:300]
+    unbroken = fold(estimator, samples, state)
+    half = fold(estimator, samples[:150], state)
+    save_state(half, tmp_path / "state.npz")
+    read = load_state(tmp_path / "state.npz", STATES[type(estimator)])
+    assert bits(read) == bits(half)
+    assert bits(fold(estimator, samples[150:], read)) == bits(unbroken)

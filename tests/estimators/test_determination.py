@@ -122,7 +122,7 @@ def test_named_sums_hold_along_every_direction_the_data_leave_open(seed):
 
 def test_moving_along_a_weak_direction_changes_no_torque_and_no_named_sum(ur5, wrist):
     known, mapping = wrist.determination, wrist.mapping
-    e = wrist.identification[0]
+    e = wrist.fitted[0]
     motion, mask = e.recording.trajectory, e.recording.mask
     W = joint_torque_regressor(ur5, motion.q, motion.v, motion.a)[:, mapping.independent]
     W = W[mask.astype(bool).reshape(-1)]  # the rows that were fitted
@@ -172,7 +172,7 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
     reasons = found.verdict.reasons
     assert any(str(list(known.undetermined)) in reason for reason in reasons)
 
-    log = found.identification[0].recording.log
+    log = found.fitted[0].recording.log
     with pytest.raises(RankDeficientError) as caught:
         identify(ur5, [log], signals=EXACT, estimator="wls")
     assert caught.value.rank == known.rank
@@ -232,7 +232,7 @@ def test_too_few_rows_are_said(ur5):
 
 
 def test_a_pinned_link_is_not_listed(ur5, wrist):
-    log = wrist.identification[0].recording.log
+    log = wrist.fitted[0].recording.log
     settings = replace(wrist.estimator, constraints={"pinned": ["wrist_3_link"]})
     found = identify(ur5, [log], signals=EXACT, estimator=settings)
     own = found.mapping.in_words([f"wrist_3_link.{term}" for term in ("mcx", "Ixy", "Ixz", "Iyz")])

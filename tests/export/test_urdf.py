@@ -1,5 +1,6 @@
 import hashlib
 import json
+import os
 import re
 
 import numpy as np
@@ -351,7 +352,7 @@ def test_a_failure_while_writing_leaves_the_folder_as_it_was(source, tmp_path, r
             write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
     assert listing(tmp_path) == before
     with monkeypatch.context() as patch:
-        patch.setattr(urdf.os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        patch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
         with pytest.raises(OSError, match="disk full"):
             write_urdf(model, pi * 1.01, tmp_path / "new.urdf")
     assert listing(tmp_path) == before

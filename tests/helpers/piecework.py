@@ -1,6 +1,7 @@
 """Pieces for tests of who reduces them: random rows by seed, with a mark for each reduction.
 
-As a script, it reduces ten slow pieces with a checkpoint: ``piecework.py FOLDER WORKERS [resume]``.
+As a script, it reduces ten pieces with a checkpoint: ``piecework.py FOLDER WORKERS hold|resume``.
+"hold" leaves the last five under way for ever: it waits for a signal.
 """
 
 import os
@@ -15,8 +16,9 @@ import numpy as np
 
 from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors
+from robotid.regressor.reduction import Reduction, join
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Piece, Reduction, join
+from robotid.workers.pieces import Piece
 from robotid.workers.processes import ProcessBackend, SerialBackend, reduce_pieces
 
 NAMES = ("a", "b", "c", "d", "e")
@@ -50,6 +52,8 @@ class RandomPiece(Piece):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.fault == "meet":
             meet(self.marks)
+        if self.fault == "hold":
+            time.sleep(600)
         rng = np.random.default_rng(self.seed)
         rows = rng.standard_normal((2, self.samples, len(NAMES) + 1))
         R = np.array([np.linalg.qr(part, mode="r") for part in rows])
@@ -65,7 +69,7 @@ def mark(piece):
     path.write_text(socket.gethostname())
 
 
-def meet(folder, seconds=3.0):
+def meet(folder, seconds=60.0):
     """Wait until another process reduces something, too."""
     end = time.monotonic() + seconds
     while len(workers_of(folder)) < 2:
@@ -113,9 +117,19 @@ def same_bits(one, other):
     )
 
 
-def main(folder, workers, *words):
-    pieces = pieces_in(Path(folder) / "marks", pause=0.15)
-    checkpoint = Checkpoint.open(folder, {"inputs": "these"}, pieces, resume="resume" in words)
+def local_cluster():
+    """Return a cluster with two workers, each a process of its own, on ports that are free."""
+    from distributed import LocalCluster
+
+    return LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
+    )
+
+
+def main(folder, workers, word):
+    faults = dict.fromkeys(range(5, 10), "hold") if word == "hold" else {}
+    pieces = pieces_in(Path(folder) / "marks", faults=faults)
+    checkpoint = Checkpoint.open(folder, {"inputs": "these"}, pieces, resume=word == "resume")
     backend = ProcessBackend(int(workers)) if int(workers) > 1 else SerialBackend()
     with backend:
         found = reduce_all(pieces, backend=backend, checkpoint=checkpoint)

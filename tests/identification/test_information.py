@@ -20,7 +20,7 @@ def found(ur5):
 def dense(found):
     """Return the weighted regressor of the rows used, whole."""
     model, rows = found.model, []
-    for e in found.identification:
+    for e in found.fitted:
         t, sigma = e.recording.trajectory, found.wls.sigma
         W = joint_torque_regressor(model, t.q, t.v, t.a, t.direction)[:, found.mapping.independent]
         weighted = W.reshape(len(t.t), model.n_rows, -1) / sigma[:, None]

@@ -104,7 +104,7 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
     one, other = compare(noisy_job, tmp_path)
     page = (tmp_path / "pieces" / "report.html").read_text()
     assert "A long log" not in page  # all samples are drawn of one so short
-    assert other.identification[0].recording.name == one.identification[0].recording.name
+    assert other.fitted[0].recording.name == one.fitted[0].recording.name
     result = json.loads((tmp_path / "pieces" / "result.json").read_text())
     assert result["settings"]["reduction"] == {"rows_in_memory": HELD}
     kept = noisy_job.validation[0].path
@@ -150,7 +150,7 @@ def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path
     monkeypatch.setattr("robotid.identification.survey._WINDOW", 400)
     job = replace(noisy_job, rows_in_memory=HELD, validation=())
     identification, result = run_job(job, tmp_path)
-    (evaluation,) = identification.identification
+    (evaluation,) = identification.fitted
     recording = evaluation.recording
     assert recording.is_partial
     assert len(recording.trajectory.t) == 300

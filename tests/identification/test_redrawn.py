@@ -7,6 +7,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
+from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import Cone, svec, unsvec
 from robotid.estimators.consistent.solvers import nearest
 from robotid.exceptions import NotConvergedError, SettingsError
@@ -61,7 +62,7 @@ def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread)
     rows = information(inside, rng, 1.0)
     R = rows[:, :-1]
     meat = meat_over_bread * R.T @ R
-    found, failures = inside.redrawn(rows, inside.prior, meat, 3000, rng)
+    found, failures = inside.programme.redrawn(rows, 1.0, inside.prior, meat, 3000, rng)
     assert failures == []
     L = np.diag(inside.prior_std**-2)
     B = np.linalg.inv(inside.K.T @ R.T @ R @ inside.K + L)
@@ -79,7 +80,7 @@ def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
     prior[i] = 0.0
     fit = replace(inside, prior=prior, K=np.delete(inside.K, np.flatnonzero(inside.K[:, i]), 0))
     rows = information(fit, rng, 1.0)
-    found, _ = fit.redrawn(rows, prior, rows[:, :-1].T @ rows[:, :-1], 2000, rng)
+    found, _ = fit.programme.redrawn(rows, 1.0, prior, rows[:, :-1].T @ rows[:, :-1], 2000, rng)
     away = found[:, i] / fit.prior_std[i]
     assert away.min() > -2e-3
     assert np.mean(away < 2e-3) == pytest.approx(0.5, abs=0.04)
@@ -105,13 +106,13 @@ def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
 
 def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, monkeypatch):
     log = exact_log(ur5, truth(ur5), rng, samples=1000, noise=NOISE)
-    solve = Consistent.redrawn
+    solve = Programme.redrawn
 
-    def some_fail(self, rows, pi, meat, draws, rng):
-        found, _ = solve(self, rows, pi, meat, draws, rng)
+    def some_fail(self, *arguments):
+        found, _ = solve(self, *arguments)
         return found[:-lost], ["InsufficientProgress"] * lost
 
-    monkeypatch.setattr(Consistent, "redrawn", some_fail)
+    monkeypatch.setattr(Programme, "redrawn", some_fail)
     lost = 3
     found = identify(ur5, [log], signals=EXACT)
     assert "61 fits" in found.errors.method

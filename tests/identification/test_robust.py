@@ -64,7 +64,7 @@ def test_huber_is_the_minimum_of_its_loss(ur5):
     rough = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
     found = identify(ur5, [log], signals=rough, estimator=EstimatorSettings("wls", robust="huber"))
     plain = identify(ur5, [log], signals=rough, estimator="wls")
-    (evaluation,) = found.identification
+    (evaluation,) = found.fitted
     residual = log.tau - evaluation.torques["estimate"]
     scale = 1.4826 * np.median(np.abs(residual), axis=0)
 
@@ -100,7 +100,7 @@ def test_friction_that_the_filter_smears_leaves_no_residual(ur5):
     quiet = exact_log(ur5, truth(ur5), np.random.default_rng(4), samples=2000, rate=100.0)
     noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
     found = identify(ur5, [replace(quiet, tau=quiet.tau + noise)], estimator="wls")
-    (evaluation,) = found.identification
+    (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
     assert (np.where(evaluation.recording.mask, residual, 0.0) < 10 * usual).all()
@@ -113,7 +113,7 @@ def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
     step = pi[[name.endswith(".coulomb") for name in ur5.layout.names]]
     smooth = step * (np.tanh(quiet.v / 0.03) - np.sign(quiet.v))
     found = identify(ur5, [replace(quiet, tau=quiet.tau + noise + smooth)], estimator="wls")
-    (evaluation,) = found.identification
+    (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
     assert ((residual > 20 * usual) & evaluation.recording.mask).any()  # it is there

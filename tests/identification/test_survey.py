@@ -21,11 +21,11 @@ from robotid.logs.read import lay_out, read_log, write_log
 from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.logs.time_stamps import TimeStamps
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.reduction import join
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import random_fourier
-from robotid.workers.pieces import join
 
 LENGTH = 500  # rows per piece
 

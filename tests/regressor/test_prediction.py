@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from regressor.test_compiled import ROBOTS, motion
+from helpers.robots import ROBOTS, motion
 
 from robotid.exceptions import DataError
 from robotid.regressor import prediction

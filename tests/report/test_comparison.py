@@ -15,8 +15,7 @@ from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.logs.read import write_log
-from robotid.report.comparison import compare_results
-from robotid.report.comparison_page import write_comparison
+from robotid.report.comparison import compare_results, write_comparison
 from robotid.robot.model import RobotModel
 
 

@@ -4,8 +4,9 @@ import pytest
 import trimesh
 
 from robotid.robot.examples import example_urdfs
-from robotid.robot.meshes import Surface, find_mesh, read_surfaces, read_visuals, thin
+from robotid.robot.meshes import Surface, find_mesh, read_shapes, read_surfaces, thin
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import parse_urdf
 from robotid.viewer.scene import robot_scene
 
 URDF = """<robot name="r">
@@ -40,15 +41,16 @@ def package(tmp_path, monkeypatch):
 
 
 def test_visuals_are_read_with_their_poses_and_colours(package):
-    box, mesh, plain, cylinder, lost = read_visuals(package / "urdf" / "r.urdf")
-    assert (box.link, box.shape, box.size) == ("base", "box", (1, 2, 3))
+    box, mesh, plain, cylinder, lost, oops = read_shapes(parse_urdf(package / "urdf" / "r.urdf"))
+    assert (box.link, box.kind, box.size) == ("base", "box", (1, 2, 3))
     assert box.rgba == (0.5, 0.2, 0.1, 1)
-    assert (mesh.shape, mesh.size, mesh.rgba) == ("mesh", (0.5, 0.5, 0.5), (0, 1, 0, 1))
+    assert (mesh.kind, mesh.size, mesh.rgba) == ("mesh", (0.5, 0.5, 0.5), (0, 1, 0, 1))
     np.testing.assert_allclose(mesh.placement[:3, :3], pin.rpy.rpyToMatrix(0.1, -0.7, 2.5))
     np.testing.assert_allclose(mesh.placement[:3, 3], [1, 2, 3])
     assert plain.rgba is None
     assert cylinder.size == (0.1, 0.4)
     assert lost.file.endswith("lost.stl")
+    assert oops.kind == ""
 
 
 def test_a_mesh_is_found_above_the_urdf_in_the_package_path_and_by_its_path(
@@ -75,8 +77,8 @@ def test_every_mesh_of_the_example_robots_is_found_but_those_of_another_computer
     lost = [
         visual.file
         for urdf in example_urdfs()
-        for visual in read_visuals(urdf)
-        if visual.shape == "mesh" and find_mesh(visual.file, urdf) is None
+        for visual in read_shapes(parse_urdf(urdf))
+        if visual.kind == "mesh" and find_mesh(visual.file, urdf) is None
     ]
     assert [file for file in lost if not file.startswith("file:///usr/Romeo")] == []
 

@@ -13,7 +13,7 @@ from robotid._files import write_json
 from robotid.export.result import build_result
 from robotid.findings import Finding
 from robotid.identification.pipeline import identify
-from robotid.report.comparison_page import write_comparison
+from robotid.report.comparison import write_comparison
 from robotid.report.document import write_report
 from robotid.robot.model import RobotModel
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.viewer.unexplained import find_surprises
+from robotid.viewer.unexplained import find_unexplained
 
 T = np.arange(2000) / 100.0  # [s]
 JOINTS = ("a", "b", "c")
@@ -13,14 +13,14 @@ def torques(rng):
     return tau, tau + rng.normal(0.0, 0.5, tau.shape)
 
 
-def test_noise_is_no_surprise(torques):
-    assert find_surprises(T, *torques, JOINTS) == ()
+def test_noise_is_explained(torques):
+    assert find_unexplained(T, *torques, JOINTS) == ()
 
 
 def test_a_joint_that_is_poorly_explained_throughout_is_none_either(torques, rng):
     tau, predicted = torques
     predicted = predicted + rng.normal(0.0, 4.0, tau.shape)
-    assert find_surprises(T, tau, predicted, JOINTS) == ()
+    assert find_unexplained(T, tau, predicted, JOINTS) == ()
 
 
 def test_a_push_is_found_with_its_joint_its_time_and_its_size(torques):
@@ -28,7 +28,7 @@ def test_a_push_is_found_with_its_joint_its_time_and_its_size(torques):
     tau = tau.copy()
     tau[500:560, 1] += 8.0
     tau[500:560, 2] += 5.0
-    (found,) = find_surprises(T, tau, predicted, JOINTS)
+    (found,) = find_unexplained(T, tau, predicted, JOINTS)
     assert found.joint == "b"
     # the mean over 0.2 s begins to rise half a window early
     assert found.start == pytest.approx(5.0, abs=0.11)
@@ -41,15 +41,15 @@ def test_two_pushes_far_apart_are_two_and_near_ones_are_one(torques):
     tau = tau.copy()
     for row in (500, 560, 1200):
         tau[row : row + 30, 0] -= 9.0
-    first, second = find_surprises(T, tau, predicted, JOINTS)
+    first, second = find_unexplained(T, tau, predicted, JOINTS)
     assert first.end - first.start == pytest.approx(0.9, abs=0.2)
     assert second.start == pytest.approx(12.0, abs=0.11)
 
 
-def test_where_nothing_is_predicted_nothing_is_a_surprise(torques):
+def test_where_nothing_is_predicted_nothing_is_unexplained(torques):
     tau, predicted = torques
     tau, predicted = tau.copy(), predicted.copy()
     tau[500:560] += 50.0
     predicted[480:580] = np.nan
-    assert find_surprises(T, tau, predicted, JOINTS) == ()
-    assert find_surprises(T, tau, np.full_like(tau, np.nan), JOINTS) == ()
+    assert find_unexplained(T, tau, predicted, JOINTS) == ()
+    assert find_unexplained(T, tau, np.full_like(tau, np.nan), JOINTS) == ()

@@ -82,7 +82,7 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
 def test_half_a_file_is_never_taken_for_a_piece(tmp_path):
     pieces = interrupted(tmp_path)
     folder = tmp_path / ".robotid-checkpoint"
-    (folder / "piece-000005.partial").write_bytes(b"PK")
+    (folder / ".piece-000005.npz.321").write_bytes(b"PK")
     assert sorted(Checkpoint.open(tmp_path, INPUTS, pieces, resume=True).finished()) == [0, 1, 2]
 
 

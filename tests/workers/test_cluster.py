@@ -3,12 +3,20 @@
 import os
 
 import pytest
-from helpers.piecework import marks, pieces_in, reduce_all, reduced, same_bits, workers_of
+from helpers.piecework import (
+    local_cluster,
+    marks,
+    pieces_in,
+    reduce_all,
+    reduced,
+    same_bits,
+    workers_of,
+)
 
 from robotid.exceptions import DataError, WorkerError
+from robotid.regressor.reduction import join
 from robotid.workers import cluster
 from robotid.workers.cluster import ClusterBackend
-from robotid.workers.pieces import join
 
 distributed = pytest.importorskip("distributed")
 
@@ -16,13 +24,7 @@ distributed = pytest.importorskip("distributed")
 @pytest.fixture(scope="module")
 def address():
     """The address of a cluster with two workers, each a process of its own."""
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        silence_logs=50,
-    ) as cluster:
+    with local_cluster() as cluster:
         yield cluster.scheduler_address
 
 

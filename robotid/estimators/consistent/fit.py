@@ -28,7 +28,7 @@ from robotid.estimators.consistent.penalties import (
     body_units,
     make_penalty,
 )
-from robotid.estimators.consistent.solvers import SOLVERS, ConeSolution
+from robotid.estimators.consistent.solvers import SOLVERS
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError
@@ -53,8 +53,8 @@ class Consistent(BatchEstimator):
     without the inequalities, from weighted least squares onwards.
 
     An estimate is over the p standard parameters, its covariance that of the fit without the
-    inequalities; ``redrawn`` tells that with them. Its rank, condition number and the names of
-    undetermined parameters are those of the base parameters.
+    inequalities; ``Programme.redrawn`` tells that with them. Its rank, condition number and the
+    names of undetermined parameters are those of the base parameters.
 
     Attributes:
         layout: The standard parameters.
@@ -123,7 +123,7 @@ class Consistent(BatchEstimator):
         wls = self._wls(factors)
         sigma = self.noise(factors, wls.sigma)
         rows = self.rows(factors, sigma)
-        solution, covariance = self.minimise(rows)
+        solution, covariance = self.programme.minimise(rows, self.prior_weight)
         details = self._details(solution.x)
         if self.check:
             details["check"] = self._second_opinion(rows, solution.x, factors)
@@ -166,7 +166,7 @@ class Consistent(BatchEstimator):
                 "or 'kalman', which have one"
             )
         rows = _information_rows(estimate, known)  # (k, b + 1)
-        solution, covariance = self.minimise(rows)
+        solution, covariance = self.programme.minimise(rows, self.prior_weight)
         return replace(
             estimate,
             theta=solution.x,
@@ -204,39 +204,8 @@ class Consistent(BatchEstimator):
         """
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
-    def minimise(self, rows: Array) -> tuple[ConeSolution, Array]:
-        """Minimise |rows [K pi; -1]|^2 and the weighted penalty over the cone.
-
-        Args:
-            rows: Information, shape (k, b + 1), as of ``rows``.
-
-        Returns:
-            The solution, its x being pi, shape (p,); and the covariance without the inequalities.
-
-        Raises:
-            NotConvergedError: If the cone solver or Newton's method does not solve it.
-        """
-        return self.programme.minimise(rows, self.prior_weight)
-
-    def redrawn(
-        self, rows: Array, pi: Array, meat: Array, draws: int, rng: np.random.Generator
-    ) -> tuple[Array, list[str]]:
-        """Return how fits lie about this one whose data and prior are drawn anew.
-
-        Args:
-            rows: Information, shape (k, b + 1), as of ``rows``.
-            pi: The fit, shape (p,).
-            meat: Covariance of the score of the rows, shape (b, b).
-            draws: How many.
-            rng: Source of the noise.
-
-        Returns:
-            See ``Programme.redrawn``.
-        """
-        return self.programme.redrawn(rows, self.prior_weight, pi, meat, draws, rng)
-
     def objective(self, rows: Array, pi: Array) -> float:
-        """Return what ``minimise`` minimises.
+        """Return what the fit minimises.
 
         Args:
             rows: Information, shape (k, b + 1).
@@ -333,7 +302,8 @@ class Consistent(BatchEstimator):
         """Return what the other solver makes of it, as plain values."""
         (other,) = (name for name in SOLVERS if name != self.solver)
         try:
-            solution, _ = replace(self, solver=other).minimise(rows)
+            programme = replace(self.programme, solver=other)
+            solution, _ = programme.minimise(rows, self.prior_weight)
         except NotConvergedError as error:
             return {"solver": other, "status": error.status}
         objective = self.objective(rows, pi)

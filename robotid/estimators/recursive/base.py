@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import fields
@@ -11,6 +10,7 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 
+from robotid._files import written_whole
 from robotid._typing import Array
 from robotid.estimators.estimator import Estimate, Estimator, require_rows
 from robotid.exceptions import DataError, RankDeficientError
@@ -155,13 +155,10 @@ def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
         state: A frozen dataclass of arrays and numbers.
         path: The file; written beside its place first.
     """
-    target = Path(path)
     content = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state)}
     kind = np.frombuffer(json.dumps(type(state).__name__).encode(), dtype=np.uint8)
-    beside = target.with_name(f".{target.name}.{os.getpid()}")
-    with open(beside, "wb") as stream:
+    with written_whole(path) as beside, open(beside, "wb") as stream:
         np.savez(stream, allow_pickle=False, __kind__=kind, **content)
-    os.replace(beside, target)
 
 
 def load_state(path: str | Path, kind: type[StateT]) -> StateT:

@@ -290,8 +290,8 @@ function showArcs(row) {
 
 const plots = [];
 const style = getComputedStyle(document.documentElement);
-const ink = () => style.getPropertyValue("--ink").trim();
-const rule = () => style.getPropertyValue("--rule").trim();
+const ink = () => style.getPropertyValue("--text").trim();
+const rule = () => style.getPropertyValue("--line").trim();
 
 function axis(extra) {
   return { stroke: ink, grid: { stroke: rule, width: 1 }, ticks: { stroke: rule, width: 1 },

@@ -88,7 +88,7 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
     for k in range(3):
         others = [s for i, s in enumerate(stretches) if i != k]
         rows = fit.rows(merge(others), NOISE)
-        pi = replace(fit, prior_weight=2.0).minimise(rows)[0].x
+        pi = fit.programme.minimise(rows, 2.0)[0].x
         W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE

@@ -2,20 +2,19 @@
 
 import numpy as np
 import pytest
+from helpers.base_dynamics import BaseDynamics
 from helpers.synthetic import truth
 
 from robotid.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.paper import planar_2r
-from robotid.paper.closed_loop import run_procedure
 from robotid.paper.dynamics import (
-    BaseDynamics,
     LinearPlant,
     PlanarDynamics,
     mass_matrix,
     smallest_eigenvalue,
 )
 from robotid.paper.formulas import Bounds, recursive_update
-from robotid.paper.procedure import Influences, LoopSettings, random_torque
+from robotid.paper.procedure import Influences, LoopSettings, random_torque, run_procedure
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.simulation.plant import RobotPlant

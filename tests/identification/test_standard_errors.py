@@ -5,8 +5,7 @@ import scipy.stats
 
 from robotid.estimators import WLS
 from robotid.exceptions import DataError
-from robotid.identification.standard_errors import measured_errors
-from robotid.identification.uncertainty import quantile, scatter
+from robotid.identification.standard_errors import measured_errors, quantile, scatter
 from robotid.regressor.factors import compress, merge
 from robotid.regressor.problem import Problem
 

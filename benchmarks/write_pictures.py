@@ -1,0 +1,45 @@
+"""Write the README's pictures, report.png and replay.png, from a fresh ``robotid demo``.
+
+    python benchmarks/write_pictures.py
+
+It needs the extra [dev] and a Chromium.
+"""
+
+import sys
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+HERE = ROOT / "docs" / "pictures"
+sys.path.insert(0, str(ROOT / "tests"))
+from helpers.browsing import launch, visit
+
+from robotid.commands.demo import run_demo
+
+
+def main():
+    with tempfile.TemporaryDirectory() as name, contextmanager(launch)() as browser:
+        folder = Path(name)
+        run_demo(folder)
+        with visit(browser, folder / "report.html", size=(1000, 870)) as seen:
+            seen.page.screenshot(path=HERE / "report.png")
+        with visit(browser, folder / "replay.html", size=(1200, 640)) as seen:
+            seen.page.wait_for_timeout(3000)  # [ms] the robot is on its way
+            for body in ("wrist_1", "wrist_2", "wrist_3"):  # their ellipsoids hide the robot
+                for box in seen.page.get_by_label(f": {body}_link").all():
+                    box.uncheck()
+            seen.page.mouse.move(400, 300)
+            for _ in range(8):
+                seen.page.mouse.wheel(0, -100)  # nearer
+                seen.page.wait_for_timeout(100)
+            seen.page.wait_for_timeout(1000)
+            seen.page.screenshot(path=HERE / "replay.png")
+    for picture in HERE.glob("*.png"):
+        Image.open(picture).convert("RGB").quantize(192).save(picture, optimize=True)
+
+
+if __name__ == "__main__":
+    main()

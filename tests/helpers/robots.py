@@ -1,0 +1,40 @@
+"""Robots of all kinds of joints, and motions of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+
+from robotid.logs.data import Trajectory
+from robotid.robot.parameters import Coupling
+
+WRIST = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -0.5)))
+ROBOTS = {
+    "six turning joints": ("ur5_robot.urdf", {}),
+    "coupled drives": ("ur5_robot.urdf", {"couplings": (WRIST,)}),
+    "locked joints, other order": (
+        "ur5_robot.urdf",
+        {"joints": ["wrist_2_joint", "elbow_joint"], "locked": {"wrist_1_joint": 0.7}},
+    ),
+    "other gravity": ("ur5_robot.urdf", {"gravity": (3.0, -5.0, 8.0)}),
+    "gripper that slides": ("panda.urdf", {}),
+    "mimic joint coupled": ("panda.urdf", {"mimic": "coupled"}),
+    "continuous joints": ("double_pendulum_continuous.urdf", {}),
+    "torso that slides": ("tiago_no_hand.urdf", {}),
+    "unaligned axes": ("finger_edu.urdf", {}),
+    "unaligned axes, floating": ("borinot_flying_arm_2.urdf", {"free_flyer": True}),
+    "humanoid": ("talos_reduced.urdf", {}),
+    "humanoid, floating": ("talos_reduced.urdf", {"free_flyer": True}),
+}
+
+
+def motion(model, rng, samples, reach=3.0, direction=None):
+    n = len(model.joints)
+    q = rng.uniform(-reach, reach, (samples, n))
+    v, a, tau = rng.uniform(-2, 2, (3, samples, model.n_rows))
+    values = {"t": np.arange(samples) / 100, "v": v, "a": a, "tau": tau, "joints": model.joints}
+    values["direction"] = direction
+    if model.free_flyer:  # logs of a floating base are not read yet
+        pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
+        return SimpleNamespace(q=np.hstack([pose, q]), **values)
+    return Trajectory(q=q, rate=100.0, segment=np.zeros(samples, dtype=int), **values)
