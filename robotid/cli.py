@@ -12,8 +12,7 @@ from robotid.commands.console import (
     print_files,
     print_inspection,
     print_result,
-    print_table,
-    print_verdict,
+    print_validation,
     shown_log,
 )
 from robotid.commands.flags import (
@@ -324,11 +323,7 @@ def _validate(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(found, allow_nan=False))
         return
-    print(f"predicted with {found['predicted_with']}")
-    for recording in found["validation"]:
-        print(f"\n{recording['log']}")
-        print_table(recording["per_joint"], {})
-    print_verdict(found["verdict"])
+    print_validation(found)
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -18,7 +18,6 @@ from robotid.export.sidecar import load_identified
 from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
-from robotid.identification.metrics import Metrics
 from robotid.identification.pipeline import Identification
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -82,7 +81,7 @@ def build_result(
         "standard_parameters": _standard_parameters(identification),
         "drive_parameters": _drive_parameters(identification),
         "consistency": _consistency(identification),
-        "identification": _metrics(identification.metrics()),
+        "identification": identification.metrics().to_dict(),
         "validation": [
             recording_metrics(e, "estimate") | {"band": _band(identification, e)}
             for e in identification.validation
@@ -91,7 +90,7 @@ def build_result(
         "wls": {
             "base_values": identification.wls.theta.tolist(),
             "base_std_errors": [_finite(error) for error in identification.wls.std_error],
-            "identification": _metrics(identification.metrics("wls")),
+            "identification": identification.metrics("wls").to_dict(),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
         "verdict": verdict.to_dict(),
@@ -108,7 +107,7 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     Returns:
         The dictionary.
     """
-    return {"log": evaluation.recording.log.path, **_metrics(evaluation.metrics[name])}
+    return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,25 +327,6 @@ def _consistency(identification: Identification) -> dict[str, Any]:
 
 def _smallest(J: Array) -> float:
     return float(np.linalg.eigvalsh(J)[0])
-
-
-def _metrics(metrics: Metrics) -> dict[str, Any]:
-    return {
-        "per_joint": {
-            joint: {
-                "rmse": m.rmse,
-                "unit": m.unit,
-                "relative_error_pct": m.relative_error_pct,
-                "r2": m.r2,
-                "rows": m.rows,
-                "urdf_relative_error_pct": m.baselines["urdf"],
-                "gravity_only_relative_error_pct": m.baselines["gravity_only"],
-                "better_than_constant": m.better_than_constant,
-            }
-            for joint, m in metrics.per_joint.items()
-        },
-        "pooled_rmse": metrics.pooled_rmse,
-    }
 
 
 def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:
