@@ -23,6 +23,7 @@ from setting import ROBOTS, machine
 
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import survey_logs
+from robotid.identification.recordings import Recordings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.reduction import join
 from robotid.robot.examples import example_urdf
@@ -80,8 +81,8 @@ def survey(path, rows_in_memory):
         rows_in_memory=rows_in_memory,
     )
     model = job.model()
-    (log,) = survey_logs(job, [entry], model, structural_mapping(model))
-    return log.pieces
+    fitted, _ = survey_logs(job, model, job.identification, ())
+    return Recordings(model, structural_mapping(model), fitted).pieces
 
 
 def timed(plan, pieces):

@@ -31,7 +31,8 @@ PAGES = {
     "replay": "replay.md",
 }
 BLOCK = re.compile(
-    r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n(?P<body>.*?)<!-- end of table -->",
+    r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"
+    r"(?P<body>.*?)<!-- end of table -->",
     re.DOTALL,
 )
 

@@ -11,6 +11,7 @@ from inspect import isfunction
 from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 
 __all__ = ["NOT_NEGATIVE", "POSITIVE", "Key", "Range", "Settings", "check_keys", "setting"]
 
@@ -212,7 +213,7 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
 def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
     if value is None:
         return
-    words = f"one of {list(key.among)}" if key.among else ""
+    words = f"one of {listed(key.among)}" if key.among else ""
     if key.within is not None:
         words = f"{key.within.words} or {words}" if words else key.within.words
     is_right = not words

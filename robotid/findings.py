@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Finding", "by_severity"]
+__all__ = ["Finding", "by_severity", "listed"]
 
 _RANK = {"error": 0, "warning": 1, "note": 2}
 
@@ -25,6 +25,22 @@ class Finding:
     where: str
     message: str
     evidence: Mapping[str, float] = field(default_factory=dict)
+
+
+def listed(names: Iterable[object], limit: int | None = None) -> str:
+    """Return names as a sentence holds them, "a, b and 12 more".
+
+    Args:
+        names: The names.
+        limit: How many of them are named; all if None.
+
+    Returns:
+        The names with commas; "none" if there is none.
+    """
+    words = [str(name) for name in names]
+    shown = words[:limit]
+    more = f" and {len(words) - len(shown)} more" if len(words) > len(shown) else ""
+    return (", ".join(shown) or "none") + more
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:

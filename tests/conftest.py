@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 from helpers.browsing import launch
 from helpers.paths import IN_CI, ROOT
+from helpers.synthetic import exact_log, truth
 
 from robotid.doctor.urdf import inspect_urdf
+from robotid.identification.pipeline import identify
+from robotid.logs.data import Log
+from robotid.logs.read import read_log, write_log
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf, example_urdfs
 from robotid.robot.model import RobotModel
 
@@ -47,3 +52,28 @@ def recordings():
 def browser():
     """The system's Chromium; see browsing.py."""
     yield from launch()
+
+
+@pytest.fixture(scope="session")
+def identified(ur5, tmp_path_factory):
+    """A UR5 identified from files of synthetic logs; no two of its figures are alike.
+
+    Two logs were fitted, one was kept apart and has a gap; noise differs from joint to joint, and
+    is so large that prior and data, and WLS and the estimate, say different things.
+    """
+    folder, rng = tmp_path_factory.mktemp("identified"), np.random.default_rng(7)
+    noise = np.array([4.0, 8.0, 6.0, 1.6, 1.0, 0.6])  # [N m]
+    logs = {}
+    for name, samples, rate in (("first", 180, 50.0), ("second", 140, 40.0), ("kept", 300, 50.0)):
+        log = exact_log(ur5, truth(ur5), rng, samples=samples, rate=rate, noise=noise)
+        rows = np.ones(samples, dtype=bool)
+        rows[120:150] = name != "kept"
+        parts = {key: getattr(log, key)[rows] for key in ("t", "q", "v", "a", "tau")}
+        write_log(Log(joints=log.joints, **parts), folder / f"{name}.csv")
+        logs[name] = read_log(folder / f"{name}.csv", ur5.joints)
+    return identify(
+        ur5,
+        [logs["first"], logs["second"]],
+        validation=[logs["kept"]],
+        signals=SignalSettings(cutoff=12.0, min_velocity=0.05),
+    )

@@ -17,7 +17,8 @@ PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
     "exceptions",
-    "findings versions _files _html _settings _typing",
+    "findings versions _files _html _typing",
+    "_settings",
     "robot logs",
     "regressor",
     "estimators simulation workers",

@@ -1,18 +1,18 @@
 """Examine the logs of a job before anything is identified."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from pathlib import Path
 
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import examine_locked, is_long, survey_logs
+from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import alarming, diagnose
+from robotid.doctor.locked_joints import check_locked
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity
-from robotid.logs.data import Log
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.identification.survey import SurveyedLog
 from robotid.robot.model import RobotModel
 
-__all__ = ["examine"]
+__all__ = ["examine", "examine_logs"]
 
 
 def examine(job: Job) -> tuple[Finding, ...]:
@@ -30,40 +30,38 @@ def examine(job: Job) -> tuple[Finding, ...]:
     """
     alarming([], job.ignore)
     model = job.model()
+    refused: list[Finding] = []
+
+    def refuse(entry: LogEntry, error: DataError) -> None:
+        refused.append(Finding(error.code, "error", entry.path.name, str(error)))
+
+    fitted, kept = survey_logs(job, model, job.identification, job.validation, refuse=refuse)
+    return by_severity([*refused, *examine_logs(job, model, fitted, kept)])
+
+
+def examine_logs(
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], kept: Sequence[SurveyedLog]
+) -> tuple[Finding, ...]:
+    """Examine logs that were surveyed: their windows, and the joints that the job holds still.
+
+    Args:
+        job: The job.
+        model: Its robot.
+        fitted: Its logs to fit.
+        kept: Its logs kept apart.
+
+    Returns:
+        The findings, held joints first.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
     findings: list[Finding] = []
-    read = _look if is_long(job, (*job.identification, *job.validation)) else _read
-    fitted, kept = (
-        read(job, model, entries, findings) for entries in (job.identification, job.validation)
-    )
-    return by_severity([*findings, *diagnose(model, fitted, kept, job.signals)])
-
-
-def _read(
-    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
-) -> list[Log]:
-    """Return the logs that can be read; why the others cannot goes to the findings."""
-    logs = []
-    for entry in entries:
-        try:
-            logs.append(job.read(entry, model))
-            findings += examine_locked(job, model, [entry])
-        except DataError as error:
-            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
-    return logs
-
-
-def _look(
-    job: Job, model: RobotModel, entries: Sequence[LogEntry], findings: list[Finding]
-) -> list[Log]:
-    """Return windows of logs that are too long to be in memory."""
-    mapping, looks = structural_mapping(model), []
-    for entry in entries:
-        try:
-            (log,) = survey_logs(job, [entry], model, mapping)
-        except DataError as error:
-            findings.append(Finding(error.code, "error", entry.path.name, str(error)))
-            continue
-        notes, name = log.head.notes, entry.path.name
-        findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
-        looks += [replace(look, notes=()) for look in log.looks]
-    return looks
+    for log in (*fitted, *kept):
+        name = Path(log.path).name
+        findings += check_locked(model, log.held, name, job.locked)
+        if len(log.windows) > 1:  # the windows have no notes of their own
+            notes = log.head.notes
+            findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
+    first, second = ([look for log in logs for look in log.looks] for logs in (fitted, kept))
+    return (*findings, *diagnose(model, first, second, job.signals))

@@ -9,21 +9,19 @@ from typing import Any
 
 from robotid._files import folder_beside, write_json
 from robotid.commands.checkpoint_inputs import checkpoint_inputs
+from robotid.commands.doctor import examine_logs
 from robotid.commands.job import Job
-from robotid.commands.logs import examine_locked, is_long, survey_logs
-from robotid.doctor.diagnosis import alarming, diagnose
+from robotid.commands.logs import survey_logs
+from robotid.doctor.diagnosis import alarming
 from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
 from robotid.findings import Finding
 from robotid.identification.doubts import doubts_of
-from robotid.identification.findings import consistency_findings
-from robotid.identification.long_recordings import LongRecordings
-from robotid.identification.pipeline import Identification, conclude, identify
-from robotid.identification.settings import BoundedSettings
-from robotid.identification.verdict import Doubt
-from robotid.logs.data import Log
+from robotid.identification.findings import fit_findings, locked_findings, log_findings
+from robotid.identification.pipeline import Identification, conclude
+from robotid.identification.recordings import Recordings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.report.document import write_report
 from robotid.robot.model import RobotModel
@@ -33,10 +31,6 @@ from robotid.workers.plan import WorkPlan
 __all__ = ["run_job"]
 
 _log = logging.getLogger(__name__)
-
-_NAMED = 5  # outliers that a finding names
-_WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
-_DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is worth a word
 
 
 def run_job(
@@ -67,20 +61,7 @@ def run_job(
         raise SettingsError(
             f"{str(target)!r} is a file, wanted a folder for the results; name another"
         )
-    chosen = plan or WorkPlan(job.workers or 1)
-    checkpoint: Checkpoint | None = None
-    if is_long(job, (*job.identification, *job.validation)):
-        identification, findings, checkpoint = _identify_long(job, model, target, chosen)
-    else:
-        if chosen.is_asked_for:
-            _log.warning(
-                "the logs have no more than %d rows and are read at once: workers, scheduler and "
-                "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
-                job.rows_in_memory,
-            )
-        identification, findings = _identify(job, model)
-    findings += _fit_findings(identification)
-    identification = replace(identification, doubts=_doubts(job, identification, findings))
+    identification, findings, checkpoint = _identify(job, model, target, plan)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {"report": "report.html"}
@@ -109,41 +90,45 @@ def _remove_urdf(urdf: Path) -> None:
             stale.unlink()
 
 
-def _identify(job: Job, model: RobotModel) -> tuple[Identification, list[Finding]]:
-    """Identify from logs in memory."""
-    logs = [job.read(entry, model) for entry in job.identification]
-    kept = [job.read(entry, model) for entry in job.validation]
-    held = examine_locked(job, model, [*job.identification, *job.validation])
-    diagnosis = (*held, *diagnose(model, logs, kept, job.signals))
-    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.is_robust)
-    with _explained(diagnosis):
-        identification = identify(
-            model, logs, validation=kept, signals=job.signals, estimator=job.estimator
-        )
-    return _with_alarms(job, model, identification, [*logs, *kept], diagnosis, alarms)
-
-
-def _identify_long(
-    job: Job, model: RobotModel, folder: Path, plan: WorkPlan
-) -> tuple[Identification, list[Finding], Checkpoint]:
-    """Identify from logs that are read in pieces; finished ones are kept in the folder."""
-    mapping = structural_mapping(model)
-    logs = survey_logs(job, job.identification, model, mapping)
-    kept = survey_logs(job, job.validation, model, mapping)
-    if not logs:
+def _identify(
+    job: Job, model: RobotModel, folder: Path, plan: WorkPlan | None
+) -> tuple[Identification, list[Finding], Checkpoint | None]:
+    """Identify from the job's logs; finished pieces of long ones are kept in the folder."""
+    fitted, kept = survey_logs(job, model, job.identification, job.validation)
+    if not fitted:
         raise DataError("no log was given; at least one is needed to identify anything")
-    fitted_looks, kept_looks = (
-        [look for log in some for look in log.looks] for some in (logs, kept)
-    )
-    diagnosis = diagnose(model, fitted_looks, kept_looks, job.signals)
-    alarms = alarming(diagnosis, job.ignore, is_robust=job.estimator.is_robust)
-    pieces = [piece for log in logs for piece in log.pieces]
-    checkpoint = Checkpoint.open(folder, checkpoint_inputs(job), pieces, resume=plan.resume)
-    with plan, _explained(diagnosis):
-        recordings = LongRecordings(model, logs, kept, plan, checkpoint)
-        identification = conclude(model, recordings, job.estimator)
-    heads = [log.head for log in (*logs, *kept)]
-    return *_with_alarms(job, model, identification, heads, diagnosis, alarms), checkpoint
+    diagnosis = examine_logs(job, model, fitted, kept)
+    is_robust = job.estimator.is_robust
+    alarms = alarming(diagnosis, job.ignore, is_robust=is_robust)
+    recordings = Recordings(model, structural_mapping(model), fitted, kept)
+    chosen, checkpoint = plan or WorkPlan(job.workers or 1), None
+    if not recordings.is_held:
+        checkpoint = Checkpoint.open(
+            folder, checkpoint_inputs(job), recordings.pieces, resume=chosen.resume
+        )
+        recordings = replace(recordings, plan=chosen, checkpoint=checkpoint)
+    elif chosen.is_asked_for:
+        _log.warning(
+            "the logs have no more than %d rows and are read at once: workers, scheduler and "
+            "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
+            job.rows_in_memory,
+        )
+    with chosen, _explained(diagnosis):
+        identification = conclude(recordings, job.estimator)
+    stated = model.locked if job.mimic == "coupled" else job.locked
+    findings = locked_findings(model, stated)
+    findings += log_findings([log.head for log in (*fitted, *kept)])
+    findings += impossible_inertials(model)
+    # what the motion excites the fit tells from all rows: finding "undetermined"
+    findings += [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
+    findings += fit_findings(identification)
+    told = [finding for finding in findings if finding.code not in job.ignore]
+    names = [
+        Path(e.recording.log.path).name for e in identification.validation if not e.is_refitted
+    ]
+    doubts = doubts_of(told, model.joints, names, is_robust=is_robust)
+    messages = tuple(finding.message for finding in alarms)
+    return replace(identification, alarms=messages, doubts=doubts), findings, checkpoint
 
 
 @contextmanager
@@ -156,128 +141,3 @@ def _explained(diagnosis: Sequence[Finding]) -> Iterator[None]:
             if finding.severity != "note":
                 error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
         raise
-
-
-def _with_alarms(
-    job: Job,
-    model: RobotModel,
-    identification: Identification,
-    logs: Sequence[Log],
-    diagnosis: Sequence[Finding],
-    alarms: Sequence[Finding],
-) -> tuple[Identification, list[Finding]]:
-    """Return the identification with its alarms, and what is worth a word so far."""
-    findings = [*_locked_findings(job, model), *_log_findings(logs)]
-    findings += impossible_inertials(model)
-    # what the motion excites the fit tells from all rows: finding "undetermined"
-    findings += [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
-    messages = tuple(finding.message for finding in alarms)
-    return replace(identification, alarms=messages), findings
-
-
-def _doubts(
-    job: Job, identification: Identification, findings: Sequence[Finding]
-) -> tuple[Doubt, ...]:
-    """Return what makes the result doubtful, but for what the user knows better."""
-    kept = [Path(e.recording.log.path).name for e in identification.validation if not e.is_refitted]
-    told = [finding for finding in findings if finding.code not in job.ignore]
-    is_robust = job.estimator.is_robust
-    return doubts_of(told, identification.model.joints, kept, is_robust=is_robust)
-
-
-def _locked_findings(job: Job, model: RobotModel) -> list[Finding]:
-    assumed = [name for name in model.locked if name not in job.locked and job.mimic != "coupled"]
-    if not assumed:
-        return []
-    message = (
-        f"the joints {assumed} are neither identified nor locked in the job: they are taken to "
-        "stand at 0; state their true positions with locked = { joint = position }"
-    )
-    return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
-
-
-def _log_findings(logs: Sequence[Log]) -> list[Finding]:
-    by_note: dict[str, list[str]] = {}
-    for log in logs:
-        for note in log.notes:
-            by_note.setdefault(note, []).append(Path(log.path).name)
-    return [
-        Finding("log_note", "note", ", ".join(names), f"{', '.join(names)}: {note}")
-        for note, names in by_note.items()
-    ]
-
-
-def _outlier_findings(identification: Identification) -> list[Finding]:
-    outliers = identification.outliers
-    if not outliers:
-        return []
-    places = [
-        f"{o.joint} at {o.t:.3f} s of {o.log}: {o.torque:.4g} against {o.predicted:.4g} predicted, "
-        f"{o.size:.0f} times its usual residual"
-        for o in outliers[:_NAMED]
-    ]
-    more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
-    advice = (
-        "they were weighted down"
-        if identification.estimator.is_robust
-        else "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
-    )
-    message = (
-        f"{len(outliers)} places of the fitted logs are not explained: {'; '.join(places)}{more}; "
-        f"{advice}"
-    )
-    evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
-    return [Finding("outliers", "warning", outliers[0].joint, message, evidence)]
-
-
-def _asked(identification: Identification) -> str:
-    """Return in words what the user asks of the parameters, empty if nothing."""
-    settings = identification.estimator
-    if not isinstance(settings, BoundedSettings):
-        return ""
-    asked = {key: value for key, value in settings.constraints.items() if value}
-    if settings.margin > _WIDE:
-        asked["margin"] = settings.margin
-    return f"what [estimator] asks for ({asked}), " if asked else ""
-
-
-def _fit_findings(identification: Identification) -> list[Finding]:
-    findings = []
-    known = identification.determination
-    if known.groups:
-        message = (
-            f"the data determine {known.rank} of {len(known.names)} base parameters: "
-            f"{known.in_words()}. What they leave open keeps the URDF's values; record a richer "
-            "trajectory to determine it"
-        )
-        findings.append(Finding("undetermined", "warning", "base_parameters", message))
-    if not identification.is_consistent:
-        message = (
-            f"the {identification.estimator.name} estimate is not physically consistent, so no "
-            "URDF was written; use the 'consistent' estimator for one that loads"
-        )
-        findings.append(Finding("urdf_not_written", "warning", "urdf", message))
-    findings += consistency_findings(identification)
-    findings += _outlier_findings(identification)
-    for evaluation in identification.refitted:
-        message = (
-            f"the validation log {evaluation.recording.name} holds rows that were fitted: its "
-            "score shows the fit, not the prediction; validate on another recording"
-        )
-        where = evaluation.recording.log.path
-        findings.append(Finding("validation_was_fitted", "warning", where, message))
-    ours, wls = identification.metrics(), identification.metrics("wls")
-    asked = _asked(identification)
-    for joint, measured in ours.per_joint.items():
-        if measured.rmse > _DIFFERS * wls.per_joint[joint].rmse:
-            message = (
-                f"{joint}: the residual is {measured.rmse:.3g} {measured.unit} against "
-                f"{wls.per_joint[joint].rmse:.3g} of unconstrained WLS: physics and data disagree "
-                f"there; check {asked}the torque scale (gains), the drive model and the payload"
-            )
-            evidence = {
-                "error_pct": measured.relative_error_pct or 0.0,
-                "wls_error_pct": wls.per_joint[joint].relative_error_pct or 0.0,
-            }
-            findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
-    return findings

@@ -11,9 +11,10 @@ import numpy as np
 from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.result import load_result, stated_parameters
-from robotid.identification.evaluation import predict, prepare
+from robotid.export.result import read_result, stated_parameters
+from robotid.identification.evaluation import predict
 from robotid.identification.pipeline import Identification
+from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource
@@ -76,7 +77,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
                 continue
             name = file.resolve().parent.name if len(paths) > 1 else "identified"
             label = name if name not in results else f"{name} {len(results) + 1}"
-            results[label] = load_result(file).content
+            results[label] = read_result(file)
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
     folder, content = tracks[0] if tracks else (None, None)
@@ -198,10 +199,10 @@ def _track(path: Path) -> Mapping[str, Any] | None:
 def _torques(job: Job, model: RobotModel, log: Log, vectors: Mapping[str, Array]) -> Torques:
     if not vectors:
         return Torques(log.t, log.tau)
-    recording = prepare(model, log, job.signals)
-    motion = recording.trajectory
+    rows = hold_log(model, log, job.signals).whole
+    motion = rows.trajectory
     predicted = predict(model, list(vectors.values()), motion)
-    shown = [_sure(torque, recording.mask) for torque in predicted]
+    shown = [_sure(torque, rows.mask) for torque in predicted]
     return Torques(motion.t, motion.tau, dict(zip(vectors, shown, strict=True)))
 
 

@@ -6,17 +6,16 @@ from typing import Any
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import is_long, survey_logs
+from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import alarming, diagnose
 from robotid.export.result import load_result, recording_metrics, stated_parameters
 from robotid.findings import Finding
 from robotid.identification.doubts import doubts_of
-from robotid.identification.evaluation import Evaluation, evaluate, prepare, shares_rows
-from robotid.identification.long_recordings import evaluate_long
+from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
 from robotid.identification.metrics import Metrics
+from robotid.identification.survey import SurveyedLog
 from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
 __all__ = ["validate_result"]
@@ -51,15 +50,8 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
-    if is_long(job, entries):
-        surveyed = survey_logs(job, entries, model, structural_mapping(model))
-        evaluations = [evaluate_long(log, parameters, prior) for log in surveyed]
-        kept = [log.looks for log in surveyed]
-    else:
-        read = [job.read(entry, model) for entry in entries]
-        recordings = [prepare(model, log, job.signals) for log in read]
-        evaluations = [evaluate(model, r, parameters, prior) for r in recordings]
-        kept = [(log,) for log in read]
+    (kept,) = survey_logs(job, model, entries)
+    _, evaluations = evaluate_logs((), kept, parameters, prior)
     fitted, missing = _fitted_logs(job, source, result)
     verdict = _verdict(job, source, result, evaluations, kept, fitted, missing)
     return {
@@ -80,10 +72,8 @@ def _fitted_logs(
         e.path.name for e, there in zip(job.identification, is_there, strict=True) if not there
     ]
     entries = [e for e, there in zip(job.identification, is_there, strict=True) if there]
-    if is_long(job, entries):
-        surveyed = survey_logs(job, entries, model, structural_mapping(model))
-        return [look for log in surveyed for look in log.looks], missing
-    return [job.read(entry, model) for entry in entries], missing
+    (surveyed,) = survey_logs(job, model, entries)
+    return [look for log in surveyed for look in log.looks], missing
 
 
 def _hashes(result: Mapping[str, Any]) -> set[str]:
@@ -96,19 +86,22 @@ def _verdict(
     model: RobotModel,
     result: Mapping[str, Any],
     evaluations: Sequence[Evaluation],
-    kept: Sequence[Sequence[Log]],
+    kept: Sequence[SurveyedLog],
     fitted: Sequence[Log],
     missing: Sequence[str],
 ) -> Verdict:
     """Return the verdict on logs that may be fitted ones, faulty, or of a motion seen before."""
     hashes = _hashes(result)
     again = [
-        file_sha256(logs[0].path) in hashes or any(_share(a, b) for a in logs for b in fitted)
-        for logs in kept
+        file_sha256(log.path) in hashes or any(_share(a, b) for a in log.looks for b in fitted)
+        for log in kept
     ]
     new = [e for e, is_refitted in zip(evaluations, again, strict=True) if not is_refitted]
     looks = [
-        log for logs, refitted in zip(kept, again, strict=True) if not refitted for log in logs
+        look
+        for log, refitted in zip(kept, again, strict=True)
+        if not refitted
+        for look in log.looks
     ]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
     found = [

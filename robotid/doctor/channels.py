@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.logs.data import Log
 from robotid.logs.signals import velocity_lag
 
@@ -32,7 +32,7 @@ _ABSURD = 5.0  # a spike this many times what the channel ever is cannot be moti
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque tells little
 _LATE = 0.02  # [s] robotid does not use a measured velocity that is later than this
-_LAG = 0.002  # [s] a shorter lag is not worth a word
+_LAG = 0.002  # [s] a shorter lag is not reported
 _ALIKE = 0.8  # correlation of a velocity with the derivative of its position
 _SCALE = 1.1  # a velocity that is this many times d(q)/dt, or its inverse, is in another unit
 _DEAD = 1e-3  # a velocity that moves by less than this share of d(q)/dt does not move
@@ -57,9 +57,10 @@ def check_quantisation(log: Log) -> Iterator[Finding]:
             names = [log.joints[j] for j in chosen]
             evidence = {f"steps_{log.joints[j]}": float(count[j]) for j in chosen}
             message = (
-                f"{_name(log)}: {kind} of {names} moves in steps of {steps[chosen].max():.3g}, "
+                f"{_name(log)}: {kind} of {listed(names)} moves in steps of "
+                f"{steps[chosen].max():.3g}, "
                 f"{count[chosen].min():.0f} of them over its range; "
-                + ("it says next to nothing: scale or log it finer" if few else "log more digits")
+                + ("it is uninformative: scale or log it finer" if few else "log more digits")
             )
             severity = "warning" if few and kind == "tau" else "note"
             yield Finding("quantised", severity, f"{_name(log)}: {kind}", message, evidence)

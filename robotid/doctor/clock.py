@@ -11,12 +11,12 @@ from robotid.logs.data import Log
 
 __all__ = ["check_clock", "check_gaps", "check_stale_rows", "check_standstill", "check_static"]
 
-_JITTER = 0.05  # spread of the steps over their median from which jitter is worth a word
+_JITTER = 0.05  # spread of the steps over their median from which jitter is reported
 _GAP = 2.5  # a step longer than this many median steps is a gap
 _LONG = 0.05  # [s] ... if it is longer than this, too
 _STALE = 0.05  # share of stale rows that is more than a blemish
 _STILL = 0.02  # [rad/s or m/s] slower than this a joint stands still
-_REST = 1.0  # [s] a rest this long at an end is worth a word
+_REST = 1.0  # [s] a rest this long at an end is reported
 _STATIC = 1e-3  # [rad or m] a joint that moves less than this does not move
 _HARDLY = 0.2  # [rad] a joint that moves less than this hardly does
 _HARDLY_SLIDES = 0.05  # [m] the same of a joint that slides

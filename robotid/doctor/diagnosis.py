@@ -30,7 +30,7 @@ from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
 from robotid.exceptions import DataError, SettingsError
-from robotid.findings import Finding, by_severity
+from robotid.findings import Finding, by_severity, listed
 from robotid.identification.doubts import DOUBTFUL, is_outvoted
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
@@ -123,7 +123,9 @@ def alarming(
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""
-            raise SettingsError(f"doctor: ignore names {code!r}, wanted some of {known}{hint}")
+            raise SettingsError(
+                f"doctor: ignore names {code!r}, wanted some of {listed(known)}{hint}"
+            )
     errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
     return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 
 __all__ = ["LoadModel", "check_loads", "load_model"]
 
@@ -37,7 +37,7 @@ class LoadModel:
 
     Attributes:
         R: Triangular factor of the c unknowns and the torque of each joint, shape (n, c+1, c+1);
-            0 of joints that have no say.
+            0 of joints that are ignored.
         mean: Prior mean of the unknowns: links over the URDF's, and m, mcx, mcy, mcz of a payload.
         spread: Prior standard deviation, shape (c,).
         expected: Misfit of torques that are explained as well as by each joint's own.
@@ -101,7 +101,7 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
         share: Share of each torque's variance that no physics explains, shape (n,).
 
     Returns:
-        The load model; a torque that is constant or that physics does not explain has no say.
+        The load model; a torque that is constant or that physics does not explain is ignored.
     """
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
@@ -217,7 +217,8 @@ def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Fin
     if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
         factor = float(np.exp(np.log(factors).mean()))
         message = (
-            f"{name}: the torques of {joints} fit the URDF far better times {factor:.3g}: they may "
+            f"{name}: the torques of {listed(joints)} fit the URDF far better times {factor:.3g}: "
+            "they may "
             "be currents, or have another unit or gain; give them as current_<joint> "
             + todo.format("JOINT")
         )

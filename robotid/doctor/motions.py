@@ -10,9 +10,8 @@ from robotid.estimators import WLS
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
 from robotid.findings import Finding
-from robotid.identification.evaluation import row_mask
 from robotid.identification.prior import spread_of
-from robotid.identification.recordings import base_problem, independent_share
+from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping

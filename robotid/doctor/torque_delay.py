@@ -22,7 +22,7 @@ _LONGEST = 0.1  # [s] delays are sought up to this
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] an estimate is not better than this
-_FEW = 100  # rows from which a joint has a say in the delay
+_FEW = 100  # rows from which a joint counts for the delay
 _MOVING = 0.1  # share of the instants in which it must move
 _STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
 _ROWS = 2000  # instants that are looked at
@@ -137,10 +137,12 @@ def check_torque_delay(
     message = (
         f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
         + (
-            f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: mend the "
+            f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
             f"logger's clock, or state [signals] torque_delay = {delay:.4f}"
             if late
-            else ", no more than unmodelled friction may feign; nothing needs doing"
+            else ". Friction that the model lacks can look like this; if the drive filters its "
+            "torque, "
+            f"state [signals] torque_delay = {delay:.4f}"
         )
     )
     evidence = {"delay": delay, "std_error": error, "gain": gain}

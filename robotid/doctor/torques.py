@@ -8,7 +8,7 @@ import numpy as np
 from robotid.doctor.hypotheses import Explanation, explanations
 from robotid.doctor.loads import check_loads
 from robotid.doctor.sample import Probe
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 
 __all__ = ["check_torques"]
 
@@ -83,9 +83,9 @@ def _exchanged(
         shown = ", ".join(f"tau_{a} is that of {b}" for a, b in zip(names, owners, strict=True))
         what, todo = f"torque columns are exchanged: {shown}", "rename these torque columns"
     elif best.kind == "position_order":
-        what, todo = f"the position columns of {names} are exchanged", "rename them"
+        what, todo = f"the position columns of {listed(names)} are exchanged", "rename them"
     else:
-        what, todo = f"all columns of {names} are exchanged", "name the joints rightly"
+        what, todo = f"all columns of {listed(names)} are exchanged", "name the joints rightly"
     message = (
         f"{name}: {what}: so read, the unexplained share of the worst torque falls from "
         f"{100 * stated.share.max():.2g} to {100 * best.share.max():.2g} %; {todo}"

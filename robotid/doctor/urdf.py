@@ -12,7 +12,7 @@ import numpy as np
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
@@ -196,7 +196,7 @@ def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # n
     harm = "Pinocchio refuses such a file" if key == "friction" else "simulators gain energy by it"
     message = (
         f"joint {joint.name!r} has {key} {text}, wanted 0 or more; robotid does not use it, but "
-        f"{harm}: mend the sign"
+        f"{harm}: correct the sign"
     )
     yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message, {key: float(text)})
 
@@ -235,7 +235,8 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
         if lumped and body >= 0:
             moved = model.layout.bodies[body]
             message = (
-                f"link {moved!r} is one body with {lumped}, joined to it by fixed joints: one sum "
+                f"link {moved!r} is one body with {listed(lumped)}, joined to it by fixed joints: "
+                "one sum "
                 "is identified, and a written URDF has it in this link; nothing needs doing"
             )
             yield Finding("fixed_lumped", "note", f"link {moved}", message)
@@ -245,7 +246,7 @@ def _missing(link: str, having: list[str]) -> Finding:
     if having:
         message = (
             f"link {link!r} moves but has no <inertial>, wanted one; the mass of its body is in "
-            f"{having}, so nothing needs doing if it is a mere frame"
+            f"{listed(having)}, so nothing needs doing if it is a mere frame"
         )
         return Finding("missing_inertial", "note", f"link {link}", message)
     message = (

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.robot.geometry import body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -129,7 +129,8 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
         if len(group) < 2 or spread < _SIZE or inertials[group[0]].mass <= 0:
             continue
         message = (
-            f"the links {group} have the same mass, centre of mass and inertia, but other sizes; "
+            f"the links {listed(group)} have the same mass, centre of mass and inertia, but other "
+            "sizes; "
             "one was copied: write each link's own"
         )
         evidence = {"links": float(len(group)), "difference": spread}

@@ -34,7 +34,9 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
             continue
         if value < 0:
             name = link.get("name", "")
-            message = f"link {name!r} has the mass {value:g} kg, wanted more than 0; mend the sign"
+            message = (
+                f"link {name!r} has the mass {value:g} kg, wanted more than 0; correct the sign"
+            )
             yield Finding("negative_mass", "error", f"link {name}", message, {"mass": value})
 
 

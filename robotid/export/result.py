@@ -28,6 +28,7 @@ __all__ = [
     "Result",
     "build_result",
     "load_result",
+    "read_result",
     "recording_metrics",
     "stated_parameters",
 ]
@@ -181,8 +182,23 @@ def load_result(path: str | Path) -> Result:
         DataError: If it is missing, no JSON, or of another schema.
     """
     source = Path(path)
-    if source.is_dir():
-        source = source / "result.json"
+    source = source / "result.json" if source.is_dir() else source
+    return Result(source, read_result(source))
+
+
+def read_result(path: str | Path) -> dict[str, Any]:
+    """Read a result.json.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        DataError: If it is missing, no JSON, or of another schema.
+    """
+    source = Path(path)
     if not source.is_file():
         raise DataError(f"there is no result {str(source)!r}")
     try:
@@ -198,7 +214,7 @@ def load_result(path: str | Path) -> Result:
     missing = [key for key in _WANTED if key not in result]
     if missing:
         raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
-    return Result(source, result)
+    return dict(result)
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:

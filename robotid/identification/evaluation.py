@@ -1,38 +1,38 @@
-"""Predicted torque of a recording, and its metrics."""
+"""Predicted torque of recordings, and its metrics: piece by piece, a log in memory at once."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.identification.metrics import Metrics, TorqueSums
+from robotid.identification.survey import LogPiece, SurveyedLog
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process, resolve, unwrap
-from robotid.regressor.columns import friction_speeds, sure_rows
+from robotid.logs.signals import turns_note
 from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
+from robotid.workers.plan import WorkPlan
 
 __all__ = [
     "Evaluation",
     "Extent",
     "Recording",
-    "conclude_sums",
-    "evaluate",
-    "is_shared",
+    "evaluate_logs",
     "pool",
     "predict",
     "predict_all",
-    "prepare",
-    "row_mask",
-    "rows_in",
-    "sampled_every",
     "shares_rows",
-    "torque_sums",
 ]
+
+_SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
+_SAMPLED = 200  # rows spread over a log that are looked for in others
+_SHARED = 0.02  # share of them that another recording may hold: windows that meet share a row
 
 
 @dataclass(frozen=True)
@@ -109,35 +109,42 @@ class Evaluation:
     is_refitted: bool = False
 
 
-def prepare(model: RobotModel, log: Log, settings: SignalSettings) -> Recording:
-    """Return a log made ready for a model: turns taken out, filtered, rows chosen.
+def evaluate_logs(
+    fitted: Sequence[SurveyedLog],
+    kept: Sequence[SurveyedLog],
+    parameters: Mapping[str, Array],
+    prior: Array,
+    *,
+    plan: WorkPlan | None = None,
+) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
+    """Return how well parameters predict logs.
 
     Args:
-        model: The robot.
-        log: The log, of the model's joints in its order.
-        settings: How it becomes a trajectory.
+        fitted: Logs that were fitted, surveyed with the model that predicts.
+        kept: Logs kept apart.
+        parameters: Standard parameters by name, each of shape (p,).
+        prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion.
+        plan: Who works on the pieces of logs in files; this process if None.
 
     Returns:
-        The recording.
+        Evaluations of the fitted logs, and of those kept apart; of logs in files, the torques are
+        those of the stretches that are kept for plots.
 
     Raises:
-        DataError: If the log is too short or an angle jumps.
-        SettingsError: If a setting does not fit the log.
+        DataError: If no row of a log is used.
     """
-    log = unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
-    resolved = resolve(log, settings)
-    trajectory = process(log, resolved, friction_speeds(model.layout))
-    mask = row_mask(model, trajectory, resolved.min_velocity)
-    extent = Extent(
-        samples=len(log.t),
-        rate=float(1.0 / np.median(np.diff(log.t))),
-        start=float(log.t[0]),
-        end=float(log.t[-1]),
-        smooth=len(trajectory.t),
-        rows_used=int(mask.sum()),
-        segments=int(trajectory.segment[-1]) + 1,
+    work = partial(_score, parameters=parameters, prior=prior)
+    apart = _score_logs(kept, work, plan)
+    sought = [score.sampled for score in apart]
+    own = _score_logs(fitted, partial(work, sought=sought), plan)
+    again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(apart))]
+    return (
+        tuple(_conclude(log, score) for log, score in zip(fitted, own, strict=True)),
+        tuple(
+            _conclude(log, score, is_refitted=is_refitted)
+            for log, score, is_refitted in zip(kept, apart, again, strict=True)
+        ),
     )
-    return Recording(log, resolved, trajectory, mask, extent)
 
 
 def shares_rows(one: Log, other: Log) -> bool:
@@ -152,84 +159,7 @@ def shares_rows(one: Log, other: Log) -> bool:
         the second; windows that meet share their common row, which counts for nothing.
     """
     rows, others = (np.hstack([log.q, log.tau]) for log in (one, other))
-    return is_shared(rows_in(rows[:: sampled_every(len(rows))], others))
-
-
-def sampled_every(rows: int) -> int:
-    """Return how far apart the rows are that ``shares_rows`` looks for.
-
-    Args:
-        rows: Rows of the log that they are of.
-
-    Returns:
-        Every so many rows.
-    """
-    return max(1, rows // 200)
-
-
-def rows_in(sampled: Array, rows: Array) -> Array:
-    """Return which rows of positions and torques are among others.
-
-    Args:
-        sampled: The rows, shape (m, 2 n).
-        rows: The others, shape (N, 2 n).
-
-    Returns:
-        Flags, shape (m,), bool.
-    """
-    found = np.isin(sampled[:, 0], rows[:, 0])
-    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
-    for k in np.flatnonzero(found):
-        found[k] = (likely == sampled[k]).all(axis=1).any()
-    return found
-
-
-def is_shared(found: Array) -> bool:
-    """Return whether so many rows are in another log that it holds the same recording.
-
-    Args:
-        found: Which of the rows looked for are in it, bool.
-
-    Returns:
-        Whether it does.
-    """
-    return int(found.sum()) > max(1, 0.02 * len(found))
-
-
-def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return which rows are used: those where the sign of every friction speed is sure.
-
-    Args:
-        model: The robot. Without Coulomb friction to identify every row is used.
-        trajectory: N samples.
-        min_velocity: Bound on the speed of a joint or of a coupled drive [rad/s or m/s].
-
-    Returns:
-        Flags, shape (N, n_rows), bool.
-    """
-    return sure_rows(model.layout, trajectory.v, min_velocity)
-
-
-def evaluate(
-    model: RobotModel, recording: Recording, parameters: Mapping[str, Array], prior: Array
-) -> Evaluation:
-    """Return predicted torques and metrics of a recording.
-
-    Args:
-        model: The robot.
-        recording: The recording.
-        parameters: Standard parameters by name, each of shape (p,).
-        prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion.
-
-    Returns:
-        The evaluation.
-
-    Raises:
-        DataError: If no row of the recording is used.
-    """
-    torques = predict_all(model, recording.trajectory, parameters, prior)
-    sums = torque_sums(recording.trajectory, recording.mask, torques, list(parameters))
-    return conclude_sums(model, recording, torques, sums)
+    return _is_shared(_rows_in(rows[:: _sampled_every(len(rows))], others))
 
 
 def predict_all(
@@ -265,52 +195,6 @@ def predict_all(
     return {**predicted, "urdf": urdf, "gravity_only": gravity}
 
 
-def torque_sums(
-    trajectory: Trajectory, mask: Array, torques: Mapping[str, Array], names: Sequence[str]
-) -> dict[str, TorqueSums]:
-    """Return what the metrics of predictions are made of.
-
-    Args:
-        trajectory: N samples.
-        mask: Rows used, shape (N, n_rows), bool.
-        torques: As of ``predict_all``.
-        names: Which of them to measure.
-
-    Returns:
-        The sums by name.
-    """
-    baselines = {key: torques[key] for key in ("urdf", "gravity_only")}
-    tau = trajectory.tau
-    return {name: TorqueSums.of(tau, torques[name], mask, baselines) for name in names}
-
-
-def conclude_sums(
-    model: RobotModel,
-    recording: Recording,
-    torques: Mapping[str, Array],
-    sums: Mapping[str, TorqueSums],
-    *,
-    is_refitted: bool = False,
-) -> Evaluation:
-    """Return the evaluation that predicted torques and their sums make up.
-
-    Args:
-        model: The robot.
-        recording: The recording.
-        torques: Torques predicted for its trajectory.
-        sums: Sums over the whole log.
-        is_refitted: Whether it was kept apart, but holds rows that were fitted.
-
-    Returns:
-        The evaluation.
-
-    Raises:
-        DataError: If no row of the recording is used.
-    """
-    metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
-    return Evaluation(recording, torques, sums, metrics, is_refitted)
-
-
 def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Metrics:
     """Return the metrics over several recordings together.
 
@@ -327,6 +211,191 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
     """
     together = reduce(TorqueSums.merge, [evaluation.sums[name] for evaluation in evaluations])
     return together.metrics(model.row_names, model.row_units)
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """What is known of a log, or of its pieces so far.
+
+    Attributes:
+        sums: What the metrics are made of, by name of the parameters.
+        smooth: Samples.
+        used: Torque rows used.
+        segments: Numbers of the stretches that have samples.
+        turned: Joints whose full turns were taken out, shape (n,), bool.
+        shown: Motion, rows used and torques of all samples, or of a few stretches.
+        sampled: Recorded rows spread over the log, shape (m, 2 n).
+        found: Which of the sampled rows of other logs are in this one, one array for each log.
+    """
+
+    sums: Mapping[str, TorqueSums]
+    smooth: int
+    used: int
+    segments: frozenset[int]
+    turned: Array
+    shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...]
+    sampled: Array
+    found: tuple[Array, ...]
+
+    def join(self, other: "_Score") -> "_Score":
+        """Return what is known with the pieces that follow."""
+        return _Score(
+            sums={name: x.merge(other.sums[name]) for name, x in self.sums.items()},
+            smooth=self.smooth + other.smooth,
+            used=self.used + other.used,
+            segments=self.segments | other.segments,
+            turned=self.turned | other.turned,
+            shown=self.shown + other.shown,
+            sampled=np.concatenate([self.sampled, other.sampled]),
+            found=tuple(one | two for one, two in zip(self.found, other.found, strict=True)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A piece, and what is kept of it: recorded rows spread over it, and a stretch for plots."""
+
+    piece: LogPiece
+    sampled: slice
+    shown: slice | None
+
+    @property
+    def name(self) -> str:
+        return self.piece.name
+
+    @property
+    def samples(self) -> int:
+        return self.piece.samples
+
+
+def _parts(log: SurveyedLog) -> list[_Part]:
+    last = len(log.pieces) - 1
+    shown = {0: slice(_SHOWN), (last + 1) // 2: slice(_SHOWN), last: slice(-_SHOWN, None)}
+    if log.is_held:
+        shown = {0: slice(None)}
+    every = _sampled_every(log.stop - log.first)
+    return [
+        _Part(piece, slice((log.first - piece.first) % every, None, every), shown.get(k))
+        for k, piece in enumerate(log.pieces)
+    ]
+
+
+def _score_logs(
+    logs: Sequence[SurveyedLog], work: "partial[_Score]", plan: WorkPlan | None
+) -> list[_Score]:
+    """Return what is known of each log; refuse one without samples."""
+    parts = [_parts(log) for log in logs]
+    every = list(chain.from_iterable(parts))
+    found: Iterator[_Score] = (
+        (work(part, None) for part in every)
+        if plan is None
+        else plan.map(work, every, "evaluating")
+    )
+    scores = []
+    for log, own in zip(logs, parts, strict=True):
+        by_piece = [next(found) for _ in own]
+        score = reduce(_Score.join, by_piece)
+        if not score.smooth:
+            raise log.too_short()
+        if not score.shown:  # of none of the chosen pieces is a sample left: draw another one
+            filled = next(k for k, piece in enumerate(by_piece) if piece.smooth)
+            again = work(replace(own[filled], shown=slice(_SHOWN)), None)
+            score = replace(score, shown=again.shown)
+        scores.append(score)
+    return scores
+
+
+def _score(
+    whole: _Part,
+    threads: int | None,
+    *,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    sought: Sequence[Array] = (),
+) -> _Score:
+    """Return what is known of a piece, with the torques of a part of it."""
+    header, rows = whole.piece.header, whole.piece.read()
+    model, motion, mask = header.model, rows.trajectory, rows.mask
+    names = [*parameters, "urdf", "gravity_only"]
+    torques = {name: np.empty((0, model.n_rows)) for name in names}
+    if len(motion.t):
+        torques = predict_all(model, motion, parameters, prior, compiled=header.is_compiled)
+    baselines = {key: torques[key] for key in ("urdf", "gravity_only")}
+    shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...] = ()
+    if whole.shown is not None and len(motion.t):
+        part = slice(*whole.shown.indices(len(motion.t)))
+        kept = {name: torque[part] for name, torque in torques.items()}
+        shown = ((motion.part(part.start, part.stop), mask[part], kept),)
+    recorded = np.hstack([rows.positions, rows.torques])
+    return _Score(
+        sums={
+            name: TorqueSums.of(motion.tau, torques[name], mask, baselines) for name in parameters
+        },
+        smooth=len(motion.t),
+        used=int(mask.sum()),
+        segments=frozenset(np.unique(motion.segment).tolist()),
+        turned=rows.turned,
+        shown=shown,
+        sampled=recorded[whole.sampled],
+        found=tuple(_rows_in(sampled, recorded) for sampled in sought),
+    )
+
+
+def _conclude(log: SurveyedLog, score: _Score, *, is_refitted: bool = False) -> Evaluation:
+    """Return the evaluation of a log."""
+    motions, masks, torques = zip(*score.shown, strict=True)
+    extent = Extent(
+        samples=log.stop - log.first,
+        rate=1.0 / log.step,
+        start=float(log.stamps[log.first]),
+        end=float(log.stamps[log.stop - 1]),
+        smooth=score.smooth,
+        rows_used=score.used,
+        segments=len(score.segments),
+    )
+    head, model = log.head, log.model
+    names = [head.joints[j] for j in np.flatnonzero(score.turned)]
+    if names:
+        head = replace(head, notes=(*head.notes, turns_note(names)))
+    mask = np.concatenate(masks)
+    recording = Recording(head, log.signals, _joined(motions), mask, extent)
+    predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
+    sums = score.sums
+    metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
+    return Evaluation(recording, predicted, sums, metrics, is_refitted)
+
+
+def _joined(motions: Sequence[Trajectory]) -> Trajectory:
+    """Return motions one after the other; what is shown never joins what is not beside it."""
+    segments, number = [], 0
+    for motion in motions:
+        segments.append(np.unique(motion.segment, return_inverse=True)[1] + number)
+        number = int(segments[-1][-1]) + 1
+    joined: dict[str, Any] = {
+        key: np.concatenate([getattr(motion, key) for motion in motions])
+        for key in ("t", "q", "v", "a", "tau", "direction")
+        if len(motions) > 1 and getattr(motions[0], key) is not None
+    }
+    return replace(motions[0], **joined, segment=np.concatenate(segments))
+
+
+def _sampled_every(rows: int) -> int:
+    """Return how far apart the rows are that are looked for, of so many."""
+    return max(1, rows // _SAMPLED)
+
+
+def _rows_in(sampled: Array, rows: Array) -> Array:
+    """Return which of the rows (m, 2 n) of positions and torques are among others, shape (m,)."""
+    found = np.isin(sampled[:, 0], rows[:, 0])
+    likely = rows[np.isin(rows[:, 0], sampled[found, 0])]
+    for k in np.flatnonzero(found):
+        found[k] = (likely == sampled[k]).all(axis=1).any()
+    return found
+
+
+def _is_shared(found: Array) -> bool:
+    """Return whether so many rows are in another log that it holds the same recording."""
+    return int(found.sum()) > max(1, _SHARED * len(found))
 
 
 def _without_drives(model: RobotModel, pi: Array) -> Array:

@@ -1,15 +1,113 @@
-"""What is worth a word about the physical side of a fit: mass matrix, solvers, active bounds."""
+"""What a user should know of a fit: open parameters, outliers, mass matrix, solvers, bounds."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
 
 from robotid.findings import Finding
 from robotid.identification.pipeline import Identification
-from robotid.identification.settings import ConsistentSettings
+from robotid.identification.settings import BoundedSettings, ConsistentSettings
+from robotid.logs.data import Log
+from robotid.robot.model import RobotModel
 
-__all__ = ["consistency_findings"]
+__all__ = ["consistency_findings", "fit_findings", "locked_findings", "log_findings"]
 
 _SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
 _SAME_OPTIMUM = 1e-3  # the same of the objectives of log-Cholesky and cone programme
 _COSTS = 1.05  # residual over that of WLS from which bounds cost torque
+_NAMED = 5  # outliers that a finding names
+_WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
+_DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is reported
+_USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
+
+
+def fit_findings(identification: Identification) -> list[Finding]:
+    """Return what a user should know of a fit: what it leaves open, outliers, costs of physics.
+
+    Args:
+        identification: What was found.
+
+    Returns:
+        The findings, none if all is well.
+    """
+    findings = []
+    known = identification.determination
+    if known.groups:
+        message = (
+            f"the data determine {known.rank} of {len(known.names)} base parameters: "
+            f"{known.in_words()}. What they leave open keeps the URDF's values; record a richer "
+            "trajectory to determine it"
+        )
+        findings.append(Finding("undetermined", "warning", "base_parameters", message))
+    if not identification.is_consistent:
+        message = (
+            f"the {identification.estimator.name} estimate is not physically consistent, so no "
+            "URDF was written; use the 'consistent' estimator for one that loads"
+        )
+        findings.append(Finding("urdf_not_written", "warning", "urdf", message))
+    findings += consistency_findings(identification)
+    findings += _outlier_findings(identification)
+    for evaluation in identification.refitted:
+        message = (
+            f"the validation log {evaluation.recording.name} holds rows that were fitted: its "
+            "score shows the fit, not the prediction; validate on another recording"
+        )
+        where = evaluation.recording.log.path
+        findings.append(Finding("validation_was_fitted", "warning", where, message))
+    ours, wls = identification.metrics(), identification.metrics("wls")
+    asked = _asked(identification)
+    for joint, measured in ours.per_joint.items():
+        if measured.rmse > _DIFFERS * wls.per_joint[joint].rmse:
+            message = (
+                f"{joint}: the residual is {measured.rmse:.3g} {measured.unit} against "
+                f"{wls.per_joint[joint].rmse:.3g} of unconstrained WLS: physics and data disagree "
+                f"there; check {asked}the torque scale (gains), the drive model and the payload"
+            )
+            evidence = {
+                "error_pct": measured.relative_error_pct or 0.0,
+                "wls_error_pct": wls.per_joint[joint].relative_error_pct or 0.0,
+            }
+            findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
+    return findings
+
+
+def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
+    """Return a warning of locked joints whose positions nobody stated.
+
+    Args:
+        model: The robot.
+        stated: Names of the locked joints that stand where the user says, or follow others.
+
+    Returns:
+        A warning "locked_at_zero", or none.
+    """
+    assumed = [name for name in model.locked if name not in stated]
+    if not assumed:
+        return []
+    message = (
+        f"the joints {assumed} are neither identified nor locked in the job: they are taken to "
+        "stand at 0; state their true positions with locked = { joint = position }"
+    )
+    return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
+
+
+def log_findings(logs: Sequence[Log]) -> list[Finding]:
+    """Return the notes on logs, each once with the names of its logs.
+
+    Args:
+        logs: The logs.
+
+    Returns:
+        A note "log_note" per note.
+    """
+    by_note: dict[str, list[str]] = {}
+    for log in logs:
+        for note in log.notes:
+            by_note.setdefault(note, []).append(Path(log.path).name)
+    return [
+        Finding("log_note", "note", ", ".join(names), f"{', '.join(names)}: {note}")
+        for note, names in by_note.items()
+    ]
 
 
 def consistency_findings(identification: Identification) -> list[Finding]:
@@ -69,7 +167,38 @@ def consistency_findings(identification: Identification) -> list[Finding]:
     return findings
 
 
-_USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
+def _outlier_findings(identification: Identification) -> list[Finding]:
+    outliers = identification.outliers
+    if not outliers:
+        return []
+    places = [
+        f"{o.joint} at {o.t:.3f} s of {o.log}: {o.torque:.4g} against {o.predicted:.4g} predicted, "
+        f"{o.size:.0f} times its usual residual"
+        for o in outliers[:_NAMED]
+    ]
+    more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
+    advice = (
+        "they were weighted down"
+        if identification.estimator.is_robust
+        else "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
+    )
+    message = (
+        f"{len(outliers)} places of the fitted logs are not explained: {'; '.join(places)}{more}; "
+        f"{advice}"
+    )
+    evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
+    return [Finding("outliers", "warning", outliers[0].joint, message, evidence)]
+
+
+def _asked(identification: Identification) -> str:
+    """Return in words what the user asks of the parameters, empty if nothing."""
+    settings = identification.estimator
+    if not isinstance(settings, BoundedSettings):
+        return ""
+    asked = {key: value for key, value in settings.constraints.items() if value}
+    if settings.margin > _WIDE:
+        asked["margin"] = settings.margin
+    return f"what [estimator] asks for ({asked}), " if asked else ""
 
 
 def _speaks_against(identification: Identification) -> str:

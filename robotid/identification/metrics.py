@@ -9,7 +9,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 
-__all__ = ["JointMetrics", "Metrics", "TorqueSums", "measure"]
+__all__ = ["JointMetrics", "Metrics", "TorqueSums"]
 
 
 @dataclass(frozen=True)
@@ -181,30 +181,3 @@ class TorqueSums:
 
     def _relative_error(self, j: int, residual: float) -> float | None:
         return 100.0 * float(np.sqrt(residual / self.torque[j])) if self.torque[j] > 0 else None
-
-
-def measure(
-    tau: Array,
-    prediction: Array,
-    mask: Array,
-    names: Sequence[str],
-    units: Sequence[str],
-    baselines: Mapping[str, Array] | None = None,
-) -> Metrics:
-    """Return the metrics of a prediction.
-
-    Args:
-        tau: Measured torque, shape (N, n) [N m, N].
-        prediction: Predicted torque, shape (N, n) [N m, N].
-        mask: Rows used, shape (N, n), bool.
-        names: Names of the n joints.
-        units: Units of their torques.
-        baselines: Other predictions to compare with, by name, each of shape (N, n).
-
-    Returns:
-        The metrics.
-
-    Raises:
-        DataError: If no row is used at all.
-    """
-    return TorqueSums.of(tau, prediction, mask, baselines or {}).metrics(names, units)

@@ -1,7 +1,7 @@
 """identify(): from a model and logs to parameters and how far they can be trusted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,11 +12,11 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
-from robotid.identification.evaluation import Evaluation, pool, prepare
+from robotid.identification.evaluation import Evaluation, pool
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.prior import spread_of
-from robotid.identification.recordings import LoadedRecordings, Recordings
+from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import (
     BoundedSettings,
@@ -34,6 +34,7 @@ from robotid.identification.summary import (
     identification_line,
     identification_text,
 )
+from robotid.identification.survey import hold_log
 from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -102,6 +103,7 @@ class Identification:
     alarms: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     report: str = ""
+    _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def __repr__(self) -> str:
         return identification_line(self)
@@ -128,10 +130,12 @@ class Identification:
         is_possible = bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
         return is_possible and self.mass_matrix.is_positive
 
-    @cached_property
+    @property
     def mass_matrix(self) -> MassMatrixCheck:
-        """The mass matrix of the standard parameters over random poses."""
-        return check_mass_matrix(self.model, self.standard)
+        """The mass matrix of the standard parameters over random poses; ``replace`` keeps it."""
+        if not self._checked or self._checked[-1][0] is not self.standard:
+            self._checked.append((self.standard, check_mass_matrix(self.model, self.standard)))
+        return self._checked[-1][1]
 
     @property
     def standard_error(self) -> Array:
@@ -247,18 +251,14 @@ def identify(
     settings = signals or SignalSettings()
     if not logs:
         raise DataError("no log was given; at least one is needed to identify anything")
-    fitted = [prepare(model, log, settings) for log in logs]
-    kept = [prepare(model, log, settings) for log in validation]
-    return conclude(model, LoadedRecordings(model, fitted, kept), choice)
+    fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (logs, validation))
+    return conclude(Recordings(model, structural_mapping(model), fitted, kept), choice)
 
 
-def conclude(
-    model: RobotModel, recordings: Recordings, choice: EstimatorSettings
-) -> Identification:
+def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identification:
     """Identify a robot's parameters from recordings, in memory or not.
 
     Args:
-        model: The robot.
         recordings: The recordings.
         choice: Which estimator.
 
@@ -270,44 +270,10 @@ def conclude(
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
     """
-    mapping = structural_mapping(model)
-    prior = model.standard_parameters()
-    reductions, grown = recordings.reduce(mapping), 1.0
-    if choice.is_robust:
-        robust = reweigh(model, mapping, recordings, reductions, choice.loss, prior)
-        recordings, reductions = robust.recordings, robust.reductions
-        grown = robust.loss_of_efficiency**2
-    reduction = join(reductions)
-    stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
-    factors, share = reduction.factors, recordings.share
-    spread = spread_of(model, reduction.squares, reduction.samples)
-    rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
-    before = Known(prior, spread, share, rough.sigma, stretches)
-    known = model.layout.owned_by(choice.bounds.pinned)
-    rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
-    determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
-    try:
-        estimate, fit, weighing = _run(choice, model, mapping, before, recordings, factors, rough)
-    except RankDeficientError as error:
-        raise determination.refusal(error) from error
-    wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
-    if weighing == "by step" and fit is None:
-        estimate = with_wls_errors(estimate, wls)
-    else:
-        sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
-        estimate, errors = measured_errors(
-            estimate,
-            stretches,
-            factors,
-            share,
-            mapping.K,
-            estimate.sigma if estimate.names == mapping.names else sigma,
-            is_filter=weighing == "by age",
-            redraws=_redraws(choice, fit),
-        )
-    if grown != 1.0:
-        estimate = replace(estimate, covariance=grown * estimate.covariance)
-        wls = replace(wls, covariance=grown * wls.covariance)
+    model, mapping = recordings.model, recordings.mapping
+    ground = _ground(recordings, choice)
+    prior, spread = ground.before.pi, ground.before.spread
+    estimate, wls, errors = _measured(ground, choice)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     wls_standard = mapping.to_standard(wls.theta, prior, spread)
@@ -329,9 +295,83 @@ def conclude(
         fitted=fitted,
         validation=kept,
         errors=errors,
-        factors=factors,
-        determination=determination,
+        factors=ground.factors,
+        determination=ground.determination,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """What every estimator stands on.
+
+    Attributes:
+        recordings: The recordings, their rows weighted if a robust loss was asked for.
+        factors: What all fitted rows come down to, base parameters.
+        before: What is known without them, and how they are cut into stretches.
+        rough: Weighted least squares on them.
+        determination: Which base parameters they determine.
+        grown: By how much a robust loss widens the covariance [-].
+    """
+
+    recordings: Recordings
+    factors: Factors
+    before: Known
+    rough: Estimate
+    determination: Determination
+    grown: float
+
+
+def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
+    """Reduce the rows, with a robust loss reweighted, to what every estimator stands on."""
+    model, mapping = recordings.model, recordings.mapping
+    prior = model.standard_parameters()
+    reductions, grown = recordings.reduce(), 1.0
+    if choice.is_robust:
+        robust = reweigh(recordings, reductions, choice.loss, prior)
+        recordings, reductions = robust.recordings, robust.reductions
+        grown = robust.loss_of_efficiency**2
+    reduction = join(reductions)
+    stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
+    factors, share = reduction.factors, recordings.share
+    spread = spread_of(model, reduction.squares, reduction.samples)
+    rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
+    before = Known(prior, spread, share, rough.sigma, stretches)
+    known = model.layout.owned_by(choice.bounds.pinned)
+    rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
+    determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
+    return _Ground(recordings, factors, before, rough, determination, grown)
+
+
+def _measured(
+    ground: _Ground, choice: EstimatorSettings
+) -> tuple[Estimate, Estimate, StandardErrors]:
+    """Return the estimate and that of WLS with measured standard errors, and their ground."""
+    recordings, factors, rough = ground.recordings, ground.factors, ground.rough
+    model, mapping, before = recordings.model, recordings.mapping, ground.before
+    try:
+        estimate, fit, weighing = _run(choice, model, mapping, before, recordings, factors, rough)
+    except RankDeficientError as error:
+        raise ground.determination.refusal(error) from error
+    stretches, share = before.stretches, before.share
+    wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
+    if weighing == "by step" and fit is None:
+        estimate = with_wls_errors(estimate, wls)
+    else:
+        sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
+        estimate, errors = measured_errors(
+            estimate,
+            stretches,
+            factors,
+            share,
+            mapping.K,
+            estimate.sigma if estimate.names == mapping.names else sigma,
+            is_filter=weighing == "by age",
+            redraws=_redraws(choice, fit),
+        )
+    if ground.grown != 1.0:
+        estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
+        wls = replace(wls, covariance=ground.grown * wls.covariance)
+    return estimate, wls, errors
 
 
 def _redraws(choice: EstimatorSettings, fit: Consistent | None) -> Redraws | None:
@@ -354,7 +394,7 @@ def _run(
     estimator = make_estimator(choice, model, mapping, prior)
     if estimator.reads == "factors":
         return estimator.fit(factors), estimator.in_cone, estimator.weighing
-    estimate = estimator.fit(recordings.problem(mapping, with_mass=estimator.needs_mass))
+    estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
     if not (isinstance(choice, RecursiveSettings) and choice.physical):
         return estimate, None, estimator.weighing
     if estimator.weighing == "by step":

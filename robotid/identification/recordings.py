@@ -1,69 +1,132 @@
-"""What an identification asks of its logs: their factors, their samples, their predictions.
+"""What an identification asks of its logs: their factors, their samples, their predictions."""
 
-Logs in memory are one implementation, long logs read in pieces another.
-"""
-
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
 
 from robotid._typing import Array
-from robotid.identification.evaluation import Evaluation, Recording, evaluate, shares_rows
-from robotid.logs.data import Trajectory
-from robotid.logs.settings import SignalSettings
+from robotid.identification.evaluation import Evaluation, evaluate_logs
+from robotid.identification.rows import base_problem, independent_share
+from robotid.identification.survey import ReducedPiece, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress_stretches
-from robotid.regressor.problem import Problem, concatenate
-from robotid.regressor.reduction import Reduction
-from robotid.regressor.torque import build_problem
+from robotid.regressor.problem import Block, Problem, concatenate
+from robotid.regressor.reduction import Reduction, join_stretches
 from robotid.robot.model import RobotModel
+from robotid.workers.checkpoint import Checkpoint
+from robotid.workers.plan import WorkPlan
 
-__all__ = ["LoadedRecordings", "Recordings", "base_problem", "independent_share"]
+__all__ = ["Recordings"]
 
-
-_STRETCHES = 48  # of all logs together: enough to see how much their scores scatter
+_STRETCHES = 48  # of all logs in memory: enough to see how much their scores scatter
 _CORRELATIONS = 10  # shortest stretch in correlation times of noise behind the filter
+_STRETCHES_IN_FILE = 64  # of each log in a file whose factors are kept apart
+_FACTORS = 2**26  # bytes of them all, if that leaves each log a few
+_FEW = 8
 
 
-class Recordings(ABC):
-    """The logs of an identification: those to fit, and those kept apart."""
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """The logs of an identification, each read in pieces as often as needed; or held in memory.
+
+    Attributes:
+        model: The robot.
+        mapping: Standard to base parameters.
+        fitted: Logs to fit.
+        kept: Logs kept apart.
+        plan: Who works on the pieces of logs in files; this process if None.
+        checkpoint: Where reductions are kept until the run is complete.
+        weights: Weights of the rows of each log to fit, shapes (N, n_rows); 1 if None.
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    fitted: Sequence[SurveyedLog]
+    kept: Sequence[SurveyedLog] = ()
+    plan: WorkPlan | None = None
+    checkpoint: Checkpoint | None = None
+    weights: tuple[Array, ...] | None = None
 
     @property
-    @abstractmethod
+    def is_held(self) -> bool:
+        """Whether all logs are in memory."""
+        return all(log.is_held for log in (*self.fitted, *self.kept))
+
+    @property
     def share(self) -> float:
         """Share of the fitted rows that count as independent [-]."""
+        return min(independent_share(log.signals) for log in self.fitted)
 
-    @abstractmethod
-    def reduce(self, mapping: BaseMapping) -> tuple[Reduction, ...]:
+    @property
+    def pieces(self) -> list[ReducedPiece]:
+        """The pieces of the logs to fit, in order."""
+        return [ReducedPiece(piece, self.mapping) for log in self.fitted for piece in log.pieces]
+
+    def reduce(self) -> tuple[Reduction, ...]:
         """Reduce the logs to fit.
 
-        Args:
-            mapping: Standard to base parameters.
-
         Returns:
-            One reduction per stretch of a log, in order of time.
+            One reduction per stretch of a log, in order of time. A stretch of a log in memory is
+            longer than the correlation of filtered noise; one in a file is of neighbouring pieces.
 
         Raises:
-            DataError: If a row cannot be used.
+            DataError: If a row cannot be used, or no stretch of a log is long enough.
         """
+        if self.is_held:
+            for log in (*self.fitted, *self.kept):
+                log.whole  # noqa: B018 refused before any fit
+            return tuple(chain.from_iterable(map(self._stretches, range(len(self.fitted)))))
+        plan = self.plan or WorkPlan()
+        found = iter(plan.reduce(self.pieces, checkpoint=self.checkpoint))
+        reductions = []
+        size = 8 * self.model.n_rows * (len(self.mapping.independent) + 1) ** 2 * len(self.fitted)
+        most = max(_FEW, min(_STRETCHES_IN_FILE, _FACTORS // size))
+        for log in self.fitted:
+            count = len(log.pieces)
+            own = join_stretches(islice(found, count), count, most)
+            if not any(reduction.samples for reduction in own):
+                raise log.too_short()
+            reductions += own
+        return tuple(reductions)
 
-    @abstractmethod
-    def problem(self, mapping: BaseMapping, *, with_mass: bool = False) -> Problem:
+    def problem(self, *, with_mass: bool = False) -> Problem:
         """Return the rows of the logs to fit, for estimators that read them in order of time.
 
         Args:
-            mapping: Standard to base parameters.
             with_mass: Whether each sample also carries the regressor of its mass matrix.
 
         Returns:
-            The base problem.
+            The base problem; of logs in files in blocks only: each pass reads them anew.
         """
+        if self.is_held:
+            return concatenate([self._problem(k, with_mass) for k in range(len(self.fitted))])
 
-    @abstractmethod
+        def problems() -> Iterator[Problem]:
+            for piece in (piece for log in self.fitted for piece in log.pieces):
+                rows = piece.read()
+                yield base_problem(
+                    self.model, self.mapping, rows.trajectory, rows.mask, with_mass=with_mass
+                )
+
+        def stream() -> Iterator[Block]:
+            return chain.from_iterable(problem.blocks() for problem in problems())
+
+        def mass_stream() -> Iterator[Array]:
+            for problem in problems():
+                yield from problem.mass_stream() if problem.mass_stream is not None else ()
+
+        return Problem(
+            stream,
+            self.mapping.base_names,
+            self.model.n_rows,
+            self.model.support()[:, self.mapping.independent],
+            mass_stream if with_mass else None,
+        )
+
     def evaluate(
         self, parameters: Mapping[str, Array], prior: Array
     ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-        """Return how well parameters predict every log.
+        """Return how well parameters predict every log; see ``evaluate_logs``.
 
         Args:
             parameters: Standard parameters by name, each of shape (p,).
@@ -75,135 +138,19 @@ class Recordings(ABC):
         Raises:
             DataError: If no row of a log is used.
         """
+        return evaluate_logs(self.fitted, self.kept, parameters, prior, plan=self.plan)
 
+    def _problem(self, k: int, with_mass: bool = False) -> Problem:
+        """Return the rows of a log in memory, weighted."""
+        rows = self.fitted[k].whole
+        weight = rows.mask if self.weights is None else rows.mask * self.weights[k]
+        return base_problem(self.model, self.mapping, rows.trajectory, weight, with_mass=with_mass)
 
-@dataclass(frozen=True, eq=False)
-class LoadedRecordings(Recordings):
-    """Logs in memory.
-
-    Attributes:
-        model: The robot.
-        fitted: Recordings to fit.
-        kept: Recordings kept apart.
-        weights: Weights of the rows of each recording to fit, shapes (N, n_rows); 1 if None.
-    """
-
-    model: RobotModel
-    fitted: Sequence[Recording]
-    kept: Sequence[Recording]
-    weights: tuple[Array, ...] | None = None
-
-    def _row_weights(self) -> list[Array]:
-        masks = [recording.mask.astype(float) for recording in self.fitted]
-        if self.weights is None:
-            return masks
-        return [mask * weight for mask, weight in zip(masks, self.weights, strict=True)]
-
-    @property
-    def share(self) -> float:
-        """See ``Recordings.share``."""
-        return min(independent_share(recording.signals) for recording in self.fitted)
-
-    def reduce(self, mapping: BaseMapping) -> tuple[Reduction, ...]:
-        """See ``Recordings.reduce``.
-
-        Args:
-            mapping: Standard to base parameters.
-
-        Returns:
-            One reduction per stretch, each longer than the correlation of filtered noise.
-        """
-        count = -(-_STRETCHES // len(self.fitted))
-        reductions: list[Reduction] = []
-        for recording, weight in zip(self.fitted, self._row_weights(), strict=True):
-            motion = recording.trajectory
-            shortest = round(_CORRELATIONS / independent_share(recording.signals))
-            length = max(-(-len(motion.t) // count), shortest)
-            problem = base_problem(self.model, mapping, motion, weight)
-            for k, factors in enumerate(compress_stretches(problem, length)):
-                part = motion.part(k * length, (k + 1) * length)
-                reductions.append(Reduction(factors, part.squares, len(part.t)))
-        return tuple(reductions)
-
-    def problem(self, mapping: BaseMapping, *, with_mass: bool = False) -> Problem:
-        """See ``Recordings.problem``.
-
-        Args:
-            mapping: Standard to base parameters.
-            with_mass: Whether each sample also carries the regressor of its mass matrix.
-
-        Returns:
-            The base problem.
-        """
-        return concatenate(
-            [
-                base_problem(self.model, mapping, r.trajectory, weight, with_mass=with_mass)
-                for r, weight in zip(self.fitted, self._row_weights(), strict=True)
-            ]
-        )
-
-    def evaluate(
-        self, parameters: Mapping[str, Array], prior: Array
-    ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-        """See ``Recordings.evaluate``.
-
-        Args:
-            parameters: Standard parameters by name, each of shape (p,).
-            prior: Those of the URDF, shape (p,).
-
-        Returns:
-            Evaluations of the fitted logs, and of those kept apart.
-        """
-        fitted, kept = (
-            [evaluate(self.model, r, parameters, prior) for r in recordings]
-            for recordings in (self.fitted, self.kept)
-        )
-        again = [any(shares_rows(k.log, f.log) for f in self.fitted) for k in self.kept]
-        return tuple(fitted), tuple(
-            replace(evaluation, is_refitted=is_refitted)
-            for evaluation, is_refitted in zip(kept, again, strict=True)
-        )
-
-
-def base_problem(
-    model: RobotModel,
-    mapping: BaseMapping,
-    trajectory: Trajectory,
-    weight: Array,
-    *,
-    with_mass: bool = False,
-    compiled: bool | None = None,
-) -> Problem:
-    """Return the problem of a trajectory in base parameters.
-
-    Args:
-        model: The robot.
-        mapping: Standard to base parameters.
-        trajectory: N samples.
-        weight: Weight of each row, shape (N, n_rows); or which rows are used, bool.
-        with_mass: As of ``build_problem``.
-        compiled: As of ``build_problem``.
-
-    Returns:
-        The problem.
-
-    Raises:
-        DataError: If the trajectory's joints are not the model's.
-    """
-    rows = weight.astype(float)
-    problem = build_problem(model, trajectory, rows, with_mass=with_mass, compiled=compiled)
-    return mapping.reduce(problem)
-
-
-def independent_share(signals: SignalSettings) -> float:
-    """Return the share of rows that are independent behind the filter: its band over Nyquist's.
-
-    Args:
-        signals: The settings, resolved.
-
-    Returns:
-        The share, at most 1.
-    """
-    if signals.cutoff is None or signals.rate is None:
-        return 1.0
-    return min(1.0, 2.0 * signals.cutoff / signals.rate)
+    def _stretches(self, k: int) -> Iterator[Reduction]:
+        """Yield what each stretch of a log in memory comes down to."""
+        motion, count = self.fitted[k].whole.trajectory, -(-_STRETCHES // len(self.fitted))
+        shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
+        length = max(-(-len(motion.t) // count), shortest)
+        for i, factors in enumerate(compress_stretches(self._problem(k), length)):
+            part = motion.part(i * length, (i + 1) * length)
+            yield Reduction(factors, part.squares, len(part.t))

@@ -11,8 +11,7 @@ from robotid._typing import Array
 from robotid.estimators import WLS
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.evaluation import Evaluation
-from robotid.identification.recordings import LoadedRecordings, Recordings
-from robotid.regressor.base_parameters import BaseMapping
+from robotid.identification.recordings import Recordings
 from robotid.regressor.prediction import predict
 from robotid.regressor.reduction import Reduction, join
 from robotid.robot.drives import DriveMotion
@@ -115,8 +114,6 @@ def loss_slope(loss: str, r: Array) -> Array:
 
 
 def reweigh(
-    model: RobotModel,
-    mapping: BaseMapping,
     recordings: Recordings,
     reductions: tuple[Reduction, ...],
     loss: str,
@@ -128,8 +125,6 @@ def reweigh(
     "tukey", which ignores bad rows altogether, starts where "huber" ends, whose minimum is unique.
 
     Args:
-        model: The robot.
-        mapping: Standard to base parameters.
         recordings: The recordings, in memory.
         reductions: What they come down to without weights.
         loss: "huber" or "tukey".
@@ -142,11 +137,12 @@ def reweigh(
         NotConvergedError: If the weights do not settle.
         SettingsError: If the recordings are not in memory.
     """
-    if not isinstance(recordings, LoadedRecordings):
+    if not recordings.is_held:
         raise SettingsError(
             f"robust is {loss!r}: its weights are found in several passes over rows in memory; "
             "raise rows_in_memory in [reduction], cut the log with start and end, or leave it out"
         )
+    mapping = recordings.mapping
     weighted, stages = recordings, ["huber"] if loss == "huber" else ["huber", "tukey"]
     for stage in stages:
         before = None
@@ -159,17 +155,17 @@ def reweigh(
                     break
             before = fit.theta
             standard = mapping.to_standard(fit.theta, prior)
-            residuals = _scaled_residuals(model, recordings, standard)
+            residuals = _scaled_residuals(recordings, standard)
             weights = tuple(loss_weight(stage, r) for r in residuals)
             weighted = replace(recordings, weights=weights)
-            reductions = weighted.reduce(mapping)
+            reductions = weighted.reduce()
         else:
             raise NotConvergedError(
                 f"the weights of the {stage} loss still change after {_MAX_ITERATIONS} passes; "
                 "look for logs of different robots, or use robust = 'none'",
                 "max_iterations",
             )
-    used = np.concatenate([r.mask.ravel() for r in recordings.fitted])
+    used = np.concatenate([log.whole.mask.ravel() for log in recordings.fitted])
     scaled = np.concatenate([r.ravel() for r in residuals])[used]
     weight = loss_weight(loss, scaled)
     slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
@@ -232,14 +228,12 @@ def _friction_step(model: RobotModel, standard: Array) -> Array:
     return step
 
 
-def _scaled_residuals(
-    model: RobotModel, recordings: LoadedRecordings, standard: Array
-) -> list[Array]:
+def _scaled_residuals(recordings: Recordings, standard: Array) -> list[Array]:
     """Return the residuals of each recording in standard deviations of their joint."""
-    residuals = [
-        r.trajectory.tau - predict(model, [standard], r.trajectory)[0] for r in recordings.fitted
-    ]
-    scales = _scales(residuals, [r.mask for r in recordings.fitted])
+    rows = [log.whole for log in recordings.fitted]
+    motions = [r.trajectory for r in rows]
+    residuals = [m.tau - predict(recordings.model, [standard], m)[0] for m in motions]
+    scales = _scales(residuals, [r.mask for r in rows])
     return [residual / scales for residual in residuals]
 
 

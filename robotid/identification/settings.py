@@ -7,6 +7,7 @@ from typing import Any, Self
 
 from robotid._settings import Range, Settings, setting
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 
 __all__ = [
     "ESTIMATORS",
@@ -127,12 +128,14 @@ class EstimatorSettings(Settings):
         if cls is not EstimatorSettings:
             return super().__new__(cls)
         if kind is None:
-            raise SettingsError(f"estimator is {name!r}, wanted one of {list(ESTIMATORS)}")
+            raise SettingsError(f"estimator is {name!r}, wanted one of {listed(ESTIMATORS)}")
         own = [f.name for f in fields(kind) if f.name != "name"]
         own.sort(key=lambda key: key not in kind.__annotations__)
         for key in options:
             if key not in own:
-                raise SettingsError(f"estimator {name!r} has no setting {key!r}; it has {own}")
+                raise SettingsError(
+                    f"estimator {name!r} has no setting {key!r}; it has {listed(own)}"
+                )
         return super().__new__(kind)
 
     @classmethod

@@ -1,12 +1,13 @@
-"""Logs larger than memory: surveyed once, then read and reduced in pieces.
+"""Logs of any length: surveyed once, then read in pieces. A log in memory is one piece.
 
-The survey reads the time stamps of all rows and a few windows of the rest, and decides everything
-automatic for the whole log. A piece is a fixed stretch of rows, read with rows around it.
+The survey of a file reads the time stamps of all rows and a few windows of the rest, and decides
+everything automatic for the whole log. A piece is a fixed stretch of rows, read with rows around
+it.
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -15,16 +16,15 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.identification.evaluation import row_mask
-from robotid.identification.recordings import base_problem
+from robotid.identification.rows import base_problem, row_mask
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
 from robotid.logs.read import LogLayout
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import decide, unwrap, velocity_lag
-from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches
-from robotid.logs.table import Place, RowReader, Table
-from robotid.logs.time_stamps import TimeStamps
+from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches, too_short
+from robotid.logs.table import Place, RowReader, Table, prefixes
+from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
@@ -33,43 +33,60 @@ from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.robot.model import RobotModel
 from robotid.workers.pieces import Piece
 
-__all__ = ["PIECE", "LogPiece", "LongLog", "survey"]
+__all__ = ["PIECE", "LogPiece", "ReducedPiece", "Rows", "SurveyedLog", "hold_log", "survey_log"]
 
 #: Rows of a piece, if nothing else is said.
 PIECE = 16384
+_ALL = slice(None)
 _WINDOW = 20_000  # rows of each window that is looked at closely
 
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """What the pieces of a log have in common."""
+    """What the pieces of a log have in common; the source is the log itself if it is in memory."""
 
-    layout: LogLayout
     model: RobotModel
-    mapping: BaseMapping
+    source: LogLayout | Log
     signals: SignalSettings
     samples: int
 
     def read(self, first: int, stop: int, near: Place) -> Log:
-        """Return rows of the file as a log in SI units, full turns left in."""
-        layout = self.layout
-        rows = _rows(open_table(Path(layout.path), layout.source), layout)
-        log = layout.to_log(rows.read(layout.wanted, first, stop, near), first)
-        check_reach(log, layout.units, layout.prismatic)
-        return log
+        """Return rows as a log in SI units, full turns left in; all of them in memory."""
+        if isinstance(self.source, Log):
+            return self.source
+        layout = self.source
+        reader = _reader(open_table(Path(layout.path), layout.source), layout.wanted)
+        return _log_of(layout, reader.read(layout.wanted, first, stop, near), first)
 
     @property
-    def is_compiled(self) -> bool:
-        """Whether the compiled path computes the rows: chosen for the log, not for each piece."""
+    def is_compiled(self) -> bool | None:
+        """Whether the compiled path computes rows of a file: chosen for the log, not by piece."""
+        if isinstance(self.source, Log):
+            return None  # by the samples of its one piece
         return choose_engine(self.model, self.samples, None) == COMPILED
-
-    def unwrap(self, log: Log) -> Log:
-        """Return the log without full turns."""
-        return unwrap(log, np.array([joint.turns_freely for joint in self.model.limits]))
 
 
 @dataclass(frozen=True, eq=False)
-class LogPiece(Piece):
+class Rows:
+    """What was read of a piece.
+
+    Attributes:
+        positions: Recorded positions of its rows, shape (samples, n), full turns left in.
+        torques: Recorded torques, likewise.
+        trajectory: Its smooth motion, of no samples if none is left.
+        mask: Rows of the motion that are used, shape (N, n_rows), bool.
+        turned: Joints whose full turns were taken out, shape (n,), bool.
+    """
+
+    positions: Array
+    torques: Array
+    trajectory: Trajectory
+    mask: Array
+    turned: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LogPiece:
     """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole.
 
     Attributes:
@@ -91,102 +108,116 @@ class LogPiece(Piece):
     @property
     def name(self) -> str:
         """What messages call it, as ``run3.parquet rows 0-16384``."""
-        return f"{Path(self.header.layout.path).name} rows {self.first}-{self.stop}"
+        return f"{Path(self.header.source.path).name} rows {self.first}-{self.stop}"
 
     @property
     def samples(self) -> int:
         """Number of its rows."""
         return self.stop - self.first
 
-    def read(self) -> tuple[Array, Trajectory, Array]:
-        """Return its raw rows, its smooth motion, and which joints' full turns were taken out.
-
-        Returns:
-            Positions and torques of its rows, shape (samples, 2 n); the trajectory, of no samples
-            if none is left; and flags, shape (n,), bool.
+    def read(self) -> Rows:
+        """Return its rows and its smooth motion; those of a log in memory are kept.
 
         Raises:
             DataError: If a row cannot be used.
         """
-        raw = self.header.read(*self.span, self.near)
-        log = self.header.unwrap(raw)
+        return self._kept if isinstance(self.header.source, Log) else self._read()
+
+    @cached_property
+    def _kept(self) -> Rows:
+        return self._read()
+
+    def _read(self) -> Rows:
+        header = self.header
+        raw = header.read(*self.span, self.near)
+        log = _unwrap(header.model, raw)
         trajectory = process_stretches(
             log,
             self.stretches,
-            self.header.signals,
+            header.signals,
             first=self.span[0],
             own=slice(self.first, self.stop),
-            speeds=friction_speeds(self.header.model.layout),
+            speeds=friction_speeds(header.model.layout),
         )
         rows = slice(self.first - self.span[0], self.stop - self.span[0])
-        own = np.hstack([raw.q[rows], raw.tau[rows]])
-        return own, trajectory, (log.q != raw.q).any(axis=0)
-
-    def mask(self, trajectory: Trajectory) -> Array:
-        """Return which rows of its motion are used.
-
-        Args:
-            trajectory: Its motion, N samples.
-
-        Returns:
-            Flags, shape (N, n_rows), bool.
-        """
-        return row_mask(self.header.model, trajectory, self.header.signals.min_velocity)
-
-    def reduce(self, *, threads: int | None = None) -> Reduction:
-        """Read the piece and reduce it; see ``Piece.reduce``.
-
-        Args:
-            threads: As of ``compress``.
-
-        Returns:
-            The reduction.
-
-        Raises:
-            DataError: If a row cannot be used.
-        """
-        _, trajectory, _ = self.read()
-        header = self.header
-        problem = base_problem(
-            header.model,
-            header.mapping,
+        return Rows(
+            raw.q[rows],
+            raw.tau[rows],
             trajectory,
-            self.mask(trajectory),
-            compiled=header.is_compiled,
+            row_mask(header.model, trajectory, header.signals.min_velocity),
+            (log.q != raw.q).any(axis=0),
         )
-        return Reduction.of(problem, trajectory, threads=threads)
 
 
 @dataclass(frozen=True, eq=False)
-class LongLog:
-    """A log that is not held in memory, after its survey.
+class ReducedPiece(Piece):
+    """A piece to be reduced to factors of base parameters.
 
     Attributes:
-        header: What its pieces have in common.
-        first: Its first row in the file, of the window.
-        stop: The row after its last one.
-        start: Time stamp of its first row [s].
-        end: Time stamp of its last row [s].
-        step: Median time step [s].
-        stretches: Its uninterrupted stretches.
-        pieces: Its pieces, in order.
-        windows: Stretches of rows that were looked at closely: the first, middle and last ones.
+        piece: The piece.
+        mapping: Standard to base parameters.
     """
 
-    header: _Header
+    piece: LogPiece
+    mapping: BaseMapping
+
+    @property
+    def name(self) -> str:
+        return self.piece.name
+
+    @property
+    def samples(self) -> int:
+        return self.piece.samples
+
+    def reduce(self, *, threads: int | None = None) -> Reduction:
+        header, rows = self.piece.header, self.piece.read()
+        problem = base_problem(
+            header.model,
+            self.mapping,
+            rows.trajectory,
+            rows.mask,
+            compiled=header.is_compiled,
+        )
+        return Reduction.of(problem, rows.trajectory, threads=threads)
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyedLog:
+    """A log ready to be read in pieces.
+
+    Attributes:
+        model: The robot.
+        source: The log if it is in memory, else which columns of its file make it up.
+        asked: How it becomes a trajectory, as the user gave it.
+        stamps: Time stamps of all rows of the file, shape (N,) [s].
+        first: Its first row in the file, of the window.
+        stop: The row after its last one.
+        windows: Stretches of rows that were looked at closely: all, or first, middle and last ones.
+        held: Positions in them of locked joints that the file has, by name [rad or m].
+        length: Rows per piece.
+        places: Where rows of the file start.
+    """
+
+    model: RobotModel
+    source: LogLayout | Log
+    asked: SignalSettings
+    stamps: Array
     first: int
     stop: int
-    start: float
-    end: float
-    step: float
-    stretches: tuple[Stretch, ...]
-    pieces: tuple[LogPiece, ...]
     windows: tuple[Log, ...]
+    held: Mapping[str, Array] = field(default_factory=dict)
+    length: int = PIECE
+    places: Sequence[Place] = (Place(),)
 
     @property
     def path(self) -> str:
-        """The file."""
-        return self.header.layout.path
+        """The file; "" if it was made in memory."""
+        return self.source.path
+
+    @property
+    def is_held(self) -> bool:
+        """Whether it is in memory."""
+        return isinstance(self.source, Log)
 
     @property
     def head(self) -> Log:
@@ -209,19 +240,115 @@ class LongLog:
             for log, (first, stop) in zip(self.windows, ranges, strict=True)
         )
 
+    @cached_property
+    def step(self) -> float:
+        """Median time step [s]."""
+        return median_step(self.stamps[self.first : self.stop])
 
-def survey(
+    @cached_property
+    def signals(self) -> SignalSettings:
+        """How it becomes a trajectory, everything automatic decided for the whole log.
+
+        Raises:
+            DataError: If measured velocity or acceleration is asked for and the log has none.
+            SettingsError: If a setting does not fit the log.
+        """
+        return decide(
+            self.asked,
+            self.step,
+            self.path or "log",
+            has_velocity=self.windows[0].v is not None,
+            has_acceleration=self.windows[0].a is not None,
+            lag=lambda: float(
+                np.median([velocity_lag(_unwrap(self.model, window)) for window in self.windows])
+            ),
+        )
+
+    @cached_property
+    def stretches(self) -> tuple[Stretch, ...]:
+        """Its uninterrupted stretches."""
+        edges = [self.first]
+        for row, t in blocks_of(self.stamps[self.first : self.stop]):
+            breaks = np.flatnonzero(np.diff(t) > (self.signals.max_gap or np.inf)) + 1
+            edges += (self.first + row + breaks).tolist()
+        return tuple(
+            Stretch(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
+            for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
+        )
+
+    @cached_property
+    def pieces(self) -> tuple[LogPiece, ...]:
+        """Its pieces, in order."""
+        return tuple(self._cut())
+
+    @property
+    def whole(self) -> Rows:
+        """All rows of a log in memory, and their smooth motion.
+
+        Raises:
+            DataError: If no stretch is long enough, or an angle jumps.
+        """
+        (piece,) = self.pieces
+        rows = piece.read()
+        if not len(rows.trajectory.t):
+            raise self.too_short()
+        return rows
+
+    def too_short(self) -> DataError:
+        """Return the error of a log without a stretch that is long enough."""
+        return too_short(self.path or "log", len(self.stretches), self.signals)
+
+    def _cut(self) -> Iterator[LogPiece]:
+        """Yield pieces of so many rows each, and which rows are to be read with each."""
+        stamps, stretches, window = self.stamps, self.stretches, (self.first, self.stop)
+        header = _Header(self.model, self.source, self.signals, self.stop - self.first)
+        reach = filter_reach(self.signals)
+        begins = [stretch.first for stretch in stretches]
+        for first in range(*window, self.length):
+            stop = min(first + self.length, window[1])
+            mine = stretches[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
+            before = int(np.searchsorted(stamps, stamps[first] - reach)) - SPLINE
+            after = int(np.searchsorted(stamps, stamps[stop - 1] + reach)) + SPLINE
+            span = max(before, mine[0].first), min(after, mine[-1].stop)
+            if span[1] - span[0] < 2:  # a lonely row, with another one: a log has two
+                low = max(span[0] - 1, window[0])
+                span = low, low + 2
+            near = _near(self.places, span[0])
+            yield LogPiece(header, first, stop, span, near, tuple(mine))
+
+
+def hold_log(
+    model: RobotModel,
+    log: Log,
+    signals: SignalSettings,
+    *,
+    held: Mapping[str, Array] | None = None,
+) -> SurveyedLog:
+    """Return a log in memory, ready to be read as one piece.
+
+    Args:
+        model: The robot.
+        log: The log, of the model's joints in its order.
+        signals: How it becomes a trajectory.
+        held: Positions of locked joints, if it has them, by name [rad or m].
+
+    Returns:
+        The log; what is wrong with it is told as it is read.
+    """
+    count = len(log.t)
+    return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
+
+
+def survey_log(
     layout: LogLayout,
     table: Table,
     model: RobotModel,
-    mapping: BaseMapping,
     signals: SignalSettings,
+    window: tuple[float | None, float | None] = (None, None),
     *,
-    start: float | None = None,
-    end: float | None = None,
-    length: int = PIECE,
-) -> LongLog:
-    """Return a log ready to be read in pieces.
+    length: int | None = PIECE,
+) -> SurveyedLog:
+    """Return a log in a file, ready to be read.
 
     Every time stamp is checked. Units, and how late the measured velocity is, are judged in the
     windows; what each piece reads is checked as it is read.
@@ -230,11 +357,10 @@ def survey(
         layout: Which columns of the file make up the log.
         table: The file, opened.
         model: The robot.
-        mapping: Standard to base parameters.
         signals: How the log becomes a trajectory.
-        start: First time stamp kept, on the log's own clock [s].
-        end: Last time stamp kept [s].
-        length: Rows per piece; a file that is only read whole is one piece.
+        window: First and last time stamp kept, on the log's own clock [s]; None for the ends.
+        length: Rows per piece; None: the log is read at once and kept in memory. A file that is
+            only read whole is one piece.
 
     Returns:
         The log.
@@ -242,32 +368,33 @@ def survey(
     Raises:
         DataError: If time does not increase, the window holds fewer than two rows, or units are
             suspect.
-        SettingsError: If a setting does not fit the log.
     """
-    rows = _rows(table, layout)
-    places: list[Place] = []
-    with TimeStamps(_stamps(rows, layout, places), Path(layout.path).name) as stamps:
-        first, stop = _window(stamps, layout, start, end)
-        step = stamps.median_step(first, stop)
-        header = _Header(layout, model, mapping, signals, stop - first)
-        windows = tuple(header.read(i, j, _near(places, i)) for i, j in _close_looks(first, stop))
-        for window in windows:
-            check_units(window, layout.units, layout.prismatic)
-        resolved = decide(
-            signals,
-            step,
-            layout.path,
-            has_velocity="dq" in layout.columns,
-            has_acceleration="ddq" in layout.columns,
-            lag=lambda: float(np.median([velocity_lag(header.unwrap(w)) for w in windows])),
-        )
-        header = replace(header, signals=resolved)
-        stretches = _stretches(stamps, first, stop, resolved)
-        if table.rows is None:
-            length = max(stop - first, 1)
-        pieces = tuple(_cut(header, stamps, (first, stop), stretches, places, length))
-        ends = stamps.at(first), stamps.at(stop - 1)
-    return LongLog(header, first, stop, *ends, step, stretches, pieces, windows)
+    held = _held_columns(layout, table, model)
+    wanted = list(dict.fromkeys([*layout.wanted, *held.values()]))
+    if length is None:
+        columns = table.read(wanted)
+        log = layout.to_log(columns)
+        check_units(log, layout.units, layout.prismatic)
+        kept = log if window == (None, None) else log.window(*window)
+        inside = slice(*np.searchsorted(log.t, [kept.t[0], np.nextafter(kept.t[-1], np.inf)]))
+        positions = _positions(held, [columns], layout, model, inside)
+        return hold_log(model, kept, signals, held=positions)
+    reader, places = _reader(table, wanted), list[Place]()
+    stamps = map_stamps(_stamps(reader, layout, places), _file(layout))
+    first, stop = _window(stamps, layout, *window)
+    ranges = _close_looks(first, stop)
+    found = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
+    windows = tuple(
+        _log_of(layout, columns, i) for columns, (i, _) in zip(found, ranges, strict=True)
+    )
+    for log in windows:
+        check_units(log, layout.units, layout.prismatic)
+    positions = _positions(held, found, layout, model)
+    if table.rows is None:
+        length = max(stop - first, 1)
+    return SurveyedLog(
+        model, layout, signals, stamps, first, stop, windows, positions, length, places
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,15 +405,12 @@ class _WholeTable(RowReader):
     wanted: Sequence[str]
 
     def count(self) -> int:
-        """Return the number of rows."""
         return len(next(iter(self._columns.values())))
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column; see ``RowReader.scan``."""
         yield self._columns[name], Place()
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows; see ``RowReader.read``."""
         return {name: self._columns[name][first:stop] for name in wanted}
 
     @cached_property
@@ -294,8 +418,20 @@ class _WholeTable(RowReader):
         return self.table.read(self.wanted)
 
 
-def _rows(table: Table, layout: LogLayout) -> RowReader:
-    return _WholeTable(table, layout.wanted) if table.rows is None else table.rows
+def _reader(table: Table, wanted: Sequence[str]) -> RowReader:
+    return _WholeTable(table, wanted) if table.rows is None else table.rows
+
+
+def _log_of(layout: LogLayout, columns: Mapping[str, Array], first: int) -> Log:
+    """Return rows of a file as a log in SI units, full turns left in."""
+    log = layout.to_log(columns, first)
+    check_reach(log, layout.units, layout.prismatic)
+    return log
+
+
+def _unwrap(model: RobotModel, log: Log) -> Log:
+    """Return the log without full turns."""
+    return unwrap(log, np.array([joint.turns_freely for joint in model.limits]))
 
 
 def _stamps(rows: RowReader, layout: LogLayout, places: list[Place]) -> Iterator[Array]:
@@ -309,17 +445,21 @@ def _near(places: Sequence[Place], row: int) -> Place:
     return places[max(bisect_right(places, row, key=lambda place: place.row) - 1, 0)]
 
 
+def _file(layout: LogLayout) -> str:
+    return Path(layout.path).name
+
+
 def _window(
-    stamps: TimeStamps, layout: LogLayout, start: float | None, end: float | None
+    stamps: Array, layout: LogLayout, start: float | None, end: float | None
 ) -> tuple[int, int]:
     """Return the rows from start to end; see ``Log.window``."""
-    where = Path(layout.path).name
-    if len(stamps) < 2:
-        raise DataError(f"{where} has {len(stamps)} rows, wanted at least 2")
-    first = 0 if start is None else stamps.search(start)
-    stop = len(stamps) if end is None else stamps.search(float(np.nextafter(end, np.inf)))
+    where, count = _file(layout), len(stamps)
+    if count < 2:
+        raise DataError(f"{where} has {count} rows, wanted at least 2")
+    first = 0 if start is None else int(np.searchsorted(stamps, start))
+    stop = count if end is None else int(np.searchsorted(stamps, end, side="right"))
     if stop - first < 2:
-        low, high = stamps.at(0), stamps.at(len(stamps) - 1)
+        low, high = stamps[0], stamps[-1]
         raise DataError(
             f"{where}: {max(stop - first, 0)} rows lie between "
             f"{low if start is None else start:g} s and {high if end is None else end:g} s; "
@@ -336,38 +476,32 @@ def _close_looks(first: int, stop: int) -> list[tuple[int, int]]:
     return [(row, row + _WINDOW) for row in (first, middle, stop - _WINDOW)]
 
 
-def _stretches(
-    stamps: TimeStamps, first: int, stop: int, signals: SignalSettings
-) -> tuple[Stretch, ...]:
-    """Return the stretches between gaps."""
-    edges = [first]
-    for row, t in stamps.blocks(first, stop):
-        breaks = np.flatnonzero(np.diff(t) > (signals.max_gap or np.inf)) + 1
-        edges += (row + breaks).tolist()
-    return tuple(
-        Stretch(i, j, stamps.at(i), stamps.at(j - 1), number)
-        for number, (i, j) in enumerate(pairwise([*edges, stop]))
-    )
+def _held_columns(layout: LogLayout, table: Table, model: RobotModel) -> dict[str, str]:
+    """Return the columns of locked joints' positions that a file has and no one reads otherwise."""
+    found = {}
+    for joint in model.locked:
+        named = layout.source.joints.get(joint, joint)
+        names = [prefix + named for prefix in prefixes()["q"] if prefix + named in table.names]
+        if names:
+            found[joint] = names[0]
+    return found
 
 
-def _cut(
-    header: _Header,
-    stamps: TimeStamps,
-    window: tuple[int, int],
-    stretches: Sequence[Stretch],
-    places: Sequence[Place],
-    length: int,
-) -> Iterator[LogPiece]:
-    """Yield pieces of so many rows each, and which rows are to be read with each."""
-    reach = filter_reach(header.signals)
-    begins = [stretch.first for stretch in stretches]
-    for first in range(*window, length):
-        stop = min(first + length, window[1])
-        mine = stretches[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
-        before = stamps.search(stamps.at(first) - reach) - SPLINE
-        after = stamps.search(stamps.at(stop - 1) + reach) + SPLINE
-        span = max(before, mine[0].first), min(after, mine[-1].stop)
-        if span[1] - span[0] < 2:  # a lonely row, with another one: a log has two
-            low = max(span[0] - 1, window[0])
-            span = low, low + 2
-        yield LogPiece(header, first, stop, span, _near(places, span[0]), tuple(mine))
+def _positions(
+    held: Mapping[str, str],
+    windows: Sequence[Mapping[str, Array]],
+    layout: LogLayout,
+    model: RobotModel,
+    inside: slice = _ALL,
+) -> dict[str, Array]:
+    """Return the positions of locked joints that were read, in rad or m."""
+    turning = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}
+    positions = {}
+    for joint, column in held.items():
+        q = np.concatenate([columns[column] for columns in windows])[inside]
+        q = q[np.isfinite(q)]
+        if joint in turning and layout.units.angle == "deg":
+            q = np.deg2rad(q)
+        if len(q):
+            positions[joint] = q
+    return positions

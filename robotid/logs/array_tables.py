@@ -8,6 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Table, choose, prefixes
@@ -83,14 +84,15 @@ def _group(where: str, paths: Sequence[str], topic: str | None) -> str:
         if not any(path.startswith(group) for path in paths):
             known = [name.rstrip("/") or "/" for name in groups]
             raise DataError(
-                f"{where} has no group {topic!r}; groups found: {known}{suggestion(topic, known)}"
+                f"{where} has no group {topic!r}; groups found: "
+                f"{listed(known)}{suggestion(topic, known)}"
             )
         return group
     timed = {head + slash for head, slash, tail in parents.values() if tail in _CLOCKS}
     if not timed:
         return ""
     names = sorted(name.rstrip("/") or "/" for name in timed)
-    chosen = choose(where, names, "groups with a time", f"entries found: {list(paths)}")
+    chosen = choose(where, names, "groups with a time", f"entries found: {listed(paths)}")
     return "" if chosen == "/" else chosen + "/"
 
 
@@ -116,7 +118,7 @@ def _columns_of(
     if joints and is_wide and len(joints) != count:
         raise DataError(
             f"{where}: {name} has shape {shape}, but the file names {len(joints)} joints: "
-            f"{list(joints)}; give each joint one column"
+            f"{listed(joints)}; give each joint one column"
         )
     names = joints if joints and len(joints) == count else [str(j) for j in range(count)]
     return {f"{name}_{names[j]}": _Column(path, j) for j in range(count)}

@@ -15,6 +15,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
+from robotid.findings import listed
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Table, choose
@@ -176,12 +177,12 @@ def _content(where: str, topic: str, number: int, message: Any) -> tuple[Layout,
         if len(values) not in (0, len(names)):
             raise DataError(
                 f"{where}: message {number} on {topic!r} names {len(names)} joints but holds "
-                f"{len(values)} values of {name}; mend the recording"
+                f"{len(values)} values of {name}; correct the recording"
             )
     if len(set(names)) < len(names):
         raise DataError(
-            f"{where}: message {number} on {topic!r} names {repeated(names)} twice; mend the "
-            "recording"
+            f"{where}: message {number} on {topic!r} names {listed(repeated(names))} twice; "
+            "correct the recording"
         )
     filled = {name: values for name, values in fields.items() if len(values)}
     return (names, tuple(filled)), list(filled.values())
@@ -225,6 +226,7 @@ def _require_whole(where: str, blocks: dict[Layout, _Block], columns: Sequence[s
         first = min(partial_)
         raise DataError(
             f"{where}: {count} of {total} messages lack some of what is read, the first (message "
-            f"{first}) {partial_[first]}. A row is one message: read only joints that are always "
+            f"{first}) {listed(partial_[first])}. A row is one message: read only joints that are "
+            "always "
             "published together, and leave out the others"
         )

@@ -178,7 +178,7 @@ def _whole_rows(
             found = len(next(csv.reader([line], delimiter=separator)))
             if found != count:
                 raise DataError(
-                    f"{where}: line {number} has {found} cells, the header has {count}; mend it"
+                    f"{where}: line {number} has {found} cells, the header has {count}; correct it"
                 )
         yield line
 
@@ -195,7 +195,7 @@ def _bad_cell(path: Path, names: list[str], columns: list[int], separator: str) 
                     hint = "; write decimals with a point" if "," in cells[i] else ""
                     return DataError(
                         f"{path.name}: {names[i]} is {found} at row {row}, wanted a number{hint}; "
-                        "remove the row or mend the recording"
+                        "remove the row or correct the recording"
                     )
     return DataError(f"{path.name} holds a cell that is not a plain decimal number")
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import listed
 
 __all__ = ["Log", "Trajectory"]
 
@@ -95,7 +96,7 @@ class Log:
         for name in joints:
             if name not in self.joints:
                 raise DataError(
-                    f"joint {name!r} is not in {_where(self.path)}; joints: {list(self.joints)}"
+                    f"joint {name!r} is not in {_where(self.path)}; joints: {listed(self.joints)}"
                     f"{suggestion(name, self.joints)}"
                 )
         kept = [self.joints.index(name) for name in joints]
@@ -216,7 +217,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
         raise DataError(f"{where}: joints is {owner.joints!r}, wanted at least one name in a tuple")
     joints = tuple(owner.joints)
     if twice := repeated(joints):
-        raise DataError(f"{where}: joints {twice} are named twice; name each joint once")
+        raise DataError(f"{where}: joints {listed(twice)} are named twice; name each joint once")
     t = _frozen(owner.t)
     if t.ndim != 1:
         raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
@@ -229,7 +230,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
         if array.shape != (len(t), len(joints)):
             raise DataError(
                 f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
-                f"for each time stamp, a column for each of the joints {list(joints)}"
+                f"for each time stamp, a column for each of the joints {listed(joints)}"
             )
         require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
         settled[{"dq": "v", "ddq": "a"}.get(name, name)] = array
@@ -268,8 +269,8 @@ def require_finite(
     found = "NaN" if np.isnan(values[row, column]) else str(values[row, column])
     at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
     raise DataError(
-        f"{where}: {names[column]} is {found} at row {first + row}{at}; remove the row or mend the "
-        "recording",
+        f"{where}: {names[column]} is {found} at row {first + row}{at}; remove the row or "
+        "correct the recording",
         code="not_finite",
     )
 
@@ -298,7 +299,7 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
         )
     raise DataError(
         f"{where}: t must increase, but t[{row}] = {now} s follows t[{row - 1}] = {before} s; "
-        "sort the rows, or mend the recording",
+        "sort the rows, or correct the recording",
         code="stamp_order",
     )
 

@@ -14,16 +14,15 @@ from robotid.logs.parquet_files import open_parquet, write_parquet
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Table
 
-__all__ = ["count_rows", "open_table", "write_columns"]
+__all__ = ["open_table", "write_columns"]
 
 
 @dataclass(frozen=True)
 class _Format:
-    """How one format is opened and, if it is, written; how its rows are counted, if they are."""
+    """How one format is opened and, if it is, written."""
 
     open: Callable[[Path, LogSource], Table]
     write: Callable[[Mapping[str, Array], Path], None] | None = None
-    count: Callable[[Path], int] | None = None
 
 
 def _without_topics(open_file: Callable[[Path], Table]) -> Callable[[Path, LogSource], Table]:
@@ -39,21 +38,11 @@ def _without_topics(open_file: Callable[[Path], Table]) -> Callable[[Path, LogSo
     return open_only
 
 
-def _counted(open_file: Callable[[Path], Table]) -> Callable[[Path], int]:
-    """Return what counts the rows of a file that can be read by rows."""
-
-    def count(path: Path) -> int:
-        rows = open_file(path).rows
-        return 0 if rows is None else rows.count()
-
-    return count
-
-
 _HDF5 = _Format(open_hdf5, write_hdf5)
 _BAG = _Format(open_bag)
 _FORMATS = {
-    ".csv": _Format(_without_topics(open_csv), write_csv, _counted(open_csv)),
-    ".parquet": _Format(_without_topics(open_parquet), write_parquet, _counted(open_parquet)),
+    ".csv": _Format(_without_topics(open_csv), write_csv),
+    ".parquet": _Format(_without_topics(open_parquet), write_parquet),
     ".npz": _Format(open_npz, write_npz),
     ".h5": _HDF5,
     ".hdf5": _HDF5,
@@ -89,25 +78,6 @@ def open_table(path: Path, source: LogSource) -> Table:
     if not path.is_file():
         raise DataError(f"there is no log file {str(path)!r}")
     return _FORMATS[suffix].open(path, source)
-
-
-def count_rows(path: Path) -> int | None:
-    """Return about how many rows a file has, if it can be read by rows.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The number; None if the file is missing, or of a format that is only read whole.
-
-    Raises:
-        DataError: If the file is broken.
-        MissingDependencyError: If a package that reads it is not installed.
-    """
-    known = _FORMATS.get(path.suffix.lower())
-    if known is None or known.count is None or not path.is_file():
-        return None
-    return known.count(path)
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:

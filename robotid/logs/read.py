@@ -13,6 +13,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 from robotid.logs.data import Log, repeated, require_finite, require_increasing, suggestion
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
@@ -235,9 +236,11 @@ class _Finder:
         found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
         extra = [name for name in self.names if name not in self.seen]
         if extra:
-            self.notes.append(f"columns ignored: {extra}")
+            self.notes.append(f"columns ignored: {listed(extra)}")
         if twice := repeated([name for names in found.values() for name in names]):
-            raise SettingsError(f"{self.where}: {twice} are read twice; correct columns={{...}}")
+            raise SettingsError(
+                f"{self.where}: {listed(twice)} are read twice; correct columns={{...}}"
+            )
         return found
 
     def factors(self, torques: Sequence[str]) -> Array:
@@ -248,12 +251,14 @@ class _Finder:
     def _check_arguments(self) -> None:
         """Refuse names twice in the file, and gains and columns of what is not read."""
         if twice := repeated([name for name in self.names if name]):
-            raise DataError(f"{self.where} has more than one column {twice}; rename or remove one")
+            raise DataError(
+                f"{self.where} has more than one column {listed(twice)}; rename or remove one"
+            )
         for joint, gain in self.gains.items():
             if joint not in self.joints:
                 raise SettingsError(
                     f"{self.where}: a gain is given for {joint!r}, which is not among the joints "
-                    f"read: {list(self.joints)}{suggestion(joint, self.joints)}"
+                    f"read: {listed(self.joints)}{suggestion(joint, self.joints)}"
                 )
             if not np.isfinite(gain) or gain == 0:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
@@ -261,7 +266,7 @@ class _Finder:
             if joint not in self.joints:
                 raise SettingsError(
                     f"{self.where}: log.joints renames {joint!r}, which is not among the joints "
-                    f"read: {list(self.joints)}{suggestion(joint, self.joints)}"
+                    f"read: {listed(self.joints)}{suggestion(joint, self.joints)}"
                 )
         known = ["time", *(f"{kind}_{joint}" for kind in prefixes() for joint in self.joints)]
         for standard, name in self.columns.items():
@@ -273,7 +278,7 @@ class _Finder:
             if name not in self.names:
                 raise DataError(
                     f"{self.where} has no column {name!r}, which columns gives for {standard!r}; "
-                    f"columns found: {self.names}{suggestion(name, self.names)}"
+                    f"columns found: {listed(self.names)}{suggestion(name, self.names)}"
                 )
 
     def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
@@ -325,7 +330,7 @@ class _Finder:
         names = [name for name in found.values() if name]
         without = [joint for joint, name in found.items() if not name]
         if names and without:
-            self.notes.append(f"{names} ignored: {without} have no {_NOUNS[kind]}")
+            self.notes.append(f"{listed(names)} ignored: {listed(without)} have no {_NOUNS[kind]}")
         return [] if without else names
 
     def _missing(self, kind: str, joint: str) -> str:
@@ -349,7 +354,8 @@ class _Finder:
         )
         near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
         raise DataError(
-            f"{self.where} has no column {sought!r}; {noun} found: {found}. {hint.format(near)}"
+            f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. "
+            f"{hint.format(near)}"
             f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}",
             code="missing_column",
         )

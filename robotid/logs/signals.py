@@ -12,13 +12,13 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import Stretch, process_stretches, too_short
 
 __all__ = [
     "decide",
-    "is_moving",
     "process",
     "resolve",
     "turns_note",
@@ -144,20 +144,6 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
     return replace(trajectory, segment=numbers)
 
 
-def is_moving(trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return which joints move: near stand-still the sign of the velocity is noise.
-
-    Args:
-        trajectory: N samples.
-        min_velocity: Bound on the speed [rad/s or m/s].
-
-    Returns:
-        Flags, shape (N, n), bool.
-    """
-    moving: Array = np.abs(trajectory.v) >= min_velocity
-    return moving
-
-
 def velocity_lag(log: Log) -> float:
     """Return how late the measured velocity is against the derivative of the position.
 
@@ -211,7 +197,7 @@ def unwrap(log: Log, is_free: Array) -> Log:
         k = int(np.argmax(jumps[:, j]))
         raise DataError(
             f"{log.path or 'log'}: q_{log.joints[j]} jumps by a full turn at t = "
-            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; mend the recording",
+            f"{log.t[k + 1]:.6g} s, but the URDF limits this joint; correct the recording",
             code="full_turn",
         )
     if not turned.any():
@@ -231,7 +217,7 @@ def turns_note(joints: Sequence[str]) -> str:
     Returns:
         The note.
     """
-    return f"full turns taken out of the angle of {list(joints)}"
+    return f"full turns taken out of the angle of {listed(joints)}"
 
 
 def _distance(slope: Array, v: Array, shift: int) -> float:

@@ -94,7 +94,7 @@ def process_stretches(
 
 
 def filter_reach(settings: SignalSettings) -> float:
-    """Return how long before and after a row others have a say in its smooth value [s].
+    """Return how long before and after a row others count for its smooth value [s].
 
     That is more than twice as far as the filter reaches: the sign of a smooth speed depends on how
     long a drive may stick, and is filtered once more.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.findings import listed
 
 __all__ = ["Place", "RowReader", "Table", "choose", "prefixes"]
 
@@ -116,7 +117,8 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
     if len(found) == 1:
         return found[0]
     raise DataError(
-        f"{where} holds {len(found)} {noun}: {sorted(found)}; {listing}. State one: topic = "
+        f"{where} holds {len(found)} {noun}: {listed(sorted(found))}; {listing}. State one: topic "
+        "= "
         f'"{sorted(found)[0]}" (job file table [log], CLI --topic, Python '
         "source=LogSource(topic=...))"
     )

@@ -1,139 +1,68 @@
-"""The time stamps of a log larger than memory, in a temporary file."""
+"""The time stamps of a log of any length: checked, in a temporary file mapped into memory."""
 
 import tempfile
-from bisect import bisect_left
 from collections.abc import Iterable, Iterator
-from types import TracebackType
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.logs.data import require_finite, require_increasing
 
-__all__ = ["TimeStamps"]
+__all__ = ["blocks_of", "map_stamps", "median_step"]
 
-_BLOCK = 2**17  # stamps in memory at a time
-_DIGIT = 16  # bits of a step decided in one pass
+_BLOCK = 2**17  # stamps looked at together
 
 
-class TimeStamps:
-    """The time stamps of a log, checked: finite, strictly increasing.
+def map_stamps(blocks: Iterable[Array], where: str) -> Array:
+    """Return the time stamps of a log, in a file that ends with the array.
 
     Args:
         blocks: The stamps, a block of rows at a time [s].
         where: What the log is called.
 
+    Returns:
+        All stamps, shape (N,) [s].
+
     Raises:
         DataError: If a stamp is not finite, or not after the one before.
     """
-
-    def __init__(self, blocks: Iterable[Array], where: str) -> None:
-        self._count = 0
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 closed by __exit__
-        try:
-            self._fill(blocks, where)
-        except BaseException:
-            self._file.close()
-            raise
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __enter__(self) -> "TimeStamps":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
-
-    def read(self, first: int, stop: int) -> Array:
-        """Return some time stamps.
-
-        Args:
-            first: First row.
-            stop: Row after the last one.
-
-        Returns:
-            Shape (stop - first,) [s].
-        """
-        self._file.seek(8 * first)
-        return np.fromfile(self._file, np.float64, max(stop - first, 0))
-
-    def at(self, row: int) -> float:
-        """Return one time stamp.
-
-        Args:
-            row: The row.
-
-        Returns:
-            Its stamp [s].
-        """
-        return float(self.read(row, row + 1)[0])
-
-    def search(self, t: float) -> int:
-        """Return the first row that is not before a time.
-
-        Args:
-            t: The time [s].
-
-        Returns:
-            The row; the number of rows if all are before.
-        """
-        return bisect_left(range(self._count), t, key=self.at)
-
-    def blocks(self, first: int, stop: int) -> Iterator[tuple[int, Array]]:
-        """Yield the time stamps in blocks that share a stamp with the one before.
-
-        Args:
-            first: First row.
-            stop: Row after the last one.
-
-        Yields:
-            The first row of a block, and its stamps, at least two [s].
-        """
-        for row in range(first, stop - 1, _BLOCK):
-            yield row, self.read(row, min(row + _BLOCK + 1, stop))
-
-    def median_step(self, first: int, stop: int) -> float:
-        """Return the median time step, exactly, whatever the number of rows.
-
-        Args:
-            first: First row.
-            stop: Row after the last one.
-
-        Returns:
-            The median [s].
-        """
-        steps = stop - first - 1
-        middle = [self._ordered(first, stop, rank) for rank in {(steps - 1) // 2, steps // 2}]
-        return float(np.mean(middle))
-
-    def _fill(self, blocks: Iterable[Array], where: str) -> None:
-        last = np.empty(0)
+    count, last = 0, np.empty(0)
+    with tempfile.TemporaryFile() as file:
         for block in blocks:
-            require_finite(block[:, None], block, ["time"], where, self._count)
-            require_increasing(np.append(last, block), where, self._count - len(last))
-            np.ascontiguousarray(block, dtype=np.float64).tofile(self._file)
-            self._count += len(block)
-            last = block[-1:]
+            require_finite(block[:, None], block, ["time"], where, count)
+            require_increasing(np.append(last, block), where, count - len(last))
+            np.ascontiguousarray(block, dtype=np.float64).tofile(file)
+            count, last = count + len(block), block[-1:]
+        file.flush()
+        return np.memmap(file, np.float64, "r", shape=(count,)) if count else last
 
-    def _ordered(self, first: int, stop: int, rank: int) -> float:
-        """Return the step of a rank; positive floats are in the order of their bits."""
-        found = 0
-        for shift in range(64 - _DIGIT, -1, -_DIGIT):
-            counts = np.zeros(2**_DIGIT, dtype=np.int64)
-            for _, t in self.blocks(first, stop):
-                keys = np.diff(t).view(np.uint64)
-                if shift < 64 - _DIGIT:
-                    keys = keys[keys >> np.uint64(shift + _DIGIT) == found]
-                digits = (keys >> np.uint64(shift)) & np.uint64(2**_DIGIT - 1)
-                counts += np.bincount(digits.astype(np.int64), minlength=2**_DIGIT)
-            below = np.cumsum(counts)
-            digit = int(np.searchsorted(below, rank, side="right"))
-            rank -= int(below[digit - 1]) if digit else 0
-            found = (found << _DIGIT) | digit
-        return float(np.array([found], dtype=np.uint64).view(np.float64)[0])
+
+def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
+    """Yield time stamps in blocks that share a stamp with the one before.
+
+    Args:
+        t: The stamps, shape (N,) [s].
+
+    Yields:
+        The first row of a block, and its stamps, at least two [s].
+    """
+    for row in range(0, len(t) - 1, _BLOCK):
+        yield row, t[row : row + _BLOCK + 1]
+
+
+def median_step(t: Array) -> float:
+    """Return the median time step; those of a long log are sorted in a temporary file.
+
+    Args:
+        t: The stamps, shape (N,), N >= 2 [s].
+
+    Returns:
+        The median [s].
+    """
+    if len(t) <= _BLOCK:
+        return float(np.median(np.diff(t)))
+    with tempfile.TemporaryFile() as file:
+        steps = np.memmap(file, np.float64, "w+", shape=(len(t) - 1,))
+        for row, block in blocks_of(t):
+            steps[row : row + len(block) - 1] = np.diff(block)
+        return float(np.median(steps, overwrite_input=True))

@@ -15,7 +15,8 @@ from robotid.paper.planar_2r import (
     regressor,
 )
 from robotid.paper.study import AMPLITUDE, DURATION, MODELS, paper_arm
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.integration import rk4
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
 
@@ -141,14 +142,7 @@ def _free_energy(name: str, steps: int, h: float) -> Array:
     states = []
     for _ in range(steps):
         states.append((q[0], v[0]))
-        a1 = plant.acceleration(q, v, nothing)
-        v2 = v + h / 2 * a1
-        a2 = plant.acceleration(q + h / 2 * v, v2, nothing)
-        v3 = v + h / 2 * a2
-        a3 = plant.acceleration(q + h / 2 * v2, v3, nothing)
-        v4 = v + h * a3
-        a4 = plant.acceleration(q + h * v3, v4, nothing)
-        q, v = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        q, v = rk4(lambda q, v, _: plant.acceleration(q, v, nothing), q, v, h)
     angles, speeds = (np.array(part) for part in zip(*states, strict=True))
     D = mass_matrix(dynamics, angles, P)
     energy: Array = np.einsum("ki,kij,kj->k", speeds, D, speeds) / 2

@@ -10,7 +10,7 @@ from robotid.paper.errata import EnergyDrift
 from robotid.paper.random_motions import RandomRuns
 from robotid.paper.study import AMPLITUDE, CASES, DURATION, ModelStudy
 from robotid.report.svg import INK, STYLE
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = [
     "convergence_figure",

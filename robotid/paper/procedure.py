@@ -24,7 +24,8 @@ from robotid.paper.formulas import (
     recursive_update,
     reference_acceleration,
 )
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.integration import rk4
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = ["History", "Influences", "LoopSettings", "random_torque", "run_procedure"]
 
@@ -302,17 +303,10 @@ class _Loop:
     def _advance(self, q: Array, v: Array, a: Array, u: Array) -> tuple[Array, Array]:
         """Return the state one update later: Runge-Kutta of order 4, the torque held."""
         h = (self.dt / self.settings.substeps)[:, None]
-        move = self.plant.acceleration
         for step in range(self.settings.substeps):
-            a1 = a if step == 0 else move(q, v, u)
-            v2 = v + h / 2 * a1
-            a2 = move(q + h / 2 * v, v2, u)
-            v3 = v + h / 2 * a2
-            a3 = move(q + h / 2 * v2, v3, u)
-            v4 = v + h * a3
-            a4 = move(q + h * v3, v4, u)
-            q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
-            v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+            q, v = rk4(
+                lambda q, v, _: self.plant.acceleration(q, v, u), q, v, h, a if step == 0 else None
+            )
         return q, v
 
     def _hold_lost(

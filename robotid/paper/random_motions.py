@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from robotid._typing import Array
 from robotid.paper.dynamics import LinearDynamics, LinearPlant
 from robotid.paper.procedure import History, LoopSettings, run_procedure
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = ["TOLERANCE", "RandomRuns", "random_runs"]
 

@@ -31,7 +31,7 @@ from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.svg import STYLE, svg_element
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 from robotid.versions import __version__
 from robotid.viewer.replays import Torques, write_replay
 

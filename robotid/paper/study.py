@@ -15,7 +15,7 @@ from robotid.exceptions import SettingsError
 from robotid.paper.dynamics import LinearPlant, PlanarDynamics, torque
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
 from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 __all__ = [
     "AMPLITUDE",

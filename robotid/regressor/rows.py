@@ -92,59 +92,29 @@ class TrajectoryRows(RowSource):
 
     @property
     def samples(self) -> int:
-        """Number of samples."""
         return len(self.trajectory.t)
 
     @property
-    def is_parallel(self) -> bool:
-        """Whether threads help: Pinocchio's Python function holds the interpreter's lock."""
+    def is_parallel(self) -> bool:  # Pinocchio's Python function holds the interpreter's lock
         return self.engine == COMPILED
 
     @cached_property
     def columns(self) -> tuple[Array, ...]:
-        """The columns that row j has, n arrays of shape (c_j,)."""
         return tuple(np.flatnonzero(row) for row in self.support[:, self.kept])
 
     @cached_property
     def rows(self) -> Array:
-        """Number of rows with a positive weight per joint, shape (n,), int."""
         used: Array = np.count_nonzero(self.weights > 0, axis=0)
         return used
 
     def part(self, start: int, stop: int) -> "TrajectoryRows":
-        """Return the rows of samples start to stop only.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-
-        Returns:
-            The rows.
-        """
         motion = self.trajectory.part(start, stop)
         return replace(self, trajectory=motion, weights=self.weights[start:stop])
 
     def select(self, columns: Array) -> "TrajectoryRows":
-        """Return the same rows with fewer columns.
-
-        Args:
-            columns: Indices of the columns kept, shape (b,), of those here.
-
-        Returns:
-            The rows.
-        """
         return replace(self, kept=self.kept[columns])
 
     def blocks(self, start: int, stop: int) -> Iterator[list[Array]]:
-        """Yield the rows of samples start to stop; see ``RowSource.blocks``.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one.
-
-        Yields:
-            Per joint the rows sqrt(weight) [W_j tau_j], shape (k, c_j + 1), column-major.
-        """
         plan = self._plan
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))

@@ -4,6 +4,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from robotid.exceptions import MissingDependencyError, ModelError
+from robotid.findings import listed
 
 __all__ = ["example_urdf", "example_urdfs"]
 
@@ -46,4 +47,4 @@ def example_urdf(name: str) -> Path:
         if path.name == name:
             return path
     names = [path.name for path in urdfs]
-    raise ModelError(f"example-robot-data has no {name!r}; it has {names}")
+    raise ModelError(f"example-robot-data has no {name!r}; it has {listed(names)}")

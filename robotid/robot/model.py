@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.findings import listed
 from robotid.robot.drives import DRIVE_TERMS
 from robotid.robot.parameters import Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
@@ -260,9 +261,9 @@ def _choose_joints(
     moving = tuple(name for name in free if name not in locked) if joints is None else tuple(joints)
     both = [name for name in moving if name in locked]
     if both:
-        raise ModelError(f"joints {both} are both identified and locked; choose one")
+        raise ModelError(f"joints {listed(both)} are both identified and locked; choose one")
     if len(set(moving)) != len(moving) or not moving:
-        raise ModelError(f"joints to identify must be named once each, got {list(moving)}")
+        raise ModelError(f"joints to identify must be named once each, got {listed(moving)}")
     positions = {name: float(locked.get(name, 0.0)) for name in free if name not in moving}
     _check_mimic(tree, moving, positions, followers)
     for name, (leader, ratio, offset) in followers.items():
@@ -288,7 +289,7 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
             near = difflib.get_close_matches(name, known, n=1)
             hint = f" Did you mean {near[0]!r}?" if near else ""
             raise ModelError(
-                f"joint {name!r} is not in {Path(tree.path).name}; joints: {known}.{hint}"
+                f"joint {name!r} is not in {Path(tree.path).name}; joints: {listed(known)}.{hint}"
             )
 
 
@@ -305,7 +306,7 @@ def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
             if leader not in by_name or leader in seen:
                 raise ModelError(
                     f"joint {joint.name!r} mimics {leader!r}, which is not a movable joint that "
-                    "leads it; mend the <mimic>, or use mimic = 'independent'"
+                    "leads it; correct the <mimic>, or use mimic = 'independent'"
                 )
             up = by_name[leader].mimic
             if up is None:
@@ -338,7 +339,7 @@ def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
         raise ModelError(f"{Path(tree.path).name}: Pinocchio refuses it: {error}") from error
     acceleration = np.asarray(gravity, dtype=float)
     if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
-        raise ModelError(f"gravity is {list(gravity)}, wanted three finite numbers [m/s^2]")
+        raise ModelError(f"gravity is {listed(gravity)}, wanted three finite numbers [m/s^2]")
     model.gravity.linear = acceleration
     return model
 

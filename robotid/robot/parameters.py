@@ -15,7 +15,6 @@ __all__ = [
     "PAPER_TERMS",
     "Coupling",
     "ParameterLayout",
-    "from_paper_order",
     "inertial_from_pseudo_inertia",
     "pseudo_inertia",
     "pseudo_inertia_basis",
@@ -223,25 +222,6 @@ def to_paper_order(pi: Array) -> Array:
     """
     order = [INERTIAL_TERMS.index(term) for term in PAPER_TERMS]
     return _by_body(pi)[:, order].reshape(-1)
-
-
-def from_paper_order(P: Array) -> Array:
-    """Return inertial parameters in Pinocchio's order; the inverse of ``to_paper_order``.
-
-    Args:
-        P: Inertial parameters in the paper's order (9), (10), shape (10 n,).
-
-    Returns:
-        The same values in Pinocchio's order, shape (10 n,).
-
-    Raises:
-        DataError: If the number of entries is not a multiple of 10.
-
-    References:
-        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (9)-(10).
-    """
-    order = [PAPER_TERMS.index(term) for term in INERTIAL_TERMS]
-    return _by_body(P)[:, order].reshape(-1)
 
 
 def pseudo_inertia_basis() -> Array:

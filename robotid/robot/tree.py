@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from robotid.exceptions import ModelError
+from robotid.findings import listed
 
 __all__ = [
     "MOVABLE",
@@ -269,7 +270,7 @@ def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
         parent[joint.child] = joint.parent
     roots = [link for link in links if link not in parent]
     if len(roots) != 1:
-        raise ModelError(f"{where}: a URDF has one root link, but this one has {roots}")
+        raise ModelError(f"{where}: a URDF has one root link, but this one has {listed(roots)}")
     return roots[0]
 
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -11,27 +10,15 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
+from robotid.simulation.integration import rk4
+from robotid.simulation.motions import Motion
 from robotid.simulation.plant import RobotPlant
 
-__all__ = ["Motion", "Noise", "another_robot", "simulate"]
+__all__ = ["Noise", "another_robot", "simulate"]
 
 _BANDWIDTH = 20.0  # [rad/s] of the tracking controller
 _SUBSTEPS = 2  # Runge-Kutta steps per sample, at least
 _LONGEST_STEP = 0.005  # [s] of Runge-Kutta, whatever the rate of the log
-
-
-class Motion(Protocol):
-    """A motion that a controller can track."""
-
-    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations.
-
-        Args:
-            t: Times, shape (N,) [s].
-
-        Returns:
-            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
-        """
 
 
 @dataclass(frozen=True)
@@ -85,18 +72,17 @@ def simulate(
     substeps = max(_SUBSTEPS, math.ceil(1.0 / rate / _LONGEST_STEP - 1e-9))
     h = 1.0 / rate / substeps
     q_r, v_r, a_r = motion.evaluate(h / 2 * np.arange(2 * substeps * (len(t) - 1) + 1))
-    state = np.concatenate([q_r[0], v_r[0]])
-    n = len(model.joints)
-    q, v, tau = (np.empty((len(t), n)) for _ in range(3))
+    q, v, tau = (np.empty((len(t), len(model.joints))) for _ in range(3))
+    q_k, v_k = q_r[0], v_r[0]
     for k in range(len(t)):
         first = 2 * substeps * k  # index on the grid of half steps
-        q[k], v[k] = state[:n], state[n:]
-        tau[k] = plant.torque(state, q_r[first], v_r[first], a_r[first])
+        q[k], v[k] = q_k, v_k
+        tau[k] = plant.torque(q_k, v_k, q_r[first], v_r[first], a_r[first])
         if k + 1 < len(t):
-            for step in range(substeps):
-                i = first + 2 * step
-                state = plant.advance(state, q_r[i : i + 3], v_r[i : i + 3], a_r[i : i + 3], h)
-        if not np.isfinite(state).all():
+            for i in range(first, first + 2 * substeps, 2):
+                reference = [x[i : i + 3] for x in (q_r, v_r, a_r)]  # start, middle, end
+                q_k, v_k = plant.advance(q_k, v_k, reference, h)
+        if not (np.isfinite(q_k).all() and np.isfinite(v_k).all()):
             raise DataError(f"the simulation diverged at t = {t[k]:.3f} s; slow the motion down")
     level = noise or Noise()
     return Log(
@@ -137,36 +123,25 @@ class _TrackedPlant:
     """The true robot and its controller."""
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
-        self.model = model
-        self.n = len(model.joints)
-        self.plant = RobotPlant(model, pi)
-        self.believed = model.pin_model
-        self.believed_data = self.believed.createData()
-        self.inertia = np.maximum(np.diag(self.plant.mass_matrix(np.zeros(self.n))), 0.02)
+        self.model, self.plant = model, RobotPlant(model, pi)
+        self.data = model.pin_model.createData()
+        self.inertia = np.maximum(
+            np.diag(self.plant.mass_matrix(np.zeros(len(model.joints)))), 0.02
+        )
 
-    def torque(self, state: Array, q_r: Array, v_r: Array, a_r: Array) -> Array:
+    def torque(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array) -> Array:
         """Return the controller's torque."""
-        q, v = state[: self.n], state[self.n :]
         G, w = self.model.velocity_map, _BANDWIDTH
-        configuration = self.model.configurations(q_r[None])[0]
-        forward = pin.rnea(self.believed, self.believed_data, configuration, G @ v_r, G @ a_r)
+        x = self.model.configurations(q_r[None])[0]
+        forward = pin.rnea(self.model.pin_model, self.data, x, G @ v_r, G @ a_r)
         command: Array = G.T @ forward + self.inertia * (w**2 * (q_r - q) + 2 * w * (v_r - v))
         return command
 
-    def derivative(self, state: Array, u: Array) -> Array:
-        """Return the rate of change of the state (q, v) under a torque."""
-        q, v = state[: self.n], state[self.n :]
-        return np.concatenate([v, self.plant.acceleration(q, v, u)])
+    def advance(self, q: Array, v: Array, reference: list[Array], h: float) -> tuple[Array, Array]:
+        """Return the state one step later; q, v, a of the motion at its start, middle and end."""
 
-    def advance(self, x: Array, q_r: Array, v_r: Array, a_r: Array, h: float) -> Array:
-        """Return the state one Runge-Kutta step later; references at its start, middle, end."""
+        def acceleration(q: Array, v: Array, share: float) -> Array:
+            u = self.torque(q, v, *(x[round(2 * share)] for x in reference))
+            return self.plant.acceleration(q, v, u)
 
-        def slope(at: Array, i: int) -> Array:
-            return self.derivative(at, self.torque(at, q_r[i], v_r[i], a_r[i]))
-
-        k1 = slope(x, 0)
-        k2 = slope(x + h / 2 * k1, 1)
-        k3 = slope(x + h / 2 * k2, 1)
-        k4 = slope(x + h * k3, 2)
-        advanced: Array = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return advanced
+        return rk4(acceleration, q, v, h)

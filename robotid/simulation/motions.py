@@ -1,14 +1,15 @@
-"""Motions that excite the parameters: Fourier series within a robot's limits."""
+"""Motions to follow: Fourier series within a robot's limits, quintics from rest to rest."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
 
-__all__ = ["FourierTrajectory", "random_fourier"]
+__all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "random_fourier"]
 
 _ROTARY_REACH = 1.2  # [rad] amplitude of a joint whose limits are wider or unknown
 _LINEAR_REACH = 0.15  # [m]
@@ -16,8 +17,22 @@ _ROTARY_SPEED = 1.5  # [rad/s] peak speed where the limit is higher or unknown
 _LINEAR_SPEED = 0.3  # [m/s]
 
 
+class Motion(Protocol):
+    """A motion that a controller can track."""
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations.
+
+        Args:
+            t: Times, shape (N,) [s].
+
+        Returns:
+            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
+        """
+
+
 @dataclass(frozen=True, eq=False)
-class FourierTrajectory:
+class FourierTrajectory(Motion):
     """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
 
     Attributes:
@@ -43,19 +58,57 @@ class FourierTrajectory:
             )
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration.
-
-        Args:
-            t: Times, shape (N,) [s].
-
-        Returns:
-            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
-        """
         w = 2 * np.pi / self.period * np.arange(1, len(self.sine) + 1)  # (h,)
         sin, cos = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))  # (N, h)
         q = self.q0 + sin @ self.sine + cos @ self.cosine
         v = (cos * w) @ self.sine - (sin * w) @ self.cosine
         a = -(sin * w**2) @ self.sine - (cos * w**2) @ self.cosine
+        return q, v, a
+
+
+@dataclass(frozen=True)
+class ProgramMotion(Motion):
+    """The motion q(t) = q0 + A (a1 t^5 + a2 t^4 + a3 t^3), from rest to rest.
+
+    The coefficients a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 take q from q0 to q0 + A and leave
+    no velocity and no acceleration at either end. Before 0 and after T the robot rests.
+
+    Attributes:
+        amplitude: A, the way each joint goes, shape (n,), or (R, n) for R motions [rad or m].
+        duration: T, one for all or one per motion, shape () or (R,) [s].
+        start: q0, of the shape of the amplitude or that of one motion [rad or m]; 0 if left out.
+
+    References:
+        Tzvetkova, (28).
+    """
+
+    amplitude: Array
+    duration: float | Array
+    start: float | Array = 0.0
+
+    def __post_init__(self) -> None:
+        A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration, dtype=float)
+        if A.ndim not in (1, 2) or not np.isfinite(A).all():
+            raise DataError(f"amplitude has shape {A.shape}, wanted (n,) or (R, n), finite")
+        if T.ndim > 0 and T.shape != A.shape[:-1]:
+            raise DataError(f"duration has shape {T.shape}, wanted () or {A.shape[:-1]}")
+        if not np.all((T > 0) & (np.inf > T)):
+            raise SettingsError(f"duration is {self.duration}, wanted a positive number")
+
+    def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations.
+
+        Args:
+            t: Times of one motion, any shape, or one per motion, shape (R,) [s].
+
+        Returns:
+            q [rad], v [rad/s] and a [rad/s^2] (or m), each of shape t.shape + (n,), or (R, n).
+        """
+        A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration)[..., None]
+        s = np.clip(np.asarray(t, dtype=float)[..., None] / T, 0.0, 1.0)  # t / T
+        q = self.start + A * (6 * s**5 - 15 * s**4 + 10 * s**3)
+        v = A * (30 * s**4 - 60 * s**3 + 30 * s**2) / T
+        a = A * (120 * s**3 - 180 * s**2 + 60 * s) / T**2
         return q, v, a
 
 

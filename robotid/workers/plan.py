@@ -9,14 +9,13 @@ from robotid._typing import ProgressCallback
 from robotid.regressor.reduction import Reduction
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
-from robotid.workers.pieces import Piece, Work, Workload
+from robotid.workers.pieces import Piece, Work, Workload, reduce_piece
 from robotid.workers.processes import (
     Backend,
     ProcessBackend,
     SerialBackend,
     choose_workers,
     map_pieces,
-    reduce_pieces,
     require_workers,
 )
 
@@ -82,31 +81,32 @@ class WorkPlan:
     def reduce(
         self, pieces: Sequence[Piece], *, checkpoint: Checkpoint | None = None
     ) -> Iterator[Reduction]:
-        """Reduce pieces; see ``reduce_pieces``.
+        """Reduce pieces; ``join`` gives the whole.
 
         Args:
             pieces: The pieces.
-            checkpoint: Where finished pieces are kept.
+            checkpoint: Where finished pieces are kept and, if resumed, taken from.
 
-        Yields:
-            One reduction per piece, in order.
-
-        Raises:
-            DataError: If a row cannot be used.
-            WorkerError: If a worker ends before its work.
+        Returns:
+            One reduction per piece, in order; errors as of ``map``.
         """
-        with self._backend(pieces) as backend:
-            yield from reduce_pieces(
-                pieces, backend=backend, checkpoint=checkpoint, progress=self.progress
-            )
+        return self.map(reduce_piece, pieces, "reducing", checkpoint=checkpoint)
 
-    def map(self, work: Work, pieces: Sequence[Workload], what: str) -> Iterator[Any]:
+    def map(
+        self,
+        work: Work,
+        pieces: Sequence[Workload],
+        what: str,
+        *,
+        checkpoint: Checkpoint | None = None,
+    ) -> Iterator[Any]:
         """Do the same with every piece; see ``map_pieces``.
 
         Args:
             work: What to do with a piece.
             pieces: The pieces.
             what: What the work is called.
+            checkpoint: Where results are kept, if they are reductions, and taken from.
 
         Yields:
             One result per piece, in order.
@@ -116,4 +116,6 @@ class WorkPlan:
             WorkerError: If a worker ends before its work.
         """
         with self._backend(pieces) as backend:
-            yield from map_pieces(work, pieces, what, backend=backend, progress=self.progress)
+            yield from map_pieces(
+                work, pieces, what, backend=backend, progress=self.progress, checkpoint=checkpoint
+            )

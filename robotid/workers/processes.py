@@ -23,9 +23,8 @@ from threadpoolctl import threadpool_limits
 from robotid._typing import ProgressCallback, ignore_progress
 from robotid.exceptions import SettingsError, WorkerError
 from robotid.regressor.factors import available_cores
-from robotid.regressor.reduction import Reduction
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Outcome, Piece, Work, Workload, reduce_piece, run_task
+from robotid.workers.pieces import Outcome, Work, Workload, run_task
 
 if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
@@ -37,7 +36,6 @@ __all__ = [
     "choose_workers",
     "map_pieces",
     "named",
-    "reduce_pieces",
     "require_workers",
 ]
 
@@ -176,45 +174,6 @@ class ProcessBackend(Backend):
             ) from error
 
 
-def reduce_pieces(
-    pieces: Sequence[Piece],
-    *,
-    backend: Backend | None = None,
-    checkpoint: Checkpoint | None = None,
-    progress: ProgressCallback | None = None,
-) -> Iterator[Reduction]:
-    """Reduce pieces; the result has the same bits whatever the backend.
-
-    Args:
-        pieces: The pieces.
-        backend: Where they are reduced; in this process if None.
-        checkpoint: Where finished pieces are kept and, if resumed, taken from.
-        progress: Called with ("reducing", samples done, samples in all, "samples").
-
-    Yields:
-        One reduction per piece, in order; ``join`` gives the whole.
-
-    Raises:
-        DataError: If a row cannot be used.
-        WorkerError: If a worker ends before its work.
-    """
-    try:
-        yield from map_pieces(
-            reduce_piece,
-            pieces,
-            "reducing",
-            backend=backend,
-            progress=progress,
-            checkpoint=checkpoint,
-        )
-    except GeneratorExit:
-        raise
-    except BaseException as error:
-        if checkpoint is not None:
-            error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
-        raise
-
-
 def map_pieces(
     work: Work,
     pieces: Sequence[Workload],
@@ -232,10 +191,10 @@ def map_pieces(
         what: What the work is called.
         backend: Where it is done; in this process if None.
         progress: Called with (what, samples done, samples in all, "samples").
-        checkpoint: Where results are kept, if they are reductions, and taken from.
+        checkpoint: Where results are kept, if they are reductions, and, if resumed, taken from.
 
     Yields:
-        One result per piece, in order.
+        One result per piece, in order, with the same bits whatever the backend.
 
     Raises:
         DataError: If a row cannot be used.
@@ -253,7 +212,7 @@ def map_pieces(
     report(what, done, total, "samples")
     early: dict[int, Any] = {}
     left = len(missing)
-    with closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
+    with _resumable(checkpoint), closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
         for k in range(len(pieces)):
             while k not in kept and k not in early:
                 index, result = next(finished)
@@ -303,6 +262,19 @@ def require_workers(workers: int) -> int:
     if workers < 1:
         raise SettingsError(f"workers is {workers}, wanted at least 1")
     return workers
+
+
+@contextmanager
+def _resumable(checkpoint: Checkpoint | None) -> Iterator[None]:
+    """Note on what stops the work where finished pieces are kept."""
+    try:
+        yield
+    except GeneratorExit:
+        raise
+    except BaseException as error:
+        if checkpoint is not None:
+            error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
+        raise
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,22 +120,45 @@ def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, t
     assert (out / "result.json").read_text() == expected
 
 
-def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
-    for name in ("fit.csv", "keep.csv"):
-        (tmp_path / name).write_text((logs / name).read_text())
-    job, out = write_job(tmp_path, 1024), tmp_path / "out"
+def break_off(job, out, monkeypatch):
+    """Run a job until its pieces are reduced, and no further."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(workflow, "conclude", interrupt)
-        assert main(["identify", job, "--out", str(out)]) == 130
+        assert main(["identify", job, "--out", out]) == 130
+
+
+def test_a_log_that_changed_since_is_refused_by_name(logs, tmp_path, capsys, monkeypatch):
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).write_text((logs / name).read_text())
+    job, out = write_job(tmp_path, 1024), str(tmp_path / "out")
+    break_off(job, out, monkeypatch)
     (tmp_path / "fit.csv").write_text((logs / "keep.csv").read_text())
-    assert main(["identify", job, "--out", str(out), "--resume"]) == 1
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
     error = capsys.readouterr().err
     assert "is the checkpoint of other inputs: logs[0]." in error
     assert "fit.csv.changed was" in error
+
+
+def test_a_filter_or_a_robot_that_changed_since_is_refused_by_name(
+    logs, tmp_path, capsys, monkeypatch
+):
+    robot, out = tmp_path / "arm.urdf", str(tmp_path / "out")
+    robot.write_text(Path(URDF).read_text())
+    monkeypatch.setitem(globals(), "URDF", str(robot))
+    for name in ("fit.csv", "keep.csv"):
+        (tmp_path / name).symlink_to(logs / name)
+    break_off(write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0"), out, monkeypatch)
+    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.5")
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
+    assert "other inputs: settings.signals.cutoff was 6.0, is 6.5." in capsys.readouterr().err
+    job = write_job(tmp_path, 1024, "[signals]", "cutoff = 6.0")
+    robot.write_text(robot.read_text() + "<!-- a later version -->")
+    assert main(["identify", job, "--out", out, "--resume"]) == 1
+    assert "other inputs: urdf_sha256 was" in capsys.readouterr().err
 
 
 def test_short_logs_have_no_use_of_workers_and_it_is_said(logs, tmp_path, capsys):

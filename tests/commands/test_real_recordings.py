@@ -7,7 +7,7 @@ import pytest
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
-from robotid.export.result import load_result
+from robotid.export.result import read_result
 from robotid.export.sidecar import load_identified
 from robotid.identification.evaluation import predict
 from robotid.robot.parameters import pseudo_inertia
@@ -72,7 +72,7 @@ def test_the_parameters_are_possible(run, name):
     layout = identification.model.layout
     J = pseudo_inertia(identification.standard[: layout.n_inertial])
     assert np.linalg.eigvalsh(J).min() > 0
-    assert load_result(folder / "result.json").content == result
+    assert read_result(folder / "result.json") == result
 
 
 def test_tx40_has_sane_masses_and_armatures(run):

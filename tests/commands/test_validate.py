@@ -1,5 +1,7 @@
 """Validation of a written result: what was fitted shows no prediction, and faults are named."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +17,10 @@ from robotid.robot.examples import example_urdf
 NOISE = 0.1 * np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])
 
 
-@pytest.fixture
-def here(ur5, tmp_path):
+@pytest.fixture(scope="module")
+def made(ur5, tmp_path_factory):
     """A result of one log without validation, the log, and another one."""
+    tmp_path = tmp_path_factory.mktemp("validate")
     rngs = np.random.default_rng(0).spawn(2)
     first, other = (
         exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=NOISE) for rng in rngs
@@ -29,6 +32,16 @@ def here(ur5, tmp_path):
         "estimator": {"prior_weight": 1.0, "draws": 0},
     }
     run_job(job_from_settings(table, "job.toml", tmp_path), tmp_path / "out")
+    return tmp_path, first, other
+
+
+@pytest.fixture
+def here(made, tmp_path):
+    """A copy of it that a test may change."""
+    folder, first, other = made
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    result = tmp_path / "out" / "result.json"
+    result.write_text(result.read_text().replace(str(folder), str(tmp_path)))
     return tmp_path, first, other
 
 
@@ -83,3 +96,40 @@ def test_without_the_fitted_logs_nobody_knows(here):
     assert "the fitted logs ['run.csv'] are not where they were" in found["reasons"][0]
     # the file itself is known by its hash
     assert "hold rows that were fitted" in verdict(folder, first)["reasons"][0]
+
+
+def test_an_alarm_of_the_result_stays_one_whatever_the_new_log(here):
+    folder, _, other = here
+    path = folder / "out" / "result.json"
+    result = json.loads(path.read_text())
+    result["verdict"]["alarms"] = ["torque columns are exchanged"]
+    path.write_text(json.dumps(result))
+    found = verdict(folder, other)
+    assert found["status"] == "poor"
+    assert found["reasons"][0] == "torque columns are exchanged"
+    assert found["alarms"] == ["torque columns are exchanged"]
+
+
+def test_a_doubt_about_the_old_validation_is_not_one_about_the_new(here):
+    folder, _, other = here
+    path = folder / "out" / "result.json"
+    result = json.loads(path.read_text())
+    result["verdict"]["doubts"] = [
+        {"code": code, "joint": "", "message": code} for code in ("repeated_motion", "clipped")
+    ]
+    path.write_text(json.dumps(result))
+    found = verdict(folder, other)
+    assert [doubt["code"] for doubt in found["doubts"]] == ["clipped"]
+    assert found["status"] == "usable"
+
+
+def test_a_longer_log_that_holds_the_fitted_rows_is_no_new_one(here):
+    folder, first, other = here
+    longer = replace(
+        first,
+        t=np.concatenate([first.t, first.t[-1] + 0.01 + other.t]),
+        **{k: np.vstack([getattr(first, k), getattr(other, k)]) for k in ("q", "v", "a", "tau")},
+    )
+    for log in (longer, rows(first, slice(0, 60))):
+        found = verdict(folder, log)
+        assert "hold rows that were fitted" in found["reasons"][0]

@@ -32,6 +32,11 @@ def table():
     return table_of(clean_log(robot("ur5"), 0))
 
 
+@pytest.fixture(scope="module")
+def short(ur5):
+    return clean_log(ur5, 0, duration=5.0)
+
+
 def loud(findings):
     return {f.code for f in findings if f.severity != "note"}
 
@@ -91,7 +96,7 @@ def test_delays_are_measured_and_corrected_only_on_request(table, tmp_path):
     _, job = spoil("torque 30 ms late", table, tmp_path)
     (found,) = [f for f in examine(job) if f.code == "torque_delay"]
     delay, error = found.evidence["delay"], found.evidence["std_error"]
-    # 5 ms: unmodelled friction near a change of direction feigns a few
+    # 5 ms: unmodelled friction near a change of direction imitates a few
     assert abs(delay - 0.03) < max(3 * error, 0.005)
     stated = replace(job, signals=SignalSettings(torque_delay=0.03))
     assert "torque_delay" not in loud(examine(stated))
@@ -224,7 +229,11 @@ def test_doctor_prints_findings_as_json_and_as_text(wrong_sign, tmp_path, capsys
 def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
     wrong_sign, tmp_path, capsys
 ):
-    words = ["identify", URDF, wrong_sign, "--out", str(tmp_path / "out"), "--json"]
+    job = tmp_path / "job.toml"
+    job.write_text(
+        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "{wrong_sign}"\n'
+    )
+    words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["verdict"]["status"] == "poor"
@@ -251,18 +260,17 @@ def test_only_errors_alarm_and_only_those_that_are_not_ignored():
     assert alarming([gap, sign], ["torque_sign"]) == ()
 
 
-def test_findings_change_no_data():
-    model = robot("ur5")
-    log = clean_log(model, 0, duration=5.0)
+def test_findings_change_no_data(ur5, short):
+    log = replace(short, tau=short.tau.copy(), q=short.q.copy())
     before = log.tau.copy(), log.q.copy()
-    diagnose(model, [log], [log], SIGNALS)
+    diagnose(ur5, [log], [log], SIGNALS)
     np.testing.assert_array_equal(log.tau, before[0])
     np.testing.assert_array_equal(log.q, before[1])
 
 
-def test_a_log_of_standing_still_is_said_to_be_one(ur5, tmp_path):
-    log = clean_log(ur5, 0, duration=5.0)
-    still = replace(log, q=np.tile(log.q[0], (len(log.t), 1)), v=np.zeros_like(log.q))
+def test_a_log_of_standing_still_is_said_to_be_one(short, tmp_path):
+    q = short.q
+    still = replace(short, q=np.tile(q[0], (len(q), 1)), v=np.zeros_like(q))
     write_log(still, tmp_path / "still.csv")
     found = examine(Job(Path(URDF), identification=(LogEntry(tmp_path / "still.csv"),)))
     assert {"no_motion", "static_joint"} <= loud(found)

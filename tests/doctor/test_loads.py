@@ -1,4 +1,4 @@
-"""Another scale of the torques, another robot's URDF, a torque that says nothing: told apart."""
+"""Another scale of the torques, another robot's URDF, an uninformative torque: told apart."""
 
 from dataclasses import replace
 

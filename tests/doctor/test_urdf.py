@@ -106,7 +106,7 @@ def test_a_moving_link_without_inertial_is_named(tmp_path):
     frame = inspected(tmp_path, ("</robot>", TOOL.format(inertial="")))
     (finding,) = found(frame, "missing_inertial")
     assert (finding["link"], finding["severity"]) == ("tool", "note")
-    assert "the mass of its body is in ['lower']" in finding["message"]
+    assert "the mass of its body is in lower" in finding["message"]
 
 
 def test_masses_of_zero_and_less_are_named(tmp_path):
@@ -118,7 +118,7 @@ def test_masses_of_zero_and_less_are_named(tmp_path):
     assert (finding["link"], finding["severity"]) == ("tool", "note")
     (finding,) = found(inspected(tmp_path, ('"2"/>', '"-2"/>')), "negative_mass")
     assert (finding["link"], finding["severity"]) == ("upper", "error")
-    assert "has the mass -2 kg, wanted more than 0; mend the sign" in finding["message"]
+    assert "has the mass -2 kg, wanted more than 0; correct the sign" in finding["message"]
     assert finding["evidence"] == {"mass": -2.0}
 
 
@@ -216,7 +216,7 @@ def test_lumped_links_are_named(tmp_path):
     tool = TOOL.format(inertial=INERTIAL.format(m=0.3))
     (finding,) = found(inspected(tmp_path, ("</robot>", tool)), "fixed_lumped")
     assert (finding["link"], finding["severity"]) == ("lower", "note")
-    assert "is one body with ['tool'], joined to it by fixed joints" in finding["message"]
+    assert "is one body with tool, joined to it by fixed joints" in finding["message"]
     to_world = ("</robot>", tool.replace('parent link="lower"', 'parent link="base"'))
     assert found(inspected(tmp_path, to_world), "fixed_lumped") == []
 

@@ -1,69 +1,228 @@
-"""A written result is loaded as what it was."""
+"""Every figure of result.json, against the result and against figures worked out again."""
 
-import shutil
+import hashlib
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.paths import ROOT
-from helpers.synthetic import exact_log, truth
+from helpers.figures import figures
 
-import robotid
-from robotid.exceptions import DataError
-from robotid.identification.settings import EstimatorSettings
-from robotid.robot.model import RobotModel
+from robotid import __version__
+from robotid.exceptions import DataError, ModelError
+from robotid.export.result import build_result, read_result, recording_metrics, stated_parameters
+from robotid.findings import Finding
+from robotid.robot.parameters import INERTIAL_TERMS
 
-URDF = ROOT / "urdf" / "planar_2r.urdf"
+FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "note", "c", "d")]
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The folder of a result, and the identification that wrote it."""
-    folder, rng = tmp_path_factory.mktemp("result"), np.random.default_rng(0)
-    model = RobotModel.from_urdf(URDF)
-    for name in ("first", "second"):
-        log = exact_log(model, truth(model), rng, samples=800, noise=0.1)
-        robotid.write_log(log, folder / f"{name}.csv")
-    (folder / "job.toml").write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "first.csv"\n'
-        '[[validation]]\nlog = "second.csv"\n'
+def result(identified):
+    settings = {"estimator": {"name": "consistent"}}
+    return build_result(identified, settings, FINDINGS, {"report": "report.html"})
+
+
+def test_the_head_says_what_was_identified_and_how(result, identified):
+    assert (result["schema_version"], result["robotid"]) == (1, __version__)
+    assert (result["robot"], result["joints"]) == ("ur5", list(identified.model.joints))
+    assert result["settings"] == {"estimator": {"name": "consistent"}}
+    assert result["outputs"] == {"report": "report.html"}
+    assert result["warnings"] == [
+        {"code": "late", "message": "late by 4 ms", "where": "a.csv"},
+        {"code": "b", "message": "d", "where": "c"},
+    ]
+    assert result["uncertainty"] == {
+        "method": identified.errors.method,
+        "stretches": identified.errors.stretches,
+        "inflation": identified.errors.inflation,
+    }
+    assert result["verdict"]["status"] == identified.verdict.status
+    assert result["verdict"]["reasons"] == list(identified.verdict.reasons)
+
+
+def test_the_structure_counts_parameters(result, identified):
+    assert result["structure"] == {
+        "standard": 60,
+        "base_inertial": 36,  # of a UR5, as in the literature
+        "base": len(identified.mapping.base_names),
+        "rank": identified.determination.rank,
+        "condition": pytest.approx(identified.wls.condition),
+        "undetermined": list(identified.determination.undetermined),
+        "not_told_apart": identified.determination.to_list(),
+    }
+
+
+def test_base_parameters_have_values_errors_and_intervals(result, identified):
+    mapping = identified.mapping
+    beta = mapping.K @ identified.standard
+    half = identified.errors.reach * identified.base_error
+    assert len({entry["std_error"] for entry in result["base_parameters"]}) == len(beta)
+    for k, entry in enumerate(result["base_parameters"]):
+        assert entry == {
+            "name": mapping.base_names[k],
+            "expression": mapping.expressions[k],
+            "value": pytest.approx(beta[k], rel=1e-9),
+            "std_error": pytest.approx(identified.base_error[k]),
+            "interval_95": [
+                pytest.approx(beta[k] - half[k], rel=1e-8),
+                pytest.approx(beta[k] + half[k], rel=1e-8),
+            ],
+            "unit": identified.model.layout.units[mapping.independent[k]],
+        }
+
+
+def test_standard_and_drive_parameters_have_value_error_prior_and_source(result, identified):
+    layout = identified.model.layout
+    links = [f"{body}.{term}" for body in layout.bodies for term in INERTIAL_TERMS]
+    terms = ("armature", "viscous", "coulomb", "offset")
+    drives = [f"{joint}.{term}" for joint in identified.model.joints for term in terms]
+    entries = [*result["standard_parameters"], *result["drive_parameters"]]
+    assert [entry["name"] for entry in result["standard_parameters"]] == links
+    assert {entry["name"] for entry in result["drive_parameters"]} == set(drives)
+    urdf = [body.toDynamicParameters() for body in list(identified.model.pin_model.inertias)[1:]]
+    for i, entry in enumerate(entries):
+        assert entry == {
+            "name": layout.names[i],
+            "value": identified.standard[i],
+            "std_error": pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
+            "unit": layout.units[i],
+            "prior": identified.prior[i],
+            "source": identified.sources[i],
+        }
+    np.testing.assert_allclose(
+        [entry["prior"] for entry in entries[:60]], np.concatenate(urdf), atol=1e-12
     )
-    found, _ = robotid.run_job(robotid.read_job(folder / "job.toml"), folder / "out")
-    return folder / "out", found
+    assert sum(entry["prior"] != entry["value"] for entry in entries) > 40
 
 
-def test_a_result_has_the_robot_its_parameters_verdict_and_metrics(written):
-    folder, found = written
-    for path in (folder, folder / "result.json"):
-        result = robotid.load_result(path)
-        assert result.robot.joints == found.model.joints
-        np.testing.assert_allclose(result.parameters, found.standard, rtol=1e-9, atol=1e-12)
-        assert result.verdict == found.verdict.to_dict()
-    fitted, kept = result.metrics.values()
-    for joint, measured in found.metrics().per_joint.items():
-        assert fitted[joint]["rmse"] == pytest.approx(measured.rmse, rel=1e-12)
-    for joint, measured in found.validation[0].metrics["estimate"].per_joint.items():
-        assert kept[joint]["relative_error_pct"] == pytest.approx(measured.relative_error_pct)
-    assert list(result.metrics)[1].endswith("second.csv")
-    assert repr(result) == (
-        f"<Result of {found.model.name}: {len(found.base)} base parameters by consistent, verdict "
-        f"{found.verdict.status}>"
-    )
+def assert_metrics(found, wanted):
+    assert list(found["per_joint"]) == list(wanted)
+    for joint, row in wanted.items():
+        assert found["per_joint"][joint] == {
+            "rmse": pytest.approx(row["rmse"]),
+            "unit": "N m",
+            "relative_error_pct": pytest.approx(row["error"]),
+            "r2": pytest.approx(row["r2"]),
+            "rows": row["rows"],
+            "urdf_relative_error_pct": pytest.approx(row["urdf"]),
+            "gravity_only_relative_error_pct": pytest.approx(row["gravity_only"]),
+            "better_than_constant": bool(row["r2"] > 0),
+        }
+    squares = sum(row["rows"] * row["rmse"] ** 2 for row in wanted.values())
+    rows = sum(row["rows"] for row in wanted.values())
+    assert found["pooled_rmse"] == pytest.approx(np.sqrt(squares / rows))
 
 
-def test_a_result_without_a_urdf_says_why_there_is_no_robot(written, tmp_path):
-    path = shutil.copy(written[0] / "result.json", tmp_path)
-    result = robotid.load_result(path)
-    del result.content["outputs"]["urdf"]
-    assert result.verdict["status"]
-    with pytest.raises(DataError, match=r"result.json has no URDF, for its parameters are not"):
-        _ = result.robot
+@pytest.mark.parametrize("name", ["estimate", "wls"])
+def test_metrics_are_those_of_the_prediction_they_name(result, identified, name):
+    part = result if name == "estimate" else result["wls"]
+    assert_metrics(part["identification"], figures(identified, identified.fitted, name))
+    (kept,) = part["validation"]
+    assert kept["log"] == identified.validation[0].recording.log.path
+    assert_metrics(kept, figures(identified, identified.validation, name))
+    assert recording_metrics(identified.validation[0], name).items() <= kept.items()
+    other = result["wls"] if name == "estimate" else result
+    joints = part["validation"][0]["per_joint"]
+    for joint, row in other["validation"][0]["per_joint"].items():
+        assert joints[joint]["rmse"] != row["rmse"]
 
 
-def test_a_folder_without_a_result_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"there is no result '.*result.json'"):
-        robotid.load_result(tmp_path)
+def test_wls_states_its_own_base_parameters(result, identified):
+    np.testing.assert_array_equal(result["wls"]["base_values"], identified.wls.theta)
+    np.testing.assert_array_equal(result["wls"]["base_std_errors"], identified.wls.std_error)
+    assert not np.allclose(identified.wls.theta, identified.base, rtol=1e-2)
 
 
-def test_estimators_of_stored_settings_are_those_that_ran(written):
-    stated = robotid.load_result(written[0]).content["settings"]["estimator"]
-    assert EstimatorSettings(**stated) == written[1].estimator
+def test_the_band_is_that_of_each_joint(result, identified):
+    kept = identified.validation[0]
+    recording, band = kept.recording, identified.band(kept)
+    shown = result["validation"][0]["band"]
+    assert list(shown) == list(identified.model.joints)
+    for j, row in enumerate(shown.values()):
+        used = recording.mask[:, j].astype(bool)
+        residual = recording.trajectory.tau[:, j] - kept.torques["estimate"][:, j]
+        half = 1.96 * band.total[:, j]
+        assert row["half_width"] == pytest.approx(np.sqrt(np.mean(half**2)), rel=1e-6)
+        own = 1.96 * np.sqrt(np.mean(band.parameters[:, j] ** 2))
+        assert row["of_parameters"] == pytest.approx(own, rel=1e-6)
+        if len(band.samples) == len(residual):
+            held = 100 * np.mean(np.abs(residual[used]) <= half[used])
+            assert row["held_pct"] == pytest.approx(held, abs=0.2)
+        assert row["of_parameters"] < row["half_width"]
+
+
+def test_consistency_tells_mass_and_eigenvalue_of_each_body(result, identified):
+    shown = result["consistency"]
+    assert shown["is_consistent"] is identified.is_consistent
+    assert [link["name"] for link in shown["links"]] == list(identified.model.layout.bodies)
+    for i, link in enumerate(shown["links"]):
+        m, *c = identified.standard[10 * i : 10 * i + 4]
+        Ixx, Ixy, Iyy, Ixz, Iyz, Izz = identified.standard[10 * i + 4 : 10 * i + 10]
+        inertia = np.array([[Ixx, Ixy, Ixz], [Ixy, Iyy, Iyz], [Ixz, Iyz, Izz]])
+        J = np.zeros((4, 4))
+        J[:3, :3] = np.trace(inertia) / 2 * np.eye(3) - inertia
+        J[:3, 3] = J[3, :3] = c
+        J[3, 3] = m
+        assert link["mass"] == m
+        assert link["min_eigenvalue"] == pytest.approx(np.linalg.eigvalsh(J)[0], rel=1e-6)
+    assert shown["total_mass"] == pytest.approx(identified.standard[:60:10].sum())
+    check = identified.mass_matrix
+    assert shown["mass_matrix"]["smallest_eigenvalue"] == check.smallest_eigenvalue
+    assert shown["fit"] == identified.estimate.details
+    counts = {kind: identified.sources.count(kind) for kind in ("data", "mixed", "prior")}
+    assert shown["sources"] == counts
+    assert len(set(counts.values())) == 3
+
+
+def test_inputs_tell_files_hashes_windows_and_rows(result, identified):
+    urdf, *logs = result["inputs"]
+    path = identified.model.tree.path
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    assert urdf == {"role": "urdf", "path": str(path), "sha256": digest}
+    evaluations = [*identified.fitted, *identified.validation]
+    roles = ["identification", "identification", "validation"]
+    wanted = [(180, 50.0, 3.58, 1), (140, 40.0, 3.475, 1), (270, 50.0, 5.98, 2)]
+    for entry, role, evaluation, (samples, rate, end, segments) in zip(
+        logs, roles, evaluations, wanted, strict=True
+    ):
+        recording = evaluation.recording
+        signals = entry.pop("signals")
+        assert entry == {
+            "role": role,
+            "path": recording.log.path,
+            "sha256": hashlib.sha256(Path(recording.log.path).read_bytes()).hexdigest(),
+            "samples": samples,
+            "rate": pytest.approx(rate),
+            "start": 0.0,
+            "end": pytest.approx(end),
+            "rows_used": int(recording.mask.sum()),
+            "segments": segments,
+        }
+        assert (signals["cutoff"], signals["min_velocity"]) == (12.0, 0.05)
+        assert signals["rate"] == pytest.approx(rate)
+
+
+def test_what_was_written_is_read_back_with_its_parameters(result, identified, tmp_path):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result, allow_nan=False))
+    stated = stated_parameters(read_result(path), identified.model)
+    np.testing.assert_array_equal(stated, identified.standard)
+
+
+def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
+    path = tmp_path / "result.json"
+    with pytest.raises(DataError, match=r"^there is no result '.*result\.json'$"):
+        read_result(path)
+    path.write_text("no")
+    with pytest.raises(DataError, match=r"^result\.json is not JSON: "):
+        read_result(path)
+    path.write_text(json.dumps({**result, "schema_version": 2}))
+    with pytest.raises(DataError, match=r"^result\.json has schema_version 2, wanted 1 of a"):
+        read_result(path)
+    path.write_text(json.dumps({k: v for k, v in result.items() if k != "inputs"}))
+    with pytest.raises(DataError, match=r"^result\.json has no \['inputs'\]; identify again"):
+        read_result(path)
+    short = {**result, "drive_parameters": result["drive_parameters"][1:]}
+    with pytest.raises(ModelError, match=r"^the result has no value of \['shoulder_pan_joint\.arm"):
+        stated_parameters(short, identified.model)

@@ -18,8 +18,8 @@ from robotid.exceptions import DataError
 from robotid.regressor.factors import Factors
 from robotid.regressor.reduction import Reduction, join
 from robotid.workers.checkpoint import Checkpoint
-from robotid.workers.pieces import Piece
-from robotid.workers.processes import ProcessBackend, SerialBackend, reduce_pieces
+from robotid.workers.pieces import Piece, reduce_piece
+from robotid.workers.processes import ProcessBackend, SerialBackend, map_pieces
 
 NAMES = ("a", "b", "c", "d", "e")
 
@@ -105,7 +105,7 @@ def pieces_in(folder, count=10, pause=0.0, faults=()):
 
 def reduce_all(pieces, **options):
     """Return the reductions of all pieces."""
-    return tuple(reduce_pieces(pieces, **options))
+    return tuple(map_pieces(reduce_piece, pieces, "reducing", **options))
 
 
 def same_bits(one, other):

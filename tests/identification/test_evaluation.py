@@ -1,14 +1,9 @@
 import numpy as np
 from helpers.synthetic import exact_log, truth
 
-from robotid.identification.evaluation import (
-    evaluate,
-    pool,
-    predict,
-    prepare,
-    row_mask,
-    shares_rows,
-)
+from robotid.identification.evaluation import evaluate_logs, pool, predict, shares_rows
+from robotid.identification.rows import row_mask
+from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.parameters import Coupling
@@ -16,10 +11,16 @@ from robotid.robot.parameters import Coupling
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 
 
+def evaluated(model, log, parameters, prior):
+    """Return the evaluation of one log in memory."""
+    ((found,), ()) = evaluate_logs([hold_log(model, log, EXACT)], (), parameters, prior)
+    return found
+
+
 def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
     pi, prior = truth(ur5), ur5.standard_parameters()
-    recording = prepare(ur5, exact_log(ur5, pi, rng), EXACT)
-    found = evaluate(ur5, recording, {"truth": pi}, prior)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, prior)
+    recording = found.recording
     assert set(found.torques) == {"truth", "urdf", "gravity_only"}
     np.testing.assert_allclose(found.torques["truth"], recording.trajectory.tau, atol=1e-10)
     (urdf,) = predict(ur5, [prior], recording.trajectory)
@@ -33,15 +34,15 @@ def test_baselines_are_the_urdf_with_and_without_motion(ur5, rng):
 
 
 def test_gravity_knows_no_offset(ur5, rng):
-    recording = prepare(ur5, exact_log(ur5, truth(ur5), rng), EXACT)
-    found = evaluate(ur5, recording, {"truth": truth(ur5)}, truth(ur5))
+    pi = truth(ur5)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"truth": pi}, pi)
     assert np.abs(found.torques["gravity_only"][:, 0]).max() < 1e-9
 
 
 def test_pooled_metrics_are_those_of_all_rows(ur5, rng):
     pi = truth(ur5)
     logs = [exact_log(ur5, pi, rng, noise=np.full(6, s), samples=200) for s in (0.1, 0.3)]
-    found = [evaluate(ur5, prepare(ur5, log, EXACT), {"x": pi}, pi) for log in logs]
+    found = [evaluated(ur5, log, {"x": pi}, pi) for log in logs]
     squares = [f.metrics["x"].pooled_rmse ** 2 for f in found]
     np.testing.assert_allclose(pool(ur5, found, "x").pooled_rmse, np.sqrt(np.mean(squares)))
 
@@ -51,7 +52,7 @@ def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
 
     coupling = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", 1.0)))
     coupled = RobotModel.from_urdf(ur5.tree.path, couplings=(coupling,))
-    trajectory = prepare(ur5, exact_log(ur5, truth(ur5), rng), EXACT).trajectory
+    trajectory = hold_log(ur5, exact_log(ur5, truth(ur5), rng), EXACT).whole.trajectory
     v = trajectory.v
     mask = row_mask(ur5, trajectory, 0.1)
     np.testing.assert_array_equal(mask, np.abs(v) >= 0.1)
@@ -77,5 +78,6 @@ def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):
 
 
 def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng)
-    assert prepare(ur5, log, EXACT).name == "log 0-11.98 s"
+    pi = truth(ur5)
+    found = evaluated(ur5, exact_log(ur5, pi, rng), {"x": pi}, pi)
+    assert found.recording.name == "log 0-11.98 s"

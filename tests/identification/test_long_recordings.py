@@ -11,15 +11,14 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry, job_from_settings, read_job
-from robotid.commands.logs import is_long, survey_logs
+from robotid.commands.logs import survey_logs
 from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, SettingsError
-from robotid.identification.long_recordings import evaluate_long
+from robotid.identification.evaluation import evaluate_logs
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
-from robotid.regressor.base_parameters import structural_mapping
 
 HELD = 1024  # rows in memory, so that pieces have 256
 
@@ -48,7 +47,7 @@ def without_page(monkeypatch):
 
 @pytest.fixture
 def without_doctor(monkeypatch):
-    monkeypatch.setattr("robotid.commands.identify.diagnose", lambda *_: ())
+    monkeypatch.setattr("robotid.commands.identify.examine_logs", lambda *_: ())
 
 
 def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
@@ -146,7 +145,7 @@ def test_a_fitted_recording_is_no_validation_in_pieces_either(
 
 
 def test_only_stretches_of_a_long_log_are_drawn_and_examined(noisy_job, tmp_path, monkeypatch):
-    monkeypatch.setattr("robotid.identification.long_recordings._SHOWN", 100)
+    monkeypatch.setattr("robotid.identification.evaluation._SHOWN", 100)
     monkeypatch.setattr("robotid.identification.survey._WINDOW", 400)
     job = replace(noisy_job, rows_in_memory=HELD, validation=())
     identification, result = run_job(job, tmp_path)
@@ -180,18 +179,26 @@ def test_a_log_with_samples_in_no_usual_piece_is_drawn_all_the_same(ur5, rng, tm
         signals=SignalSettings(cutoff=10.0, trim=10.0),
         rows_in_memory=HELD,
     )
-    (log,) = survey_logs(job, [LogEntry(path)], ur5, structural_mapping(ur5))
-    assert [len(piece.read()[1].t) for piece in log.pieces] == [0, 8, 0, 0]
-    evaluation = evaluate_long(log, {"estimate": pi}, pi)
+    (log,) = survey_logs(replace(job, rows_in_memory=1009), ur5, [LogEntry(path)])[0]
+    assert [len(piece.read().trajectory.t) for piece in log.pieces] == [0, 8, 0, 0]
+    ((evaluation,), ()) = evaluate_logs([log], (), {"estimate": pi}, pi)
     assert len(evaluation.recording.trajectory.t) == evaluation.recording.extent.smooth == 8
     assert not evaluation.recording.is_partial
 
 
 def test_a_job_is_long_by_the_rows_of_all_its_files(noisy_job):
-    entries = (*noisy_job.identification, *noisy_job.validation)
-    assert is_long(replace(noisy_job, rows_in_memory=2199), entries)
-    assert not is_long(replace(noisy_job, rows_in_memory=2200), entries)
-    assert not is_long(replace(noisy_job, rows_in_memory=1), (LogEntry(Path("missing.csv")),))
+    model, refused = noisy_job.model(), []
+    groups = noisy_job.identification, noisy_job.validation
+    for rows, is_held in ((2199, False), (2200, True)):
+        fitted, kept = survey_logs(replace(noisy_job, rows_in_memory=rows), model, *groups)
+        assert [log.is_held for log in (*fitted, *kept)] == [is_held] * 3
+    missing = (LogEntry(Path("missing.csv")), noisy_job.identification[0])
+    (found,) = survey_logs(
+        replace(noisy_job, rows_in_memory=1500), model, missing, refuse=lambda *x: refused.append(x)
+    )
+    assert [log.is_held for log in found] == [True]
+    ((entry, error),) = refused
+    assert (entry, str(error)) == (missing[0], "there is no log file 'missing.csv'")
     with pytest.raises(SettingsError, match="rows_in_memory is 0, wanted a positive number"):
         replace(noisy_job, rows_in_memory=0)
     given = job_from_settings({"urdf": "x", "reduction": {"rows_in_memory": 7}}, "job", Path())

@@ -1,9 +1,12 @@
 import numpy as np
+import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.identification.prior import prior_spread
+from robotid.identification.prior import prior_spread, spread_of
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
+from robotid.robot.mass_matrix import carried_inertia
+from robotid.robot.parameters import pseudo_inertia
 
 
 def test_the_spread_has_the_size_of_the_robot(ur5, rng):
@@ -24,3 +27,28 @@ def test_a_massless_link_still_has_a_spread(rng, ur5):
     log = exact_log(ur5, truth(ur5), rng)
     trajectory = process(log, SignalSettings(cutoff=None, trim=0.0))
     assert (prior_spread(light, [trajectory]) > 0).all()
+
+
+def test_the_spread_is_what_the_docstring_says(ur5):
+    squares, samples = np.array([4.0, 9.0, 25.0])[:, None] * np.ones((3, 6)), 1
+    spread = dict(zip(ur5.layout.names, spread_of(ur5, squares, samples), strict=True))
+    inertial = ur5.tree.inertials["forearm_link"]
+    mass, centre = inertial.mass, np.linalg.norm(ur5.standard_parameters()[21:24]) / inertial.mass
+    J = pseudo_inertia(ur5.standard_parameters()[:60])[2]
+    radius = centre + np.sqrt(np.trace(J[:3, :3]) / mass)
+    assert spread["forearm_link.mcx"] == pytest.approx(mass * radius)
+    assert spread["forearm_link.Ixx"] == pytest.approx(mass * radius**2)
+    assert spread["elbow_joint.viscous"] == pytest.approx(2.0 / 3.0)
+    carried = dict(zip(ur5.joints, carried_inertia(ur5), strict=True))
+    heavy, light = "shoulder_lift_joint", "wrist_3_joint"
+    assert carried[heavy] > 2.0 / 5.0 > carried[light]
+    assert spread[f"{heavy}.armature"] == pytest.approx(carried[heavy])
+    assert spread[f"{light}.armature"] == pytest.approx(2.0 / 5.0)
+
+
+def test_a_light_link_may_be_wrong_by_a_tenth_of_the_mean_mass(ur5):
+    pi = ur5.standard_parameters()
+    pi[20:30] *= 1e-6
+    squares = np.ones((3, 6))
+    spread = spread_of(ur5.with_parameters(pi), squares, 1)
+    assert spread[20] == pytest.approx(0.1 * pi[:60:10].mean(), rel=1e-6)

@@ -6,12 +6,15 @@ import scipy.stats
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import SettingsError
-from robotid.identification.long_recordings import LongRecordings
 from robotid.identification.pipeline import conclude, identify
-from robotid.identification.recordings import base_problem
+from robotid.identification.recordings import Recordings
 from robotid.identification.robust import LOSSES, loss_slope, loss_weight
+from robotid.identification.rows import base_problem
 from robotid.identification.settings import EstimatorSettings
+from robotid.identification.survey import survey_log
+from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
 
 NOISE = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])
 ROWS = {"wrist_2_joint": 584, "elbow_joint": 1148, "shoulder_pan_joint": 1287, "wrist_1_joint": 900}
@@ -143,14 +146,13 @@ def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(ur5):
     assert 0.85 < np.median(ratio) < 1.2, np.median(ratio)
 
 
-def test_logs_larger_than_memory_are_refused_by_name(ur5):
+def test_logs_larger_than_memory_are_refused_by_name(ur5, tmp_path):
+    path = tmp_path / "run.parquet"
+    write_log(exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=300), path)
+    log = survey_log(*lay_out(path, ur5.joints), ur5, SignalSettings(cutoff=None), length=256)
+    recordings = Recordings(ur5, structural_mapping(ur5), [log])
     with pytest.raises(SettingsError, match="rows_in_memory"):
-        conclude(ur5, _Empty(ur5, [], []), EstimatorSettings("wls", robust="huber"))
-
-
-class _Empty(LongRecordings):
-    def reduce(self, mapping):
-        return ()
+        conclude(recordings, EstimatorSettings("wls", robust="huber"))
 
 
 def test_a_job_refuses_another_loss():

@@ -112,12 +112,15 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"name": "rls", "walk": 0.1}, r"estimator 'rls' has no setting 'walk'; it has \['forg"),
-        ({"name": "ols", "margin": 1.0}, r"estimator 'ols' has no setting 'margin'; it has \[\]"),
+        (
+            {"name": "rls", "walk": 0.1},
+            "'rls' has no setting 'walk'; it has forgetting, ",
+        ),
+        ({"name": "ols", "margin": 1.0}, "'ols' has no setting 'margin'; it has none"),
         ({"name": "rls", "forgetting": 1.1}, "forgetting is 1.1, wanted 0 < x <= 1"),
         ({"name": "kalman", "walk": -1.0}, "walk is -1.0, wanted x >= 0"),
         ({"name": "kalman", "gate": True}, "gate is True, wanted 0.5 <= x < 1, or false"),
-        ({"name": "prx", "step": "paper"}, r"step is 'paper', wanted one of \['exact', 'prin"),
+        ({"name": "prx", "step": "paper"}, "step is 'paper', wanted one of exact, printed"),
         ({"name": "prx", "metric": "D"}, "metric is 'D', wanted one of"),
         ({"name": "prx", "passes": 0}, "passes is 0, wanted a positive, finite"),
         ({"name": "gradient", "step_size": 2.0}, "step_size is 2.0, wanted 0 < x < 2"),

@@ -1,13 +1,20 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from helpers.synthetic import exact_log, truth
 
-from robotid.estimators import WLS
+from robotid.estimators import OLS, WLS
 from robotid.exceptions import DataError
+from robotid.identification.pipeline import identify
 from robotid.identification.standard_errors import measured_errors, quantile, scatter
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress, merge
 from robotid.regressor.problem import Problem
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 N, JOINTS, STRETCHES = 2400, 2, 40
 SIGMA = np.array([2.0, 0.1])
@@ -62,6 +69,34 @@ def test_standard_errors_are_the_scatter_of_many_recordings(W, colour):
     # 150 runs know their own scatter to 6 %
     assert ((ratio > 0.82) & (ratio < 1.25)).all(), ratio
     assert 0.92 < np.mean(held) < 0.98
+
+
+@pytest.mark.parametrize(("samples", "basis"), [(1600, "16 stretches"), (800, "filter's band")])
+def test_behind_the_filter_errors_are_the_scatter_and_those_of_independent_rows_are_not(
+    samples, basis
+):
+    model = RobotModel.from_urdf(example_urdf("double_pendulum_simple.urdf"))
+    rng, filtered = np.random.default_rng(1), SignalSettings(cutoff=5.0)  # of logs at 100 Hz
+    clean = exact_log(model, truth(model), np.random.default_rng(0), samples=samples, rate=100.0)
+    level = 0.05 * np.sqrt(np.mean(clean.tau**2, axis=0))
+    found, stated, naive = [], [], []
+    for _ in range(30):
+        log = replace(clean, tau=clean.tau + level * rng.standard_normal(clean.tau.shape))
+        result = identify(model, [log], signals=filtered, estimator="ols")
+        assert basis in result.errors.method
+        pair = (result.estimate, result.wls)
+        found.append([estimate.theta for estimate in pair])
+        stated.append([estimate.std_error for estimate in pair])
+        naive.append([kind.fit(result.factors).std_error for kind in (OLS(), WLS())])
+    scattered = np.std(found, axis=0, ddof=1)  # (2, 13)
+    ratio = np.sqrt(np.mean(np.square(stated), axis=0)) / scattered
+    # 30 runs know a standard deviation to 13 %
+    assert ((ratio > 0.67) & (ratio < 1.5)).all(), ratio
+    assert ((np.median(ratio, axis=1) > 0.8) & (np.median(ratio, axis=1) < 1.2)).all()
+    # one row in ten is independent, 2 cutoff / rate: taking all for it errs by sqrt(10)
+    blind = np.sqrt(np.mean(np.square(naive), axis=0)) / scattered
+    assert np.median(blind) == pytest.approx(0.3, abs=0.06)
+    assert blind.max() < 0.5
 
 
 def test_independent_rows_need_no_inflation_and_coloured_ones_do(W):

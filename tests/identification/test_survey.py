@@ -11,15 +11,13 @@ from helpers.synthetic import truth
 
 from robotid.estimators import WLS
 from robotid.exceptions import DataError
-from robotid.identification import survey as long_logs
-from robotid.identification.evaluation import prepare
-from robotid.identification.recordings import LoadedRecordings
-from robotid.identification.survey import survey
+from robotid.identification import survey
+from robotid.identification.recordings import Recordings
+from robotid.identification.survey import ReducedPiece, hold_log, survey_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import lay_out, read_log, write_log
 from robotid.logs.settings import LogUnits, SignalSettings
-from robotid.logs.time_stamps import TimeStamps
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.reduction import join
 from robotid.regressor.torque import joint_torque_regressor
@@ -45,18 +43,23 @@ def recording(ur5):
 
 def long_log(model, path, signals, *, start=None, end=None, length=LENGTH, **reading):
     layout, table = lay_out(path, model.joints, **reading)
-    mapping = structural_mapping(model)
-    return survey(layout, table, model, mapping, signals, start=start, end=end, length=length)
+    return survey_log(layout, table, model, signals, (start, end), length=length)
+
+
+def pieces_of(log):
+    """Return the pieces of a log, ready to be reduced."""
+    mapping = structural_mapping(log.model)
+    return [ReducedPiece(piece, mapping) for piece in log.pieces]
 
 
 def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     """Check pieces against the log in memory; return both."""
     mapping = structural_mapping(model)
     found = long_log(model, path, signals, start=start, end=end, **reading)
-    whole = prepare(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
-    wanted = join(LoadedRecordings(model, [whole], []).reduce(mapping))
-    joined = join([piece.reduce() for piece in found.pieces])
-    assert found.header.signals == whole.signals
+    whole = hold_log(model, read_log(path, model.joints, start=start, end=end, **reading), signals)
+    wanted = join(Recordings(model, mapping, [whole]).reduce())
+    joined = join([piece.reduce() for piece in pieces_of(found)])
+    assert found.signals == whole.signals
     assert joined.samples == wanted.samples
     np.testing.assert_array_equal(joined.factors.rows, wanted.factors.rows)
     np.testing.assert_allclose(joined.squares, wanted.squares, rtol=1e-9)
@@ -65,10 +68,10 @@ def assert_alike(model, path, signals, *, start=None, end=None, **reading):
     np.testing.assert_allclose(one.theta, other.theta, rtol=1e-9, atol=1e-10 * size)
     np.testing.assert_allclose(one.std_error, other.std_error, rtol=1e-8)
     if signals.cutoff is None:
-        assert whole.trajectory.direction is None
+        assert whole.whole.trajectory.direction is None
     else:
-        directions = [piece.read()[1].direction for piece in found.pieces]
-        wanted = whole.trajectory.direction
+        directions = [piece.read().trajectory.direction for piece in found.pieces]
+        wanted = whole.whole.trajectory.direction
         np.testing.assert_allclose(np.concatenate(directions), wanted, rtol=0, atol=1e-10)
     return found, whole
 
@@ -96,7 +99,7 @@ def test_pieces_reduce_to_what_the_whole_log_reduces_to(ur5, recording, suffix, 
         ["run.npz rows 0-2000"],
     )
     assert sum(piece.samples for piece in found.pieces) == len(recording.t)
-    assert (found.start, found.end) == (recording.t[0], recording.t[-1])
+    assert found.stamps[[found.first, found.stop - 1]].tolist() == [recording.t[0], recording.t[-1]]
     assert found.step == np.median(np.diff(recording.t))
 
 
@@ -104,8 +107,7 @@ def test_a_window_of_a_file_is_cut_as_in_memory(ur5, recording, tmp_path):
     path = tmp_path / "run.csv"
     write_log(recording, path)
     found, whole = assert_alike(ur5, path, SignalSettings(), start=3.3, end=12.01)
-    assert (found.start, found.end) == (whole.log.t[0], whole.log.t[-1])
-    assert found.stop - found.first == len(whole.log.t)
+    np.testing.assert_array_equal(found.stamps[found.first : found.stop], whole.stamps)
     with pytest.raises(DataError) as in_memory:
         read_log(path, ur5.joints, start=50.0, end=60.0)
     with pytest.raises(DataError) as in_pieces:
@@ -145,7 +147,7 @@ def test_full_turns_are_taken_out_of_each_piece(tmp_path):
     path = tmp_path / "run.parquet"
     write_log(Log(t=t, q=wrapped, tau=tau, joints=kinova.joints), path)
     found, _ = assert_alike(kinova, path, SignalSettings())
-    turned = [piece.read()[2] for piece in found.pieces]
+    turned = [piece.read().turned for piece in found.pieces]
     assert np.any(turned, axis=0).tolist() == free.tolist()
 
 
@@ -199,12 +201,13 @@ def test_a_hole_in_the_last_piece_is_named_by_its_row_in_the_file(
     path = spoilt(recording, tmp_path, "tau_elbow_joint", 1801, np.nan)
     layout, table = lay_out(path, ur5.joints)
     short = replace(layout, notes=())
-    mapping = structural_mapping(ur5)
-    monkeypatch.setattr(long_logs, "_WINDOW", 100)
-    log = survey(short, table, ur5, mapping, SignalSettings(cutoff=None), start=2.0, length=LENGTH)
-    log.pieces[-2].reduce()
+    monkeypatch.setattr(survey, "_WINDOW", 100)
+    window = (2.0, None)
+    log = survey_log(short, table, ur5, SignalSettings(cutoff=None), window, length=LENGTH)
+    pieces = pieces_of(log)
+    pieces[-2].reduce()
     with pytest.raises(DataError, match=r"tau_elbow_joint is NaN at row 1801 \(t = ") as found:
-        log.pieces[-1].reduce()
+        pieces[-1].reduce()
     assert found.value.code == "not_finite"
 
 
@@ -219,32 +222,10 @@ def test_time_must_increase_where_pieces_meet_too(ur5, recording, tmp_path, row)
     assert f"t[{row}]" in str(in_pieces.value)
 
 
-def test_time_stamps_are_checked_where_blocks_meet():
-    t = np.arange(10.0)
-    with pytest.raises(DataError, match=r"t\[5\] = 4.500 s follows t\[4\] = 5.000 s"):
-        TimeStamps([t[1:6], t[5:] - 0.5], "log")
-    with pytest.raises(DataError, match="time is NaN at row 7"):
-        TimeStamps([t[:5], np.where(t[5:] == 7.0, np.nan, t[5:])], "log")
-
-
-@pytest.mark.parametrize("count", [2, 3, 9, 10, 300_001])
-def test_the_median_step_is_exact(rng, count):
-    t = 1.7e9 + np.cumsum(
-        rng.choice([0.001, 0.002, 0.0011, 3.0], count) * rng.uniform(1, 1.1, count)
-    )
-    with TimeStamps(np.array_split(t, 3), "log") as stamps:
-        assert len(stamps) == count
-        assert stamps.median_step(0, count) == np.median(np.diff(t))
-        if count > 9:
-            assert stamps.median_step(4, count - 3) == np.median(np.diff(t[4:-3]))
-            assert stamps.search(t[5]) == 5
-            assert stamps.search(np.nextafter(t[5], np.inf)) == 6
-
-
 def test_pieces_travel_as_they_are(ur5, recording, tmp_path):
     path = tmp_path / "run.parquet"
     write_log(recording, path)
-    pieces = long_log(ur5, path, SignalSettings()).pieces
+    pieces = pieces_of(long_log(ur5, path, SignalSettings()))
     for piece, again in zip(pieces, pickle.loads(pickle.dumps(pieces)), strict=True):
         np.testing.assert_array_equal(again.reduce().factors.R, piece.reduce().factors.R)
     # the model and the mapping go along once

@@ -1,3 +1,5 @@
+import pytest
+
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.verdict import Doubt, judge
 
@@ -141,3 +143,37 @@ def test_a_torque_of_zero_is_no_prediction():
     found = verdict({"a": joint(None, constant=False)})
     assert found.status == "poor"
     assert found.reasons == ("a: the torque on val.csv is 0 throughout: nothing was predicted",)
+
+
+@pytest.mark.parametrize(
+    ("error", "fitted", "status"),
+    [
+        (14.9, 14.0, "good"),
+        (15.1, 14.0, "usable"),
+        (49.9, 40.0, "usable"),
+        (50.1, 40.0, "poor"),
+        (7.9, 4.0, "good"),  # twice the fitted error is allowed
+        (8.1, 4.0, "usable"),
+        (4.9, 0.1, "good"),  # small errors are, however much smaller the fitted one
+        (5.1, 0.1, "usable"),
+    ],
+)
+def test_each_threshold_lies_where_it_is_stated(error, fitted, status):
+    found = verdict({"a": joint(error)}, fitted={"a": joint(fitted)})
+    assert found.status == status
+    assert found.joints["a"].status == status
+
+
+def test_an_alarm_alone_makes_a_good_prediction_poor():
+    kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
+    found = judge(
+        Metrics({"a": joint(3.0)}, 1.0), kept, undetermined=(), is_consistent=True, alarms=["late"]
+    )
+    assert found.status == "poor"
+    assert found.reasons == ("late",)
+    assert found.to_dict()["alarms"] == ["late"]
+
+
+def test_an_error_equal_to_the_urdfs_is_not_worse_than_it():
+    assert verdict({"a": joint(4.0, urdf=4.0)}).status == "good"
+    assert verdict({"a": joint(4.1, urdf=4.0)}).status == "poor"

@@ -72,7 +72,7 @@ def test_time_that_goes_back_is_refused():
     t[406] = 4.045
     with refused(
         "run3.csv: t must increase, but t[406] = 4.045 s follows t[405] = 4.050 s; "
-        "sort the rows, or mend the recording"
+        "sort the rows, or correct the recording"
     ):
         make_log(t=t)
 
@@ -90,7 +90,7 @@ def test_duplicate_time_stamp_is_called_so():
 def test_time_stamps_that_differ_late_are_printed_in_full():
     with refused(
         "log: t must increase, but t[1] = 1.0000001 s follows t[0] = 1.0000002 s; sort the rows, "
-        "or mend the recording"
+        "or correct the recording"
     ):
         Log(t=[1.0000002, 1.0000001], q=[[0], [0]], tau=[[0], [0]], joints=("elbow",))
 
@@ -102,7 +102,7 @@ def test_time_stamps_that_differ_late_are_printed_in_full():
 def test_values_that_are_not_finite_are_refused(field, column, value, word):
     array = spoil(getattr(make_log(), field), 34, 1, value)
     with refused(
-        f"run3.csv: {column}_elbow is {word} at row 34 (t = 0.34 s); remove the row or mend the "
+        f"run3.csv: {column}_elbow is {word} at row 34 (t = 0.34 s); remove the row or correct the "
         "recording"
     ):
         make_log(**{field: array})
@@ -111,14 +111,14 @@ def test_values_that_are_not_finite_are_refused(field, column, value, word):
 def test_time_that_is_nan_is_refused():
     t = make_log().t.copy()
     t[17] = np.nan
-    with refused("run3.csv: time is NaN at row 17; remove the row or mend the recording"):
+    with refused("run3.csv: time is NaN at row 17; remove the row or correct the recording"):
         make_log(t=t)
 
 
 def test_shapes_that_do_not_fit_are_refused():
     with refused(
         "run3.csv: tau has shape (500, 3), wanted (500, 2): a row for each time stamp, a column "
-        "for each of the joints ['shoulder', 'elbow']"
+        "for each of the joints shoulder, elbow"
     ):
         make_log(tau=np.zeros((500, 3)))
     with refused("run3.csv: t has shape (500, 1), wanted (N,)"):
@@ -131,7 +131,7 @@ def test_fewer_than_two_rows_are_refused():
 
 
 def test_joints_are_names_each_once():
-    with refused("run3.csv: joints ['elbow'] are named twice; name each joint once"):
+    with refused("run3.csv: joints elbow are named twice; name each joint once"):
         make_log(joints=("elbow", "elbow"))
     with refused("run3.csv: joints is 'ab', wanted at least one name in a tuple"):
         make_log(joints="ab")
@@ -179,7 +179,7 @@ def test_select_gives_the_order_asked_for():
 
 def test_select_of_an_unknown_joint_names_the_nearest():
     with refused(
-        "joint 'elbow2' is not in run3.csv; joints: ['shoulder', 'elbow']. Did you mean 'elbow'?"
+        "joint 'elbow2' is not in run3.csv; joints: shoulder, elbow. Did you mean 'elbow'?"
     ):
         make_log().select(["elbow2"])
 
@@ -230,10 +230,10 @@ def test_trajectory_refuses_a_wrong_rate(rate):
 
 
 def test_units_that_do_not_exist_are_refused():
-    wanted = re.escape("units: time is 'min', wanted one of ['s', 'ms', 'us', 'ns']")
+    wanted = re.escape("units: time is 'min', wanted one of s, ms, us, ns")
     with pytest.raises(SettingsError, match=wanted):
         LogUnits(time="min")
-    wanted = re.escape("units: angle is 'grad', wanted one of ['rad', 'deg']")
+    wanted = re.escape("units: angle is 'grad', wanted one of rad, deg")
     with pytest.raises(SettingsError, match=wanted):
         LogUnits(angle="grad")
 

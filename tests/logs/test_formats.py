@@ -198,7 +198,7 @@ def test_stamps_that_go_back_are_refused_as_in_any_log(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", messages, delay=lambda k: 0.05 * (k == 8))
     with refused(
         "run.mcap: t must increase, but t[8] = 0.115 s follows t[7] = 0.140 s; sort the rows, or "
-        "mend the recording"
+        "correct the recording"
     ):
         read_log(path, JOINTS)
     by_log = read_log(path, JOINTS, source=LogSource(stamp="log"))
@@ -213,8 +213,7 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
         f"topics: {{'/arm': '{STATE}', '/chatter': 'std_msgs/msg/String', '/ghost': '{STATE}'}}"
     )
     with refused(
-        f"bag holds 2 topics of {STATE}: ['/arm', '/ghost']; {listing}. State one: topic = "
-        f'"/arm" {HOW}'
+        f'bag holds 2 topics of {STATE}: /arm, /ghost; {listing}. State one: topic = "/arm" {HOW}'
     ):
         read_log(path, JOINTS)
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/arm")), log)
@@ -243,7 +242,7 @@ def test_messages_of_other_joints_are_passed_over(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", messages)
     back = read_log(path, JOINTS)
     assert_same(back, log)
-    assert back.notes == ("columns ignored: ['position_finger']",)
+    assert back.notes == ("columns ignored: position_finger",)
 
 
 def test_joints_missing_in_some_messages_are_refused(tmp_path):
@@ -255,7 +254,7 @@ def test_joints_missing_in_some_messages_are_refused(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", messages)
     with refused(
         "run.mcap, topic '/joint_states': 2 of 60 messages lack some of what is read, the first "
-        "(message 7) ['position_elbow', 'effort_elbow', 'velocity_elbow']. A row is one message: "
+        "(message 7) position_elbow, effort_elbow, velocity_elbow. A row is one message: "
         "read only joints that are always published together, and leave out the others"
     ):
         read_log(path, JOINTS)
@@ -266,7 +265,8 @@ def test_a_bag_without_efforts_is_refused_as_any_log(tmp_path):
     messages = [(*message[:4], []) for message in messages_of(make_log())]
     path = write_mcap(tmp_path / "run.mcap", messages)
     with refused(
-        "run.mcap has no column 'tau_shoulder'; torque or current columns found: []. Rename it, or "
+        "run.mcap has no column 'tau_shoulder'; torque or current columns found: none. Rename it, "
+        "or "
         "pass columns={'tau_shoulder': ...}; if 'shoulder' stood still, leave it out of joints and "
         "lock it"
     ):
@@ -302,7 +302,7 @@ def test_messages_that_do_not_fit_together_are_refused(tmp_path):
     t, names, q, v, tau = messages[5]
     wrong = {
         "holds 1 values of velocity": (t, names, q, v[:1], tau),
-        "names ['elbow'] twice": (t, ["elbow", "elbow"], q, v, tau),
+        "names elbow twice": (t, ["elbow", "elbow"], q, v, tau),
     }
     for number, (text, message) in enumerate(wrong.items()):
         path = write_mcap(tmp_path / f"{number}.mcap", [*messages[:5], message])
@@ -376,10 +376,10 @@ def test_groups_are_chosen_like_topics(tmp_path):
                 file[f"{group}/{name}"] = values
     with pytest.raises(DataError) as caught:
         read_log(path, JOINTS)
-    assert str(caught.value).startswith("run.h5 holds 2 groups with a time: ['left', 'right']; ")
+    assert str(caught.value).startswith("run.h5 holds 2 groups with a time: left, right; ")
     assert str(caught.value).endswith(f'. State one: topic = "left" {HOW}')
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/left/")), log)
-    with refused("run.h5 has no group 'lefd'; groups found: ['left', 'right']. Did you mean "
+    with refused("run.h5 has no group 'lefd'; groups found: left, right. Did you mean "
                  "'left'?"):  # fmt: skip
         read_log(path, JOINTS, source=LogSource(topic="lefd"))
 
@@ -388,7 +388,7 @@ def test_arrays_without_joint_names_are_numbered_and_mapped(tmp_path):
     log = make_log()
     path = tmp_path / "run.npz"
     np.savez(path, time=log.t, q=log.q, tau=log.tau, mass=3.0, image=np.zeros((60, 2, 2)))
-    with pytest.raises(DataError, match=r"position columns found: \['q_0', 'q_1'\]"):
+    with pytest.raises(DataError, match=r"position columns found: q_0, q_1"):
         read_log(path, JOINTS)
     numbered = LogSource(joints={"shoulder": "0", "elbow": "1"})
     assert_same(read_log(path, JOINTS, source=numbered), log, ("t", "q", "tau"))
@@ -411,18 +411,19 @@ def test_one_joint_needs_no_second_axis(tmp_path):
         ),
         (
             {"tau": np.zeros((60, 3))},
-            "run.npz: tau has shape (60, 3), but the file names 2 joints: ['shoulder', 'elbow']; "
+            "run.npz: tau has shape (60, 3), but the file names 2 joints: shoulder, elbow; "
             "give each joint one column",
         ),
         (
             {"time": None},
-            "run.npz has no column 'time'; columns found: ['q_shoulder', 'q_elbow', "
-            "'dq_shoulder', 'dq_elbow', 'tau_shoulder', 'tau_elbow']. Rename it, or pass "
+            "run.npz has no column 'time'; columns found: q_shoulder, q_elbow, "
+            "dq_shoulder, dq_elbow, tau_shoulder, tau_elbow. Rename it, or pass "
             "columns={'time': ...}",
         ),
         (
             {"tau": np.array([None] * 60)},
-            "run.npz has no column 'tau_shoulder'; torque or current columns found: []. Rename it, "
+            "run.npz has no column 'tau_shoulder'; torque or current columns found: none. Rename "
+            "it, "
             "or pass columns={'tau_shoulder': ...}; if 'shoulder' stood still, leave it out of "
             "joints and lock it",
         ),
@@ -458,13 +459,13 @@ def test_joints_may_have_other_names_in_the_file(tmp_path):
     swapped = LogSource(joints={"M1": "M2", "M2": "M1"})
     np.testing.assert_array_equal(read_log(path, ("M1", "M2"), source=swapped).q, log.q[:, ::-1])
     with refused(
-        "run.csv has no column 'q_M3'; position columns found: ['q_M1', 'q_M2']. Rename it, or "
+        "run.csv has no column 'q_M3'; position columns found: q_M1, q_M2. Rename it, or "
         "pass columns={'q_elbow': ...}; if 'elbow' stood still, leave it out of joints and lock it"
     ):
         read_log(path, JOINTS, source=LogSource(joints={"shoulder": "M1", "elbow": "M3"}))
     with refused(
-        "run.csv: log.joints renames 'elbo', which is not among the joints read: ['shoulder', "
-        "'elbow']. Did you mean 'elbow'?",
+        "run.csv: log.joints renames 'elbo', which is not among the joints read: shoulder, "
+        "elbow. Did you mean 'elbow'?",
         SettingsError,
     ):
         read_log(path, JOINTS, source=LogSource(joints={"elbo": "M2"}))
@@ -479,8 +480,8 @@ def test_a_topic_of_a_csv_file_is_noted(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"effort": "percent"}, "effort is 'percent', wanted one of ['torque', 'current']"),
-        ({"stamp": "wall"}, "stamp is 'wall', wanted one of ['header', 'log']"),
+        ({"effort": "percent"}, "effort is 'percent', wanted one of torque, current"),
+        ({"stamp": "wall"}, "stamp is 'wall', wanted one of header, log"),
         ({"joints": {"elbow": 2}}, "joints.elbow is 2, wanted a name"),
     ],
 )

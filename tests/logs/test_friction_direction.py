@@ -9,10 +9,10 @@ from scipy.signal import butter, sosfiltfilt
 
 from robotid.exceptions import DataError
 from robotid.identification.bands import torque_band
-from robotid.identification.evaluation import prepare
 from robotid.identification.pipeline import conclude, identify
-from robotid.identification.recordings import LoadedRecordings
+from robotid.identification.recordings import Recordings
 from robotid.identification.settings import EstimatorSettings
+from robotid.identification.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
@@ -41,8 +41,8 @@ def filtered(x, cutoff, rate, order=4):
 
 def coulomb_errors(model, recordings, pi):
     """Return the errors of the Coulomb parameters of weighted least squares over their values."""
-    found = conclude(model, LoadedRecordings(model, recordings, ()), EstimatorSettings("wls"))
-    mapping = found.mapping
+    mapping = structural_mapping(model)
+    found = conclude(Recordings(model, mapping, recordings), EstimatorSettings("wls"))
     chosen = [k for k, name in enumerate(mapping.base_names) if name.endswith(".coulomb")]
     assert len(chosen) == len(friction_speeds(model.layout))
     true = mapping.to_base(pi)[chosen]
@@ -52,8 +52,10 @@ def coulomb_errors(model, recordings, pi):
 def test_coulomb_friction_is_found_again_behind_the_filter(robot):
     pi = truth(robot)
     log = exact_log(robot, pi, np.random.default_rng(1), samples=4000, rate=200.0)
-    recording = prepare(robot, log, SignalSettings())
-    bare = replace(recording, trajectory=replace(recording.trajectory, direction=None))
+    recording, bare = (hold_log(robot, log, SignalSettings()) for _ in range(2))
+    rows = recording.whole
+    without = replace(rows, trajectory=replace(rows.trajectory, direction=None))
+    bare.pieces[0].__dict__["_kept"] = without  # as if it had been read so
     found, before = (coulomb_errors(robot, [r], pi) for r in (recording, bare))
     assert before.max() > 2e-3
     # left is what one sample more or less of a sign makes where a smooth speed is next to zero
@@ -64,7 +66,7 @@ def test_the_coulomb_column_is_the_filtered_sign(robot):
     rate, cutoff, trim = 200.0, 8.0, 0.5
     pi = np.where([name.endswith(".coulomb") for name in robot.layout.names], truth(robot), 0.0)
     log = exact_log(robot, pi, np.random.default_rng(2), samples=3000, rate=rate)
-    motion = prepare(robot, log, SignalSettings(cutoff=cutoff, trim=trim)).trajectory
+    motion = hold_log(robot, log, SignalSettings(cutoff=cutoff, trim=trim)).whole.trajectory
     kept = np.round(motion.t * rate).astype(int)
     w = log.v @ friction_speeds(robot.layout).T
     expected = filtered(np.sign(filtered(w, cutoff, rate)), cutoff, rate)[kept]
@@ -92,11 +94,11 @@ def test_the_sign_is_filtered_before_rows_are_left_out(ur5):
 def test_without_filter_speeds_or_friction_the_sign_is_the_speeds_own(ur5):
     log = exact_log(ur5, truth(ur5), np.random.default_rng(4), samples=300)
     assert process(log, SignalSettings()).direction is None
-    assert prepare(ur5, log, SignalSettings()).trajectory.direction.shape[1] == 6
-    assert prepare(ur5, log, SignalSettings(cutoff=None)).trajectory.direction is None
+    assert hold_log(ur5, log, SignalSettings()).whole.trajectory.direction.shape[1] == 6
+    assert hold_log(ur5, log, SignalSettings(cutoff=None)).whole.trajectory.direction is None
     viscous = RobotModel.from_urdf(ur5.tree.path, terms=("viscous",))
     assert friction_speeds(viscous.layout).shape == (0, 6)
-    assert prepare(viscous, log, SignalSettings()).trajectory.direction is None
+    assert hold_log(viscous, log, SignalSettings()).whole.trajectory.direction is None
 
 
 def test_speeds_of_joints_come_before_those_of_couplings():
@@ -148,7 +150,7 @@ def test_a_trajectory_refuses_directions_that_do_not_fit(direction, ur5):
 
 def test_a_part_of_a_trajectory_keeps_its_directions(ur5):
     log = exact_log(ur5, truth(ur5), np.random.default_rng(5), samples=300)
-    motion = prepare(ur5, log, SignalSettings()).trajectory
+    motion = hold_log(ur5, log, SignalSettings()).whole.trajectory
     np.testing.assert_array_equal(motion.part(20, 50).direction, motion.direction[20:50])
     with pytest.raises(ValueError, match="read-only"):
         motion.direction[0] = 1.0
@@ -163,7 +165,7 @@ def test_friction_that_needs_some_speed_to_be_full_is_found_again(ur5, cutoff):
     smooth = step * (np.clip(log.v / band, -1.0, 1.0) - np.sign(log.v))
     log = replace(log, tau=log.tau + smooth)
     told, untold = (
-        coulomb_errors(ur5, [prepare(ur5, log, settings)], pi).max()
+        coulomb_errors(ur5, [hold_log(ur5, log, settings)], pi).max()
         for settings in (
             SignalSettings(cutoff=cutoff, friction_band=band, min_velocity=0.0),
             SignalSettings(cutoff=cutoff, min_velocity=0.0),
@@ -231,7 +233,7 @@ def test_a_robot_that_sticks_is_predicted_as_well_as_its_noise_allows(ur5):
     tau = np.zeros((n, 6))
     tau[:, 0] = 3.0 * friction
     log = Log(t=t, q=q, tau=tau, joints=ur5.joints, v=v, a=a)
-    motion = prepare(ur5, log, SignalSettings()).trajectory
+    motion = hold_log(ur5, log, SignalSettings()).whole.trajectory
     moving = np.abs(motion.v[:, 0]) >= 0.02
     left = np.abs(motion.tau[:, 0] - 3.0 * motion.direction[:, 0])[moving]
     plain = filtered(np.sign(filtered(v[:, :1], 8.0, rate)), 8.0, rate)[:, 0]
@@ -256,7 +258,7 @@ def test_estimates_from_filtered_logs_scatter_as_their_standard_errors_say(ur5):
 
 def test_the_band_of_a_prediction_follows_the_filtered_sign(ur5):
     log = exact_log(ur5, truth(ur5), np.random.default_rng(6), samples=400)
-    motion = prepare(ur5, log, SignalSettings()).trajectory
+    motion = hold_log(ur5, log, SignalSettings()).whole.trajectory
     mapping = structural_mapping(ur5)
     C = np.diag([float(name == "elbow_joint.coulomb") for name in mapping.base_names])
     band = torque_band(ur5, mapping, motion, C, np.zeros(6))

@@ -21,7 +21,7 @@ from robotid.paper.planar_2r import (
     urdf_text,
 )
 from robotid.robot.parameters import pseudo_inertia
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 URDF = Path(__file__).parents[2] / "urdf" / "planar_2r.urdf"
 FORMS = tuple(PARAMETER_NAMES)

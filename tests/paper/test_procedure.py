@@ -17,8 +17,8 @@ from robotid.paper.formulas import Bounds, recursive_update
 from robotid.paper.procedure import Influences, LoopSettings, random_torque, run_procedure
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
+from robotid.simulation.motions import ProgramMotion
 from robotid.simulation.plant import RobotPlant
-from robotid.simulation.program import ProgramMotion
 
 P4 = planar_2r.parameters(planar_2r.PAPER_LINKS)
 ARM = PlanarDynamics("corrected")

@@ -5,7 +5,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
-from robotid.identification.evaluation import prepare
+from robotid.identification.survey import hold_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.reduction import Reduction, join, join_stretches
@@ -15,7 +15,7 @@ EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 
 
 def reduction(model, log):
-    motion = prepare(model, log, EXACT).trajectory
+    motion = hold_log(model, log, EXACT).whole.trajectory
     problem = structural_mapping(model).reduce(build_problem(model, motion))
     return Reduction.of(problem, motion), motion
 

@@ -7,13 +7,14 @@ import re
 
 import numpy as np
 import pytest
+from helpers.pages import number, percent, tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid._files import write_json
 from robotid.cli import main
 from robotid.exceptions import DataError
-from robotid.export.result import load_result
+from robotid.export.result import read_result
 from robotid.logs.read import write_log
 from robotid.report.comparison import compare_results, write_comparison
 from robotid.robot.model import RobotModel
@@ -39,7 +40,7 @@ def changed(folder, tmp_path):
     """Return a function that writes b.json with a change and compares a.json with it."""
 
     def compare(change):
-        result = copy.deepcopy(load_result(folder / "b.json").content)
+        result = copy.deepcopy(read_result(folder / "b.json"))
         change(result)
         write_json(result, tmp_path / "b.json")
         return compare_results([folder / "a.json", tmp_path / "b.json"])
@@ -48,7 +49,7 @@ def changed(folder, tmp_path):
 
 
 def test_differences_are_in_combined_standard_errors(folder):
-    a, b = (load_result(folder / f"{name}.json").content for name in "ab")
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
     found = compare_results([folder / "a.json", folder / "b.json"])
     assert len(found["base_parameters"]) == len(a["base_parameters"])
     for one, other, entry in zip(
@@ -60,7 +61,7 @@ def test_differences_are_in_combined_standard_errors(folder):
 
 
 def test_errors_of_the_same_recording_stand_side_by_side(folder):
-    a, b = (load_result(folder / f"{name}.json").content for name in "ab")
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
     found = compare_results([folder / "a.json", folder / "b.json"])
     assert found["remarks"] == []
     assert found["fitted_alike"]
@@ -146,9 +147,84 @@ def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
     assert "at least two results" in capsys.readouterr().err
 
 
+def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
+    a, b = (read_result(folder / f"{name}.json") for name in "ab")
+    b = copy.deepcopy(b)
+    last = b["base_parameters"][-1]
+    last["value"] += 4 * math.hypot(last["std_error"], a["base_parameters"][-1]["std_error"])
+    write_json(b, tmp_path / "b.json")
+    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    shown = tables(html)
+    (kept,) = [caption for caption in shown if caption.endswith(": not fitted")]
+    assert kept.startswith("second.csv 0-")
+    for caption, parts in (
+        (kept, [r["validation"][0] for r in (a, b)]),
+        ("Fitted rows of each result", [r["identification"] for r in (a, b)]),
+    ):
+        for row in shown[caption].rows:
+            one, other = (part["per_joint"][row[0]] for part in parts)
+            errors = [percent(x["relative_error_pct"]) for x in (one, other)]
+            rmse = [number(x["rmse"], ".3g") for x in (one, other)]
+            assert row[1:] == [*errors, *rmse, one["unit"]]
+        assert shown[caption].headers == ["joint", "A %", "B %", "A RMSE", "B RMSE", "unit"]
+    table = shown["Base parameters with standard errors"]
+    assert table.headers[1:6] == ["A", "B", "± A", "± B", "(B − A) / s"]
+    for row, one, other in zip(table.rows, a["base_parameters"], b["base_parameters"], strict=True):
+        difference = other["value"] - one["value"]
+        apart = difference / math.hypot(one["std_error"], other["std_error"])
+        assert row == [
+            one["name"],
+            number(one["value"]), number(other["value"]),
+            number(one["std_error"], ".2g"), number(other["std_error"], ".2g"),
+            number(apart, ".1f"), one["unit"], "apart" if abs(apart) > 3 else "",
+        ]  # fmt: skip
+    assert table.rows[-1][-1] == "apart"
+    settings = dict((row[0], row[1:]) for row in shown["Settings that differ"].rows)
+    assert settings["estimator.name"] == ["consistent", "wls"]
+    files = shown["Files read, those that differ first"]
+    assert files.headers == ["role", "A", "B", "file", "from s", "to s", "SHA-256"]
+    for row, entry in zip(files.rows, a["inputs"], strict=True):
+        window = [number(entry.get(end), ".6g") for end in ("start", "end")]
+        assert row == [entry["role"], "yes", "yes", entry["path"], *window, entry["sha256"]]
+    for label, result in (("A", a), ("B", b)):
+        box = html.split(f"<p>{label}: <strong>")[1].split("</div>")[0]
+        assert box.startswith(f"{result['verdict']['status']}</strong>")
+        assert f"({result['settings']['estimator']['name']})" in box
+        assert re.findall(r"<li>(.*?)</li>", box) == result["verdict"]["reasons"]
+
+
+def test_the_least_error_of_comparable_results_is_bold(folder, tmp_path):
+    b = copy.deepcopy(read_result(folder / "b.json"))
+    a = read_result(folder / "a.json")
+    joint = next(iter(b["validation"][0]["per_joint"]))
+    for part in (b["validation"][0], b["identification"]):
+        part["per_joint"][joint]["relative_error_pct"] = 0.01
+    write_json(b, tmp_path / "b.json")
+    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert html.count("<strong>0.01</strong>") == 2
+    error = a["validation"][0]["per_joint"][joint]["relative_error_pct"]
+    assert f"<strong>{percent(error)}</strong>" not in html.split(">unit<")[1].split("</tr>")[1]
+
+
+def test_versions_that_differ_stand_on_the_page(folder, tmp_path):
+    b = copy.deepcopy(read_result(folder / "b.json"))
+    b["versions"]["numpy"] = "1.26.0"
+    b["inputs"][-1]["sha256"] = "0" * 64
+    write_json(b, tmp_path / "b.json")
+    content = write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    assert tables(html)["Versions that differ"].rows == [["numpy", np.__version__, "1.26.0"]]
+    files = tables(html)["Files read, those that differ first"].rows
+    assert [row[1:3] for row in files] == [["yes", "no"], ["no", "yes"], *[["yes", "yes"]] * 2]
+    for remark in content["remarks"]:
+        assert f"<li>{remark.replace(chr(39), '&#x27;')}</li>" in html
+
+
 def test_names_of_files_cannot_inject_markup(folder, tmp_path):
     path = tmp_path / "<b>x.json"
-    write_json({**load_result(folder / "b.json").content, "robot": "<i>r"}, path)
+    write_json({**read_result(folder / "b.json"), "robot": "<i>r"}, path)
     write_comparison([folder / "a.json", path], tmp_path / "c.html")
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
     assert "<b>" not in html

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.identification.evaluation import evaluate, prepare
+from robotid.identification.evaluation import evaluate_logs
+from robotid.identification.survey import hold_log
 from robotid.logs.settings import SignalSettings
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
 
@@ -74,11 +75,11 @@ def test_no_used_row_gives_no_spectrum():
 
 def test_friction_is_the_torque_that_viscous_coulomb_and_offset_add(ur5, rng):
     pi = truth(ur5)
-    recording = prepare(ur5, exact_log(ur5, pi, rng), SignalSettings(cutoff=None))
-    evaluation = evaluate(ur5, recording, {"estimate": pi}, ur5.standard_parameters())
+    log = hold_log(ur5, exact_log(ur5, pi, rng), SignalSettings(cutoff=None))
+    ((evaluation,), ()) = evaluate_logs([log], (), {"estimate": pi}, ur5.standard_parameters())
     left, friction = friction_split(ur5, evaluation, pi)
     value = dict(zip(ur5.layout.names, pi, strict=True))
-    v = recording.trajectory.v
+    v = evaluation.recording.trajectory.v
     for j, name in enumerate(ur5.joints):
         known = (
             value[f"{name}.viscous"] * v[:, j]

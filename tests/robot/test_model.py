@@ -3,6 +3,7 @@ import pinocchio as pin
 import pytest
 
 from robotid.exceptions import ModelError
+from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf, example_urdfs
 from robotid.robot.model import RobotModel
 
@@ -82,6 +83,21 @@ def test_locked_joints_are_lumped_where_they_stand(tmp_path):
     assert dict(model.locked) == {"elbow": np.pi / 2}
 
 
+@pytest.mark.parametrize("axis", ["0 1 0", "1 2 3"])
+def test_a_locked_continuous_joint_gives_the_torque_at_its_angle(tmp_path, rng, axis):
+    model = RobotModel.from_urdf(
+        write(tmp_path, "continuous", axis), joints=["shoulder"], locked={"elbow": 2.3}
+    )
+    whole = pin.buildModelFromUrdf(model.tree.path)
+    assert whole.nq == 3  # the elbow as cosine and sine
+    data, neutral = whole.createData(), pin.neutral(whole)
+    for q, v, a in rng.uniform(-1, 1, (5, 3)):
+        at = pin.integrate(whole, neutral, np.array([q, 2.3]))
+        expected = pin.rnea(whole, data, at, np.array([v, 0.0]), np.array([a, 0.0]))[0]
+        Y = joint_torque_regressor(model, *np.array([q, v, a]).reshape(3, 1, 1))
+        assert (Y @ model.standard_parameters())[0] == pytest.approx(expected, rel=1e-12)
+
+
 def test_a_mimic_joint_moves_with_its_leader_when_coupled(tmp_path):
     path = write(tmp_path, more='<mimic joint="shoulder" multiplier="-2" offset="0.5"/>')
     independent = RobotModel.from_urdf(path)
@@ -115,11 +131,11 @@ def test_changed_parameters_stay_out_of_the_original(ur5):
 BAD = {
     "no joint of that name": (
         dict(joints=["elbow2"]),
-        "joint 'elbow2' is not in two.urdf; joints: ['shoulder', 'elbow']. Did you mean 'elbow'?",
+        "joint 'elbow2' is not in two.urdf; joints: shoulder, elbow. Did you mean 'elbow'?",
     ),
     "identified and locked": (
         dict(joints=["elbow"], locked={"elbow": 0.0}),
-        "joints ['elbow'] are both identified and locked",
+        "joints elbow are both identified and locked",
     ),
     "unknown mimic mode": (dict(mimic="yes"), "mimic is 'yes', wanted 'independent' or 'coupled'"),
     "gravity of two numbers": (dict(gravity=(0, 9.81)), "wanted three finite numbers"),

@@ -154,6 +154,61 @@ def test_torques_are_plotted_with_gaps_and_by_the_name_of_who_predicts(arm, moti
     np.testing.assert_allclose(residual, 1.0, atol=1e-5)
 
 
+def test_every_series_is_that_of_its_joint_and_of_who_says_so(identified):
+    """Measured and predicted torques of six joints, no two alike, at the times of the log."""
+    evaluation = identified.validation[0]
+    trajectory, model = evaluation.recording.trajectory, identified.model
+    ours = {"identified": evaluation.torques["estimate"], "URDF": evaluation.torques["urdf"]}
+    torques = Torques(trajectory.t, trajectory.tau, ours)
+    page = replay(model, trajectory.t, trajectory.q, torques=torques)
+    data = shown(page.html)
+    found = data["torques"]
+    assert found["labels"] == ["measured", "identified", "URDF"]
+    assert [joint["name"] for joint in found["joints"]] == list(model.joints)
+    assert found["values"].shape[1] == 18
+    real = ~np.isnan(found["values"][:, 0])
+    rows = np.abs(found["t"][real, None] + trajectory.t[0] - trajectory.t).argmin(axis=1)
+    np.testing.assert_allclose(found["t"][real], (trajectory.t - trajectory.t[0])[rows], atol=1e-5)
+    series = (trajectory.tau, ours["identified"], ours["URDF"])
+    for k, wanted in enumerate(series):
+        for j in range(6):
+            shown_as = found["values"][real, 6 * k + j]
+            np.testing.assert_allclose(shown_as, wanted[rows, j], rtol=1e-5, atol=1e-5)
+    moved = data["motion"]
+    rows = np.abs(moved["t"][:, None] + trajectory.t[0] - trajectory.t).argmin(axis=1)
+    np.testing.assert_allclose(moved["q"], trajectory.q[rows], atol=1e-5)
+
+
+def test_bands_are_those_of_their_parameter(arm, motion):
+    t, q = motion
+    theta, error = np.column_stack([q, 3 + q[:, :1]]), np.column_stack([0.1 * q, 7 + q[:, 1:]])
+    bands = Bands(t, ["a.m", "b.m", "c.viscous"], ["kg", "kg", "N m s/rad"], theta, error)
+    data = shown(replay(arm, t, q, bands=bands).html)["bands"]
+    assert (data["names"], data["units"]) == (
+        ["a.m", "b.m", "c.viscous"],
+        ["kg", "kg", "N m s/rad"],
+    )
+    rows = np.abs(data["t"][:, None] + 5.0 - t).argmin(axis=1)
+    np.testing.assert_allclose(data["values"][:, :3], theta[rows], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(data["values"][:, 3:], error[rows], rtol=1e-5, atol=1e-6)
+
+
+def test_the_ghost_is_the_second_motion(arm, motion):
+    t, q = motion
+    data = shown(replay(arm, t, q, ghost=("old", t + 3.0, 0.5 * q + 0.25)).html)
+    assert data["ghost"]["label"] == "old"
+    np.testing.assert_allclose(data["ghost"]["q"][-1], 0.5 * q[-1] + 0.25, rtol=1e-5)
+    np.testing.assert_allclose(data["motion"]["q"][-1], q[-1], rtol=1e-5)
+    assert data["ghost"]["t"][0] == 0.0
+
+
+def test_marks_are_told_in_order_with_their_kind(arm, motion):
+    marks = [Mark(6.5, "later", "contact"), Mark(5.25, "first", "payload")]
+    data = shown(replay(arm, *motion, marks=marks).html)
+    told = [(mark["t"], mark["label"], mark["kind"]) for mark in data["marks"]]
+    assert told == [(0.25, "first", "payload"), (1.5, "later", "contact")]
+
+
 def test_a_gap_of_the_log_is_marked(arm, motion):
     t, q = motion
     t = np.where(t > 6.0, t + 1.0, t)
@@ -173,6 +228,32 @@ def test_masses_are_told_per_link_and_label(ur5):
     assert [b["name"] for b in before["bodies"]] == list(ur5.layout.bodies)
     assert [b["mass"] for b in before["bodies"]] == pytest.approx(pi[:60:10])
     assert (found["bodies"][0]["fault"], found["bodies"][0]["semi_axes"]) == ("no mass", None)
+
+
+def test_ellipsoids_are_those_of_their_body(identified):
+    """Centre, size and direction of each, by moments of a solid: Ixx = m (b^2 + c^2) / 5, ..."""
+    model = identified.model
+    t = np.arange(3) / 10.0
+    masses = {"URDF": identified.prior, "identified": identified.standard}
+    page = replay(model, t, np.zeros((3, 6)), masses=masses)
+    before, after = shown(page.html)["masses"]
+    assert (before["label"], after["label"]) == ("URDF", "identified")
+    for marks, pi in ((before, identified.prior), (after, identified.standard)):
+        assert [body["name"] for body in marks["bodies"]] == list(model.layout.bodies)
+        assert [body["node"] for body in marks["bodies"]] == [1, 2, 3, 4, 5, 6]
+        for i, body in enumerate(marks["bodies"]):
+            m, *moment = pi[10 * i : 10 * i + 4]
+            Ixx, Ixy, Iyy, Ixz, Iyz, Izz = pi[10 * i + 4 : 10 * i + 10]
+            assert body["fault"] == ""
+            assert body["mass"] == pytest.approx(m)
+            c = np.array(body["com"])
+            np.testing.assert_allclose(m * c, moment, atol=1e-12)
+            a2, b2, c2 = np.square(body["semi_axes"])
+            solid = m / 5 * np.diag([b2 + c2, a2 + c2, a2 + b2])
+            R = pin.Quaternion(np.array(body["quaternion"])).toRotationMatrix()
+            about_joint = R @ solid @ R.T + m * (c @ c * np.eye(3) - np.outer(c, c))
+            wanted = np.array([[Ixx, Ixy, Ixz], [Ixy, Iyy, Iyz], [Ixz, Iyz, Izz]])
+            np.testing.assert_allclose(about_joint, wanted, atol=1e-9 * np.trace(wanted))
 
 
 def test_parameters_over_time_come_with_their_errors(arm, motion):

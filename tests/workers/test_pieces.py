@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 from helpers.piecework import pieces_in
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from robotid.exceptions import (
     DataError,
@@ -29,7 +29,8 @@ def test_a_task_runs_with_one_thread_and_brings_home_what_was_logged(tmp_path, c
     (piece,) = pieces_in(tmp_path / "marks", 1)
     logger = logging.getLogger("robotid")
     before = logger.level, list(logger.handlers)
-    outcome = run_task(say, piece, logging.INFO)
+    with threadpool_limits(limits=2, user_api="blas"):
+        outcome = run_task(say, piece, logging.INFO)
     assert set(outcome.result) == {1}
     expected = ("robotid.workers", logging.INFO, "random rows 0 by 1 thread")
     assert outcome.messages == (expected,)

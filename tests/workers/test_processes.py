@@ -18,6 +18,7 @@ from robotid.exceptions import (
 )
 from robotid.regressor.factors import available_cores
 from robotid.regressor.reduction import Reduction, join
+from robotid.workers.pieces import reduce_piece
 from robotid.workers.processes import ProcessBackend, choose_workers
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
@@ -79,6 +80,19 @@ def test_two_workers_work_at_the_same_time(tmp_path):
     pieces = pieces_in(tmp_path / "marks", 2, faults={0: "meet", 1: "meet"}.items())
     with ProcessBackend(2) as backend:
         reduce_all(pieces, backend=backend)
+
+
+def test_few_pieces_are_under_way_at_a_time(tmp_path):
+    taken = []
+
+    def pieces():
+        for k, piece in enumerate(pieces_in(tmp_path / "marks")):
+            taken.append(k)
+            yield k, piece
+
+    with ProcessBackend(1) as backend:
+        for done, _ in enumerate(backend.run(reduce_piece, pieces())):
+            assert len(taken) == min(10, done + 2)
 
 
 def test_workers_wait_for_more_work_and_end_when_they_are_let_go(tmp_path):

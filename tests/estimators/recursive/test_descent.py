@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from helpers.estimation import RandomStates
 
-from robotid.estimators import PRX, NormalisedGradient, fold
+from robotid.estimators import PRX, NormalisedGradient
 from robotid.estimators.recursive.descent import column_scale
 from robotid.exceptions import DataError
+from robotid.regressor.problem import Sample
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -78,11 +79,45 @@ def test_prx_says_what_it_lacks_and_refuses_settings(states):
         NormalisedGradient(np.ones(6), step_size=2.0)
 
 
-def test_prx_stays_within_omega(states):
+@pytest.mark.parametrize("average", [False, True])
+def test_prx_stays_within_omega(states, average):
     problem, beta = states.problem, states.beta
-    estimator = PRX(np.ones(6), prior=0 * beta, bounds=1.0, average=False)
-    state = fold(estimator, problem.samples(), estimator.init(58))
+    estimator = PRX(np.ones(6), prior=0 * beta, bounds=1.0, average=average)
+    state = estimator.init(58)
+    for sample in problem.samples():
+        state = estimator.update(state, sample)
+        assert max(np.linalg.norm(state.x), np.linalg.norm(state.mean)) < 1.0 + 1e-12
     assert np.linalg.norm(state.x) == pytest.approx(1.0)
+
+
+def test_only_steps_that_use_the_mass_matrix_ask_for_its_regressor():
+    asks = {
+        (step, metric): PRX(np.ones(2), step=step, metric=metric).needs_mass
+        for step in ("exact", "printed")
+        for metric in ("noise", "rows", "mass")
+    }
+    assert {key for key, needs in asks.items() if not needs} == {
+        ("exact", "noise"),
+        ("exact", "rows"),
+    }
+    assert not NormalisedGradient(np.ones(2)).needs_mass
+
+
+def test_the_gradient_step_is_its_formula(rng):
+    sigma, scale, theta = (
+        np.array([0.5, 2.0]),
+        np.array([1.0, 3.0, 0.2]),
+        np.array([1.0, -1.0, 2.0]),
+    )
+    ours = NormalisedGradient(sigma, theta, scale, step_size=0.7, regularisation=0.3, average=False)
+    Y, tau, weight = rng.standard_normal((2, 3)), rng.standard_normal(2), np.array([4.0, 1.0])
+    state = ours.update(ours.init(3), Sample(Y, tau, weight))
+    root = np.sqrt(weight) / sigma
+    Psi = root[:, None] * Y / scale
+    e = root * (Y @ theta - tau)
+    x = scale * theta - 0.7 / (0.3 + (Psi**2).sum()) * Psi.T @ e
+    np.testing.assert_allclose(state.x, x, rtol=1e-12)
+    np.testing.assert_allclose(ours.estimate(state, ("a", "b", "c")).theta, x / scale, rtol=1e-12)
 
 
 def test_averaging_takes_the_noise_out_of_prx(states, rng):

@@ -1,9 +1,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import scipy.stats
 from helpers.estimation import NOISE, Case
 
 from robotid.estimators import RLS, WLS, Kalman, fold
+from robotid.regressor.problem import Sample
 from robotid.regressor.torque import build_problem, joint_torque_regressor
 
 
@@ -63,3 +66,90 @@ def test_a_walking_filter_follows_a_change_and_a_still_one_does_not(ur5, rng):
     still = miss(Kalman(0.1 * NOISE, prior, std, gate=None))
     assert miss(Kalman(0.1 * NOISE, prior, std, walk=1e-3, gate=None)) < 0.2 * still
     assert miss(RLS(NOISE, 0.99, prior, std)) < 0.05 * still
+
+
+def random_samples(rng, count, sigma, c=3):
+    Y = rng.standard_normal((count, len(sigma), c))
+    tau = Y @ np.arange(1.0, c + 1) + sigma * rng.standard_normal((count, len(sigma)))
+    weight = rng.uniform(0.5, 2.0, tau.shape)
+    return [Sample(*x) for x in zip(Y, tau, weight, strict=True)], Y, tau, weight
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_without_walk_it_is_the_posterior_of_the_prior(rng, share):
+    sigma, prior, std = np.array([0.5, 0.1]), np.array([1.0, 0.0, -1.0]), np.array([0.3, 1.0, 2.0])
+    samples, Y, tau, weight = random_samples(rng, 8, sigma)
+    ours = Kalman(sigma, prior, std, gate=None, independent_share=share)
+    state = fold(ours, samples, ours.init(3))
+    w = (share * weight / sigma**2).reshape(-1)
+    W, d = Y.reshape(-1, 3), tau.reshape(-1)
+    H = np.diag(std**-2.0) + W.T @ (w[:, None] * W)
+    theta = np.linalg.solve(H, prior / std**2 + W.T @ (w * d))
+    np.testing.assert_allclose(state.theta, theta, rtol=1e-10)
+    np.testing.assert_allclose(state.P, np.linalg.inv(H), rtol=1e-9)
+    np.testing.assert_array_equal(state.rows, [8, 8])
+    estimate = ours.estimate(state, ("a", "b", "c"))
+    np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(np.linalg.inv(H))), rtol=1e-9)
+
+
+def test_sigma_is_the_whole_misfit_prior_included_over_all_rows(rng):
+    # each innovation counts with what was known before it, so no row is spent on a parameter
+    sigma, prior, std = np.array([0.5]), np.zeros(3), np.array([0.3, 1.0, 2.0])
+    samples, Y, tau, _ = random_samples(rng, 10, sigma)
+    samples = [replace(sample, weight=np.ones(1)) for sample in samples]
+    ours = Kalman(sigma, prior, std, gate=None)
+    state = fold(ours, samples, ours.init(3))
+    residual = (tau[:, 0] - Y[:, 0] @ state.theta) / sigma
+    misfit = residual @ residual + ((state.theta / std) ** 2).sum()
+    (level,) = ours.estimate(state, ("a", "b", "c")).sigma
+    assert level == pytest.approx(0.5 * np.sqrt(misfit / 10), rel=1e-9)
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_what_is_not_seen_walks_as_far_as_the_walk_says(full):
+    std = np.array([0.3, 1.0, 2.0])
+    before = np.diag(std**2) if full else std
+    ours = Kalman(np.ones(1), np.zeros(3), before, walk=0.1)
+    unseen = Sample(np.zeros((1, 3)), np.zeros(1), np.ones(1))
+    state = fold(ours, [unseen] * 7, ours.init(3))
+    np.testing.assert_allclose(state.P, np.diag(std**2 * (1 + 7 * 0.01)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("gate", [0.5, 0.9, 0.99])
+def test_the_gate_turns_away_as_many_good_rows_as_it_says(rng, gate):
+    known = Kalman(np.array([2.0, 0.5]), np.ones(3), np.full(3, 1e-9), gate=gate)
+    state, count = known.init(3), 5000
+    for Y in rng.standard_normal((count, 2, 3)):
+        tau = Y.sum(axis=1) + known.sigma * rng.standard_normal(2)
+        state = known.update(state, Sample(Y, tau, np.ones(2)))
+    turned_away = state.gated / count
+    # four standard deviations of a binomial share
+    bound = 4 * np.sqrt(gate * (1 - gate) / count)
+    np.testing.assert_allclose(turned_away, 1 - gate, atol=bound)
+    np.testing.assert_array_equal(state.rows + state.gated, count)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.25])
+def test_the_gate_is_chi_squares_bound_on_the_innovation(share):
+    sigma, std, gate = np.array([0.5, 0.2]), np.array([0.3, 1.0]), 0.95
+    ours = Kalman(sigma, np.zeros(2), std, gate=gate, independent_share=share)
+    Y, weight = np.array([[1.0, 2.0], [-1.0, 0.5]]), np.array([1.0, 4.0])
+    variance = ((Y * std) ** 2).sum(axis=1) + sigma**2 / share / weight
+    edge = np.sqrt(scipy.stats.chi2.ppf(gate, 1) * variance)
+    for factor, turned_away in ((0.999, [0, 0]), (1.001, [1, 1])):
+        state = ours.update(ours.init(2), Sample(Y, factor * edge, weight))
+        np.testing.assert_array_equal(state.gated, turned_away)
+    # one joint alone, of either sign
+    state = ours.update(ours.init(2), Sample(Y, edge * [-1.001, -0.999], weight))
+    np.testing.assert_array_equal(state.gated, [1, 0])
+    np.testing.assert_array_equal(state.rows, [0, 1])
+
+
+def test_after_fifty_rows_turned_away_the_next_is_believed():
+    sure = Kalman(np.ones(1), np.zeros(1), np.full(1, 1e-3))
+    far = Sample(np.ones((1, 1)), np.full(1, 100.0), np.ones(1))
+    state = fold(sure, [far] * 50, sure.init(1))
+    assert (state.gated[0], state.rows[0], state.theta[0]) == (50, 0, 0.0)
+    state = sure.update(state, far)
+    assert (state.gated[0], state.rows[0], state.in_a_row[0]) == (50, 1, 0)
+    assert state.theta[0] == pytest.approx(100.0 * 1e-6 / (1 + 1e-6))

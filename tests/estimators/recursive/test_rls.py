@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 from helpers.estimation import NOISE, Case
 
-from robotid.estimators import OLS, RLS, WLS
+from robotid.estimators import OLS, RLS, WLS, fold
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.regressor.problem import Problem, Sample
+
+NAMES = ("a", "b", "c")
 
 
 def test_rls_without_forgetting_is_ols_after_the_last_sample(ur5, rng):
@@ -61,3 +63,78 @@ def test_what_rls_was_not_shown_is_refused_by_name_or_keeps_its_prior():
         RLS(np.ones(2), 0.99)
     with pytest.raises(DataError, match="forgetting is 0"):
         RLS(np.ones(2), 0.0)
+
+
+def random_samples(rng, count, sigma, theta=(1.0, -2.0, 0.5)):
+    """Return samples of two rows, a fifth of which are left out, and all of them stacked."""
+    Y = rng.standard_normal((count, 2, 3))
+    tau = Y @ np.array(theta) + sigma * rng.standard_normal((count, 2))
+    weight = np.where(rng.random((count, 2)) < 0.2, 0.0, rng.uniform(0.5, 2.0, (count, 2)))
+    weight[:, 0] = np.maximum(weight[:, 0], 0.5)  # no sample is left out altogether
+    return [Sample(*x) for x in zip(Y, tau, weight, strict=True)], Y, tau, weight
+
+
+@pytest.mark.parametrize("forgetting", [0.9, 0.98])
+def test_forgetting_weighs_sample_k_of_n_by_its_power(rng, forgetting):
+    sigma = np.array([0.5, 0.1])
+    samples, Y, tau, weight = random_samples(rng, 60, sigma)
+    ours = RLS(sigma, forgetting, np.zeros(3), np.full(3, 1e6))
+    state = fold(ours, samples, ours.init(3))
+    age = forgetting ** np.arange(59.0, -1, -1)
+    w = (age[:, None] * weight / sigma**2).reshape(-1)
+    W, d = Y.reshape(-1, 3), tau.reshape(-1)
+    H = W.T @ (w[:, None] * W)
+    theta = np.linalg.solve(H, W.T @ (w * d))
+    estimate = ours.estimate(state, NAMES)
+    np.testing.assert_allclose(estimate.theta, theta, rtol=1e-9)
+    # the common factor of the noise levels: weighted squares over weighted rows less c
+    rows = (age[:, None] * (weight > 0)).sum()
+    assert state.rows == pytest.approx(rows, rel=1e-12)
+    scale = np.sqrt((w @ (d - W @ theta) ** 2) / (rows - 3))
+    np.testing.assert_allclose(estimate.sigma, scale * sigma, rtol=1e-8)
+    np.testing.assert_allclose(estimate.covariance, scale**2 * np.linalg.inv(H), rtol=1e-8)
+
+
+def test_each_step_renews_what_a_round_forgets_of_one_parameters_prior(rng):
+    sigma, forgetting, prior = np.ones(2), 0.9, np.array([1.0, 2.0, 3.0])
+    std = np.array([0.5, 1.0, 2.0])
+    samples, Y, tau, weight = random_samples(rng, 20, sigma)
+    ours = RLS(sigma, forgetting, prior, std)
+    state = fold(ours, samples, ours.init(3))
+    L, eta = np.diag(std**-2.0), prior / std**2
+    for k in range(20):
+        W = np.sqrt(weight[k])[:, None] * Y[k]
+        renewed = np.zeros(3)
+        renewed[k % 3] = (1 - forgetting**3) / std[k % 3] ** 2
+        L = forgetting * L + W.T @ W + np.diag(renewed)
+        eta = forgetting * eta + W.T @ (np.sqrt(weight[k]) * tau[k]) + renewed * prior
+    np.testing.assert_allclose(state.R[:3, :3].T @ state.R[:3, :3], L, rtol=1e-12)
+    estimate = ours.estimate(state, NAMES)
+    np.testing.assert_allclose(estimate.theta, np.linalg.solve(L, eta), rtol=1e-10)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_without_forgetting_sigma_has_n_minus_c_degrees_of_freedom(rng, share):
+    sigma = np.array([0.5, 0.1])
+    samples, Y, tau, weight = random_samples(rng, 12, sigma)
+    ours = RLS(sigma, independent_share=share)
+    estimate = ours.estimate(fold(ours, samples, ours.init(3)), NAMES)
+    used = weight.reshape(-1) > 0
+    root = (np.sqrt(weight) / sigma).reshape(-1)[used]
+    W, d = root[:, None] * Y.reshape(-1, 3)[used], root * tau.reshape(-1)[used]
+    theta, squares, *_ = np.linalg.lstsq(W, d, rcond=None)
+    variance = squares[0] / (len(d) - 3)
+    np.testing.assert_allclose(estimate.theta, theta, rtol=1e-9)
+    np.testing.assert_allclose(estimate.sigma, np.sqrt(variance) * sigma, rtol=1e-9)
+    expected = variance / share * np.linalg.inv(W.T @ W)
+    np.testing.assert_allclose(estimate.covariance, expected, rtol=1e-8)
+    np.testing.assert_allclose(estimate.std_error, np.sqrt(np.diag(expected)), rtol=1e-8)
+
+
+def test_few_samples_are_refused_with_forgetting_too(rng):
+    _, Y, tau, weight = random_samples(rng, 1, np.ones(2))
+    problem = Problem(
+        lambda: iter([(Y[0], tau[0], weight[0])]), NAMES, 2, np.ones((2, 3), dtype=bool)
+    )
+    with pytest.raises(DataError, match="2 torque rows for 3 parameters"):
+        RLS(np.ones(2), 0.9, np.zeros(3), np.ones(3)).fit(problem)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from robotid.exceptions import DataError, SettingsError
-from robotid.paper import planar_2r
-from robotid.simulation.program import ProgramMotion
+from robotid.simulation.motions import ProgramMotion
 
 
 def test_a_motion_of_seven_joints_has_the_coefficients_of_equation_28():
@@ -31,14 +30,6 @@ def test_many_motions_at_once_are_the_motions_one_by_one(rng):
         alone = ProgramMotion(A[r], T[r]).evaluate(t[r])
         for many, one in zip(together, alone, strict=True):
             np.testing.assert_array_equal(many[r], one)
-
-
-def test_the_planar_arm_has_the_same_program():
-    t, A = np.linspace(-1, 3, 9), np.array([1.0, 1.5])
-    for ours, planar in zip(
-        ProgramMotion(A, 2.0).evaluate(t), planar_2r.program_motion(t, A, 2.0), strict=True
-    ):
-        np.testing.assert_array_equal(ours, planar)
 
 
 ERRORS = {
