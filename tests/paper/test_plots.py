@@ -6,6 +6,7 @@ from robotid.simulation.program import ProgramMotion
 
 from robotid.paper import plots
 from robotid.paper.study import MODELS, PaperSettings, study_model
+from robotid.simulation.motions import ProgramMotion
 
 
 @pytest.fixture(scope="module")
