@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,8 @@ from robotid.estimators.consistent.weighting import choose_weight
 from robotid.exceptions import SettingsError
 from robotid.identification.settings import (
     BoundedSettings,
+    ConsistentSettings,
     ConstraintSettings,
-    DescentSettings,
     EstimatorSettings,
     GradientSettings,
     KalmanSettings,
@@ -68,7 +67,6 @@ class Known:
     stretches: tuple[Factors, ...] = ()
 
 
-@singledispatch
 def make_estimator(
     settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Known
 ) -> BatchEstimator | RecursiveEstimator[Any]:
@@ -86,87 +84,45 @@ def make_estimator(
     Raises:
         SettingsError: If constraints contradict each other or do not fit the robot.
     """
+    share, sigma, beta = prior.share, prior.sigma, mapping.to_base(prior.pi)
+    KS = mapping.K * prior.spread
+    C = KS @ KS.T  # (b, b), of the base parameters before the data
+    match settings:
+        case OLSSettings():
+            return OLS(independent_share=share)
+        case WLSSettings():
+            return WLS(independent_share=share)
+        case TLSSettings():
+            return TLS(settings.regressor_noise, independent_share=share)
+        case LogCholeskySettings():
+            fit = consistent_fit(settings, model, mapping, prior)
+            rng = np.random.default_rng(settings.seed)
+            return LogCholesky(fit, starts=settings.starts, rng=rng)
+        case ConsistentSettings():
+            return consistent_fit(settings, model, mapping, prior)
+        case RLSSettings():
+            # without forgetting nothing of the prior enters: batch least squares
+            std = np.sqrt(np.diag(C)) if settings.forgetting < 1 else None
+            return RLS(sigma, settings.forgetting, beta, std, share)
+        case KalmanSettings():
+            gate = None if settings.gate is False else float(settings.gate)
+            return Kalman(sigma, beta, C, settings.walk, gate, share)
+        case PRXSettings() | GradientSettings():
+            is_shuffled = settings.seed >= 0
+            order = np.random.default_rng(settings.seed) if is_shuffled else None
+            passes, average = settings.passes, settings.average
+            if isinstance(settings, GradientSettings):
+                size = settings.step_size
+                return NormalisedGradient(
+                    sigma, beta, step_size=size, average=average, passes=passes, rng=order
+                )
+            step, metric = settings.step, settings.metric
+            return PRX(
+                sigma, beta, step=step, metric=metric, average=average, passes=passes, rng=order
+            )
     raise SettingsError(f"{settings!r} describes no estimator; take EstimatorSettings(name)")
 
 
-@make_estimator.register
-def _(settings: OLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> OLS:
-    return OLS(independent_share=prior.share)
-
-
-@make_estimator.register
-def _(settings: WLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> WLS:
-    return WLS(independent_share=prior.share)
-
-
-@make_estimator.register
-def _(settings: TLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> TLS:
-    return TLS(settings.regressor_noise, independent_share=prior.share)
-
-
-@make_estimator.register
-def _(
-    settings: LogCholeskySettings, model: RobotModel, mapping: BaseMapping, prior: Known
-) -> LogCholesky:
-    fit = consistent_fit(settings, model, mapping, prior)
-    rng = np.random.default_rng(settings.seed)
-    return LogCholesky(fit, starts=settings.starts, rng=rng)
-
-
-@make_estimator.register
-def _(settings: RLSSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> RLS:
-    # without forgetting nothing of the prior enters: batch least squares
-    std = np.sqrt(np.diag(_base_covariance(mapping, prior))) if settings.forgetting < 1 else None
-    beta = mapping.to_base(prior.pi)
-    return RLS(prior.sigma, settings.forgetting, beta, std, prior.share)
-
-
-@make_estimator.register
-def _(settings: KalmanSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> Kalman:
-    gate = None if settings.gate is False else float(settings.gate)
-    beta, C = mapping.to_base(prior.pi), _base_covariance(mapping, prior)
-    return Kalman(prior.sigma, beta, C, settings.walk, gate, prior.share)
-
-
-@make_estimator.register
-def _(settings: PRXSettings, model: RobotModel, mapping: BaseMapping, prior: Known) -> PRX:
-    return PRX(
-        prior.sigma,
-        mapping.to_base(prior.pi),
-        step=settings.step,
-        metric=settings.metric,
-        average=settings.average,
-        passes=settings.passes,
-        rng=_order(settings),
-    )
-
-
-@make_estimator.register
-def _(
-    settings: GradientSettings, model: RobotModel, mapping: BaseMapping, prior: Known
-) -> NormalisedGradient:
-    return NormalisedGradient(
-        prior.sigma,
-        mapping.to_base(prior.pi),
-        step_size=settings.step_size,
-        average=settings.average,
-        passes=settings.passes,
-        rng=_order(settings),
-    )
-
-
-def _order(settings: DescentSettings) -> np.random.Generator | None:
-    return np.random.default_rng(settings.seed) if settings.seed >= 0 else None
-
-
-def _base_covariance(mapping: BaseMapping, prior: Known) -> Array:
-    """Return the covariance of the base parameters before the data, shape (b, b)."""
-    KS = mapping.K * prior.spread
-    covariance: Array = KS @ KS.T
-    return covariance
-
-
-@make_estimator.register
 def consistent_fit(
     settings: BoundedSettings, model: RobotModel, mapping: BaseMapping, prior: Known
 ) -> Consistent:

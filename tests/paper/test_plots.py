@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from robotid.simulation.program import ProgramMotion
 
 from robotid.paper import plots
 from robotid.paper.study import MODELS, PaperSettings, study_model
