@@ -117,13 +117,16 @@ def test_tables_of_benchmarks_are_as_these_wrote_them(page):
         name, shown = found["name"], found["body"]
         again = f"write it anew: python benchmarks/write_tables.py {name}"
         assert PAGES[name] == page.name
+        if not shown and found["digest"] == "-":  # a place that no run has filled yet
+            continue
         assert digest(shown) == found["digest"], f"bench_{name} wrote other figures; {again}"
         assert re.search(r"robotid \d.*\n", shown), f"no version under bench_{name}; {again}"
         assert re.search(MACHINE, shown), f"no machine under bench_{name}; {again}"
 
 
 def test_every_page_of_measurements_has_its_table():
-    written = {found["name"] for page in pages() for found in BLOCK.finditer(page.read_text())}
+    blocks = [found for page in pages() for found in BLOCK.finditer(page.read_text())]
+    written = {found["name"] for found in blocks if found["body"]}
     assert {"validation", "end_to_end", "regressor", "startup"} <= written
 
 

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import evaluate_logs, pool, predict, shares_rows
@@ -81,3 +82,15 @@ def test_a_recording_is_named_by_its_file_and_stretch(ur5, rng):
     pi = truth(ur5)
     found = evaluated(ur5, exact_log(ur5, pi, rng), {"x": pi}, pi)
     assert found.recording.name == "log 0-11.98 s"
+
+
+@pytest.mark.parametrize(
+    ("rows", "same", "shared"), [(200, 4, False), (200, 5, True), (10, 1, False), (10, 2, True)]
+)
+def test_more_than_two_percent_and_more_than_one_row_make_a_shared_log(rng, rows, same, shared):
+    def log(q):
+        return Log(t=np.arange(rows) / 100.0, q=q, v=None, tau=q + 1.0, joints=("a", "b"))
+
+    q, other = rng.standard_normal((2, rows, 2))
+    other[:same] = q[:same]
+    assert shares_rows(log(q), log(other)) is shared

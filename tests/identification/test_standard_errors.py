@@ -9,7 +9,12 @@ from helpers.synthetic import exact_log, truth
 from robotid.estimators import OLS, WLS
 from robotid.exceptions import DataError
 from robotid.identification.pipeline import identify
-from robotid.identification.standard_errors import measured_errors, quantile, scatter
+from robotid.identification.standard_errors import (
+    measured_errors,
+    quantile,
+    scatter,
+    with_wls_errors,
+)
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress, merge
 from robotid.regressor.problem import Problem
@@ -157,4 +162,46 @@ def test_few_stretches_keep_the_band_of_the_filter(W):
 def test_quantiles_are_students():
     np.testing.assert_allclose(
         quantile(np.array([5.0, 30.0, np.inf])), scipy.stats.t.ppf(0.975, [5.0, 30.0, 1e12]), 1e-9
+    )
+
+
+def test_a_filter_that_forgets_keeps_its_own_covariance_grown_by_the_inflation(W):
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(4), 0.9))
+    whole = merge(parts)
+    share = 0.25  # the covariance of the fit takes a quarter of the rows to be independent
+    own = WLS(independent_share=share).fit(whole)
+    found, errors = measured_errors(own, parts, whole, share, np.eye(4), own.sigma, is_filter=True)
+    _, plain = measured_errors(own, parts, whole, share, np.eye(4), own.sigma)
+    assert errors.inflation == pytest.approx(plain.inflation, rel=1e-6)
+    assert errors.inflation > 5
+    np.testing.assert_allclose(found.covariance, own.covariance * share * errors.inflation)
+
+
+def test_a_gradient_method_ends_beside_the_minimum_and_says_so(W):
+    parts = stretches(W, W @ TRUTH + noise(np.random.default_rng(5), 0.0))
+    wls = WLS().fit(merge(parts))
+    away = np.array([0.1, 0.0, -0.2, 0.3])
+    rough = replace(wls, theta=wls.theta + away, covariance=np.zeros((4, 4)))
+    found = with_wls_errors(rough, wls)
+    np.testing.assert_allclose(found.covariance, wls.covariance + np.outer(away, away))
+    np.testing.assert_array_equal(found.theta, rough.theta)
+    assert "plus the distance to it" in found.message
+
+
+def test_the_prior_makes_the_sandwich_of_its_formula(W):
+    # B (K^T M K + L) B with B = (K^T H K + L)^-1, computed from the rows themselves
+    rng, share = np.random.default_rng(6), 0.25
+    tau = W @ TRUTH + noise(rng, 0.0)
+    parts = stretches(W, tau)
+    whole, K = merge(parts), np.hstack([np.eye(4), rng.standard_normal((4, 2))])
+    wls = WLS().fit(whole)
+    L = np.diag(np.arange(1.0, 7.0))
+    rows = W.reshape(-1, 4) / np.tile(wls.sigma, N)[:, None]
+    B = np.linalg.inv(share * K.T @ rows.T @ rows @ K + L)
+    theta = np.linalg.lstsq(K, wls.theta, rcond=None)[0]
+    estimate = replace(wls, theta=theta, covariance=B, names=tuple("abcdef"))
+    found, _ = measured_errors(estimate, parts, whole, share, K, wls.sigma)
+    meat = scatter(parts, K @ theta, wls.sigma, share * K @ B @ K.T).meat
+    np.testing.assert_allclose(
+        found.covariance, B @ (share**2 * K.T @ meat @ K + L) @ B, rtol=1e-6, atol=1e-12
     )
