@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -104,5 +105,12 @@ def file_sha256(path: str | Path) -> str:
         files = sorted(file for file in source.iterdir() if file.is_file())
         listing = "".join(f"{file_sha256(file)}  {file.name}\n" for file in files)  # as sha256sum
         return hashlib.sha256(listing.encode()).hexdigest()
-    with source.open("rb") as stream:
+    about = source.stat()
+    return _sha256(source.resolve(), about.st_size, about.st_mtime_ns, about.st_ino)
+
+
+@lru_cache(maxsize=1024)
+def _sha256(path: Path, *_state: int) -> str:
+    """Return the SHA-256 of a file, which is read once as long as its state is the same."""
+    with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -78,7 +78,8 @@ class Estimate:
     @property
     def std_error(self) -> Array:
         """Standard error of each parameter, shape (c,); inf where the data say nothing."""
-        errors: Array = np.sqrt(np.diag(self.covariance))
+        # exact data leave a variance of rounding size, of either sign
+        errors: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return errors
 
     @property

@@ -46,7 +46,7 @@ def information(found: Identification) -> Information:
     error = np.diag(found.wls.covariance)
     known = np.isfinite(error) & (error > 0)
     bread = solve_factor(found.factors, found.wls.sigma, found.wls.theta).covariance
-    std = np.where(known, np.sqrt(np.diag(bread)), np.nan)
+    std = np.sqrt(np.where(known, np.diag(bread), np.nan))
     return Information(
         singular_values=singular_values[: len(norms)],
         correlation=bread / np.outer(std, std),

@@ -222,9 +222,9 @@ def _friction_step(model: RobotModel, standard: Array) -> Array:
     """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
     layout, still, step = model.layout, np.zeros(1), np.zeros(model.n_rows)
     forth, back = (DriveMotion(still, still, sign * np.ones(1)) for sign in (1.0, -1.0))
-    for term, values in layout.by_drive(standard):
-        change = np.abs((term.column(forth) - term.column(back)) * values)  # (d,)
-        step[model.n_rows - len(model.joints) :] += np.abs(layout.drive_ratios.T) @ change
+    change = [(x.column(forth) - x.column(back)).item() for _, x in layout.drive_parameters]
+    theta = standard[layout.n_inertial :]
+    step[model.n_rows - len(model.joints) :] = np.abs(layout.drive_loads * theta) @ np.abs(change)
     return step
 
 

@@ -59,18 +59,15 @@ class _CsvRows(RowReader):
     separator: str
 
     def count(self) -> int:
-        """Return the number of lines behind the first."""
         with self.path.open("rb") as file:
             blocks = iter(partial(file.read, 2**20), b"")
             return sum(block.count(b"\n") for block in blocks) - 1
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column; see ``RowReader.scan``."""
         for lines, place, rows in self._blocks(Place(), None):
             yield self._parse(lines, [name], place, 0, rows)[name], place
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows; see ``RowReader.read``."""
         parts = []
         for lines, place, rows in self._blocks(near, stop):
             start, end = max(first - place.row, 0), min(stop - place.row, rows)

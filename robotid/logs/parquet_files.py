@@ -80,12 +80,10 @@ class _ParquetRows(RowReader):
     path: Path
 
     def count(self) -> int:
-        """Return the number of rows."""
         with _open(self.path) as file:
             return int(file.metadata.num_rows)
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        """Yield one column; see ``RowReader.scan``."""
         row = 0
         with _open(self.path, _BUFFER) as file:
             _check_types(file, [name], self.path.name)
@@ -95,7 +93,6 @@ class _ParquetRows(RowReader):
                     row += batch.num_rows
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows; see ``RowReader.read``."""
         values = {name: np.empty(stop - first) for name in wanted}
         with _open(self.path, _BUFFER) as file:
             _check_types(file, wanted, self.path.name)

@@ -7,61 +7,17 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.robot.drives import TERMS, DriveMotion, DriveTerm
+from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.parameters import ParameterLayout
 
 __all__ = [
-    "DriveColumn",
     "RowPlan",
-    "drive_columns",
+    "drive_values",
     "friction_directions",
     "friction_speeds",
     "plan_rows",
     "sure_rows",
 ]
-
-
-@dataclass(frozen=True)
-class DriveColumn:
-    """One drive parameter: row r of the regressor holds ratio_r f(w), w = sum_r ratio_r v_r.
-
-    Attributes:
-        term: Which f.
-        ratios: Ratio by row [-]; a drive of one joint has a single row and ratio 1.
-        number: Which of the directions the drive follows; None if f follows none.
-    """
-
-    term: DriveTerm
-    ratios: dict[int, float]
-    number: int | None = None
-
-    def values(self, v: Array, a: Array, direction: Array) -> Array:
-        """Return f(w) at each instant.
-
-        Args:
-            v: Velocities, shape (N, n_rows) [rad/s, m/s].
-            a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-            direction: Signs of the speeds, shape (N, c), as of ``friction_directions``.
-
-        Returns:
-            Values, shape (N,).
-        """
-        w = self.speed(v)
-        signs = w if self.number is None else direction[:, self.number]
-        return self.term.column(DriveMotion(w, self.speed(a), signs))
-
-    def speed(self, v: Array) -> Array:
-        """Return w = sum_r ratio_r v_r, shape (N,).
-
-        Args:
-            v: Velocities or accelerations, shape (N, n_rows).
-        """
-        rows = list(self.ratios)
-        if len(rows) == 1 and self.ratios[rows[0]] == 1.0:
-            own: Array = v[:, rows[0]]
-            return own
-        w: Array = v[:, rows] @ np.array(list(self.ratios.values()))
-        return w
 
 
 @dataclass(frozen=True)
@@ -71,35 +27,38 @@ class RowPlan:
     Attributes:
         inertial: Per row the inertial columns wanted, n arrays of shape (c_j,).
         places: Per row their places in the block, likewise.
-        drives: Per row pairs of place and drive column.
+        drives: Per row the place of each drive column, which drive parameter it is, and its ratio.
         torques: Per row the place of the torque, its last one.
         first: Place at which each row begins, and the end, shape (n + 1,), int.
     """
 
     inertial: tuple[Array, ...]
     places: tuple[Array, ...]
-    drives: tuple[tuple[tuple[int, DriveColumn], ...], ...]
+    drives: tuple[tuple[tuple[int, int, float], ...], ...]
     torques: tuple[int, ...]
     first: Array
 
 
-def drive_columns(layout: ParameterLayout, n_rows: int) -> tuple[DriveColumn, ...]:
-    """Return the drive columns of a robot.
+def drive_values(layout: ParameterLayout, v: Array, a: Array, direction: Array) -> Array:
+    """Return what each drive parameter multiplies: a function of the speed w of its drive.
 
     Args:
-        layout: Its standard parameters.
-        n_rows: Rows of its regressor per sample; those of the joints come last.
+        layout: The standard parameters.
+        v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+        direction: As of ``friction_directions``, shape (N, c).
 
     Returns:
-        One per name in ``layout.drive_names``, in that order.
+        Values, shape (k, N); row j of the regressor holds them times ``layout.drive_loads[j]``.
     """
-    first = n_rows - len(layout.joints)
-    rows = {joint: first + j for j, joint in enumerate(layout.joints)}
-    ratios = [{rows[joint]: ratio for joint, ratio in drive.ratios} for drive in layout.drives]
-    return tuple(
-        DriveColumn(term, ratios[d], d if term.follows_direction else None)
-        for d, term in layout.drive_parameters
-    )
+    R = layout.drive_ratios
+    first = v.shape[1] - R.shape[1]
+    w, dw = R @ v[:, first:].T, R @ a[:, first:].T  # (d, N)
+    signs = direction.T if direction.shape[1] else w
+    values = np.empty((len(layout.drive_parameters), len(v)))
+    for x, (d, term) in zip(values, layout.drive_parameters, strict=True):
+        x[:] = term.column(DriveMotion(w[d], dw[d], signs[d]))
+    return values
 
 
 def friction_speeds(layout: ParameterLayout) -> Array:
@@ -172,16 +131,20 @@ def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
     Returns:
         The plan: each row's columns in that order, then its torque.
     """
-    drives = drive_columns(layout, len(columns))
-    size = layout.n_inertial
+    loads, size = layout.drive_loads, layout.n_inertial
+    base = len(columns) - len(loads)  # rows of a floating base, which no drive loads
     first = np.concatenate([[0], np.cumsum([len(row) + 1 for row in columns])])
     inertial = [np.flatnonzero(row < size) for row in columns]
     return RowPlan(
         inertial=tuple(row[k] for row, k in zip(columns, inertial, strict=True)),
         places=tuple(start + k for start, k in zip(first[:-1], inertial, strict=True)),
         drives=tuple(
-            tuple((int(start) + k, drives[g - size]) for k, g in enumerate(row) if g >= size)
-            for start, row in zip(first[:-1], columns, strict=True)
+            tuple(
+                (int(first[j]) + k, int(g) - size, float(loads[j - base, g - size]))
+                for k, g in enumerate(row)
+                if g >= size
+            )
+            for j, row in enumerate(columns)
         ),
         torques=tuple(int(end) - 1 for end in first[1:]),
         first=first,

@@ -15,9 +15,9 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.regressor.columns import RowPlan, drive_values
 
 if TYPE_CHECKING:
-    from robotid.regressor.columns import RowPlan
     from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -78,7 +78,7 @@ def why_not(model: "RobotModel") -> str | None:
 class CompiledWriter:
     """Writes one block of rows after the other into the same memory: one thread, one writer."""
 
-    def __init__(self, model: "RobotModel", tree: "Tree", plan: "RowPlan", out: Array) -> None:
+    def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
         """Prepare the work space.
 
         Args:
@@ -91,10 +91,10 @@ class CompiledWriter:
         bodies, depth = tree.rows.shape
         self._model, self._tree, self._out = model, tree, out
         self._places = _places(tree, plan)
-        self._drives = [
-            (j, place, drive) for j, row in enumerate(plan.drives) for place, drive in row
-        ]
-        self._ends = np.array([*(place for _, place, _ in self._drives), *plan.torques])
+        drives = [drive for row in plan.drives for drive in row]
+        self._drives = [k for _, k, _ in drives]
+        self._ratios = np.array([[ratio] for _, _, ratio in drives]).reshape(-1, 1)
+        self._ends = np.array([*(place for place, _, _ in drives), *plan.torques])
         self._widths = np.diff(plan.first)
         self._root = np.zeros(out.shape[1])
         self._work = np.zeros(lanes.state_size(bodies, depth))
@@ -120,10 +120,8 @@ class CompiledWriter:
             q = q[:, 1:]  # the pose has one entry more than the twist
         # copies that Numba finds writable and in C order: another kind would be compiled again
         self._q, self._v, self._a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
-        self._values = np.empty((len(self._ends), len(v)))
-        for values, (j, _, drive) in zip(self._values, self._drives, strict=False):
-            np.multiply(drive.ratios[j], drive.values(v, a, direction), out=values)
-        self._values[len(self._drives) :] = tau.T
+        values = drive_values(self._model.layout, v, a, direction)
+        self._values = np.vstack([self._ratios * values[self._drives], tau.T])
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:
@@ -198,7 +196,7 @@ def flatten(model: "RobotModel") -> Tree:
     return Tree(parents, depths, slots, leaders, joints, table)
 
 
-def _places(tree: Tree, plan: "RowPlan") -> Array:
+def _places(tree: Tree, plan: RowPlan) -> Array:
     """Return where each body's columns in each of its rows go, shape (B, D, 10); -1: nowhere."""
     table = np.full((*tree.rows.shape, 10), -1)
     for j, (wanted, place) in enumerate(zip(plan.inertial, plan.places, strict=True)):

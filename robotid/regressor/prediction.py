@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import drive_columns, friction_directions
+from robotid.regressor.columns import drive_values, friction_directions
 from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.rows import COMPILED, TrajectoryRows, trajectory_rows
 from robotid.robot.model import RobotModel
@@ -87,11 +87,8 @@ def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> A
         torque_k[:] = rnea(pin_model, data, *motion_k)
     if not is_plain:
         torque = torque @ G  # tau = G^T tau_pinocchio
-    signs = friction_directions(model.layout, v, trajectory.direction)
-    drives = drive_columns(model.layout, model.n_rows)
-    for value, drive in zip(pi[model.layout.n_inertial :], drives, strict=True):
-        if value != 0.0:
-            values = value * drive.values(v, a, signs)
-            for row, ratio in drive.ratios.items():
-                torque[:, row] += ratio * values
+    layout, theta = model.layout, pi[model.layout.n_inertial :]
+    if theta.any():
+        values = drive_values(layout, v, a, friction_directions(layout, v, trajectory.direction))
+        torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
     return torque

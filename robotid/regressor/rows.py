@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import RowPlan, friction_directions, plan_rows
+from robotid.regressor.columns import RowPlan, drive_values, friction_directions, plan_rows
 from robotid.regressor.compiled import (
     LONG_ENOUGH,
     CompiledWriter,
@@ -214,10 +214,9 @@ class _PinocchioWriter:
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
         out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]
-        direction = self._direction[part]
-        for j, drives in enumerate(self._plan.drives):
-            for place, drive in drives:
-                np.multiply(drive.ratios[j], drive.values(v, a, direction), out=out[place])
+        values = drive_values(self._model.layout, v, a, self._direction[part])
+        for place, k, ratio in chain.from_iterable(self._plan.drives):
+            np.multiply(ratio, values[k], out=out[place])
         out[list(self._plan.torques)] = self._tau[part].T
         if self._weights is not None:
             for root, (i, j) in zip(

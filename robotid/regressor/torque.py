@@ -11,7 +11,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import drive_columns, friction_directions
+from robotid.regressor.columns import drive_values, friction_directions
 from robotid.regressor.problem import Block, Problem
 from robotid.regressor.rows import BLOCK, trajectory_rows
 from robotid.robot.drives import TERMS, DriveMotion
@@ -249,12 +249,10 @@ def _write_drives(
     model: RobotModel, v: Array, a: Array, direction: Array | None, out: Array
 ) -> None:
     """Write the columns of the drive parameters, shape (N, n_rows, drive)."""
-    out[:] = 0.0
-    signs = friction_directions(model.layout, v, direction)
-    for k, drive in enumerate(drive_columns(model.layout, model.n_rows)):
-        values = drive.values(v, a, signs)
-        for row, ratio in drive.ratios.items():
-            out[:, row, k] = ratio * values
+    layout, first = model.layout, model.n_rows - len(model.joints)
+    values = drive_values(layout, v, a, friction_directions(layout, v, direction))
+    out[:, :first] = 0.0
+    np.multiply(layout.drive_loads, values.T[:, None], out=out[:, first:])
 
 
 def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array) -> None:

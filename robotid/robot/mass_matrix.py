@@ -122,9 +122,8 @@ def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
     Returns:
         Matrix, shape (n, n) [kg m^2, or kg].
     """
-    R = layout.drive_ratios  # (d, n)
-    Ia = sum((x for term, x in layout.by_drive(pi) if term.is_inertia), np.zeros(len(R)))
-    added: Array = R.T @ (Ia[:, None] * R)
+    Ia = pi[layout.n_inertial :] * [term.is_inertia for _, term in layout.drive_parameters]
+    added: Array = (layout.drive_loads * Ia) @ layout.drive_loads.T
     return added
 
 

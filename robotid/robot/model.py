@@ -228,10 +228,7 @@ class RobotModel:
                 carried[joint.idx_v : joint.idx_v + joint.nv, 10 * (body - 1) : 10 * body] = True
         inertial = (np.abs(self.velocity_map.T) > 0).astype(float) @ carried > 0
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
-        first = self.n_rows - len(self.joints)
-        for k, (d, _) in enumerate(self.layout.drive_parameters):
-            for joint_name, _ratio in self.layout.drives[d].ratios:
-                drive[first + self.joints.index(joint_name), k] = True
+        drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
         return np.hstack([inertial, drive])
 
 

@@ -116,6 +116,12 @@ class ParameterLayout:
         )
 
     @cached_property
+    def drive_loads(self) -> Array:
+        """Ratio of each row of a joint to what a drive parameter multiplies, shape (n, k) [-]."""
+        loads: Array = self.drive_ratios[[d for d, _ in self.drive_parameters]].T
+        return loads
+
+    @cached_property
     def inertial_names(self) -> tuple[str, ...]:
         """Names of the inertial parameters, as ``"forearm.mcx"``."""
         return tuple(f"{body}.{term}" for body in self.bodies for term in INERTIAL_TERMS)
@@ -136,20 +142,6 @@ class ParameterLayout:
         inertial = ["kg", *["kg m"] * 3, *["kg m^2"] * 6] * len(self.bodies)
         drive = [term.units[self._slides(d)] for d, term in self.drive_parameters]
         return tuple(inertial + drive)
-
-    def by_drive(self, pi: Array) -> list[tuple[DriveTerm, Array]]:
-        """Return the drive parameters term by term.
-
-        Args:
-            pi: Standard parameters, shape (p,).
-
-        Returns:
-            Each term with its values in the d drives, shape (d,); 0 where a drive lacks it.
-        """
-        values = {name: np.zeros(len(self.drives)) for name in self.terms}
-        for (d, term), value in zip(self.drive_parameters, pi[self.n_inertial :], strict=True):
-            values[term.name][d] = value
-        return [(TERMS[name], of_drives) for name, of_drives in values.items()]
 
     def owned_by(self, owners: Sequence[str]) -> Array:
         """Return which parameters belong to some bodies or joints.

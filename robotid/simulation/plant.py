@@ -5,7 +5,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
@@ -41,7 +41,11 @@ class RobotPlant:
         self.model = model
         self._bodies = model.with_parameters(pi)
         self._data = self._bodies.pin_model.createData()
-        self._drives = model.layout.by_drive(pi)
+        names = np.array([term.name for _, term in model.layout.drive_parameters])
+        theta = pi[model.layout.n_inertial :]
+        self._drives = [
+            (TERMS[name], np.where(names == name, theta, 0.0)) for name in model.layout.terms
+        ]
         self._armature = drive_inertia(model.layout, pi)
 
     def mass_matrix(self, q: Array) -> Array:
@@ -67,12 +71,12 @@ class RobotPlant:
         Returns:
             Torque, shape (n,) [N m or N].
         """
-        G, R = self.model.velocity_map, self.model.layout.drive_ratios
+        G, L = self.model.velocity_map, self.model.layout.drive_loads
         pin_model, x = self._bodies.pin_model, self.model.configurations(q[None])[0]
-        w = R @ v  # (d,)
+        w = L.T @ v  # (k,)
         motion = DriveMotion(w, np.zeros_like(w), np.tanh(w / _SIGN_SPEED))
         drives = sum((theta * term.column(motion) for term, theta in self._drives), 0.0 * w)
-        bias: Array = G.T @ pin.nonLinearEffects(pin_model, self._data, x, G @ v) + R.T @ drives
+        bias: Array = G.T @ pin.nonLinearEffects(pin_model, self._data, x, G @ v) + L @ drives
         return bias
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:

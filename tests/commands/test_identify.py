@@ -1,5 +1,6 @@
 """From job to result where the URDF or the logs are at fault: what is said of them."""
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
+from robotid._files import file_sha256
 from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
@@ -46,6 +48,30 @@ def test_an_earlier_urdf_does_not_stay_beside_a_result_that_has_none(ur5, rng, t
     assert set(result["outputs"]) == {"report"}
     assert not any(path.exists() for path in written)
     assert "is of an earlier run and was removed" in caplog.text
+
+
+def test_each_log_is_hashed_once_and_opened_once(ur5, rng, tmp_path, monkeypatch):
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=1.0)
+    for name in ("run.csv", "keep.csv"):
+        write_log(log, tmp_path / name)
+    entries = [LogEntry(tmp_path / "keep.csv", end=end) for end in (4.0, 8.0)]
+    job = Job(
+        Path(ur5.tree.path),
+        estimator=EstimatorSettings("wls"),
+        identification=(LogEntry(tmp_path / "run.csv"),),
+        validation=tuple(entries),
+    )
+    hashed, opened = [], []
+    digest, lay_out = hashlib.file_digest, Job.lay_out
+    monkeypatch.setattr(hashlib, "file_digest", lambda f, a: hashed.append(f.name) or digest(f, a))
+    monkeypatch.setattr(Job, "lay_out", lambda j, e, m: opened.append(e.path) or lay_out(j, e, m))
+    run_job(job, tmp_path / "out")
+    logs = [str(tmp_path / name) for name in ("keep.csv", "run.csv")]
+    assert sorted(str(name) for name in hashed if str(name).endswith(".csv")) == logs
+    assert sorted(map(str, opened)) == logs
+    before = file_sha256(logs[0])
+    (tmp_path / "keep.csv").write_text("other")
+    assert file_sha256(logs[0]) != before
 
 
 def test_a_file_in_place_of_the_folder_is_refused_before_the_fit(ur5, tmp_path):

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from robotid.commands.job import LogEntry, read_job
-from robotid.doctor.channels import check_clipping, check_spikes
+from robotid.doctor.channels import (
+    check_clipping,
+    check_noise,
+    check_spikes,
+    check_velocity_scale,
+)
 from robotid.logs.data import Log
 
 RATE, N = 500.0, 20000  # [Hz], rows of 40 s
@@ -71,3 +76,22 @@ def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
     (found,) = check_clipping(log_of_two(tau=np.full(N, value)))
     assert (found.code, found.where) == ("constant_torque", "run.csv: b")
     assert f"the torque of b is {abs(value):g} in every row" in found.message
+
+
+@pytest.mark.parametrize("factor", [0.5, 9.5493])
+def test_a_velocity_in_another_unit_is_told_with_its_factor(factor):
+    log = log_of_two()
+    scaled = replace(log, v=log.v * [1.0, factor])
+    (found,) = check_velocity_scale(scaled, "auto")
+    assert (found.code, found.severity, found.where) == ("velocity_scale", "error", "run.csv: b")
+    assert found.evidence["factor"] == pytest.approx(factor, rel=1e-3)
+    (unused,) = check_velocity_scale(scaled, "differentiated")
+    assert unused.severity == "note"
+    assert list(check_velocity_scale(log, "auto")) == []
+
+
+def test_the_noise_of_a_channel_is_its_standard_deviation():
+    levels = {f.where: f.evidence for f in check_noise(log_of_two()) if f.code == "noise"}
+    assert levels["run.csv: tau"]["a"] == pytest.approx(0.05, rel=0.05)
+    assert levels["run.csv: tau"]["b"] == pytest.approx(0.05, rel=0.05)
+    assert levels["run.csv: q"]["a"] < 1e-6

@@ -9,7 +9,8 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
-from robotid.logs.read import write_log
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.read import read_log, write_log
 from robotid.logs.units import LogUnits
 from robotid.robot.examples import example_urdf
 
@@ -62,6 +63,22 @@ def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):
 
 def test_a_joint_that_stands_where_it_is_said_to_is_not_named(job):
     assert found(job(0.7)) == []
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_held_joints_are_checked_in_logs_read_in_pieces_too(job, tmp_path, suffix, monkeypatch):
+    monkeypatch.setattr("robotid.identification.survey._WINDOW", 300)
+    short = job(0.5)
+    path = tmp_path / f"run.{suffix}"
+    write_log(read_log(tmp_path / "run.csv", (*short.model().joints, HELD)), path)
+    short = replace(short, identification=(LogEntry(path),))
+    long = replace(short, rows_in_memory=512)
+    (one,), (other,) = found(short), found(long)
+    assert (other.message, other.evidence["median"]) == (one.message, one.evidence["median"])
+    assert any(f.code == "log_note" and "looked at rows 0-300" in f.message for f in examine(long))
+    identification, _ = run_job(replace(long, estimator=EstimatorSettings("wls")), tmp_path / "out")
+    assert identification.verdict.reasons[0] == one.message
+    assert identification.alarms[0] == one.message
 
 
 def test_degrees_of_the_log_are_degrees_here(job):

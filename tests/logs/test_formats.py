@@ -23,6 +23,7 @@ from mcap.writer import Writer as McapLibraryWriter
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
+from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import read_log, write_log
 from robotid.logs.table import LogSource
 
@@ -500,3 +501,24 @@ def test_reading_a_csv_file_loads_no_other_library(tmp_path):
         "sys.exit(any(m.split('.')[0] in ('rosbags', 'h5py', 'pyarrow') for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_rows_are_read_from_any_place_that_a_scan_tells(tmp_path, suffix):
+    rows = np.arange(20_000.0)
+    path = tmp_path / f"run{suffix}"
+    write_columns({"time": rows / 8, "q": -rows}, path)
+    table = open_table(path, LogSource())
+    places, blocks = [], []
+    for block, place in table.rows.scan("q"):
+        blocks.append(block)
+        places.append(place)
+    assert len(places) > 1
+    assert [place.row for place in places] == np.cumsum([0, *map(len, blocks[:-1])]).tolist()
+    np.testing.assert_array_equal(np.concatenate(blocks), -rows)
+    assert table.rows.count() == 20_000
+    for place in places:
+        first, stop = place.row + 3, min(place.row + 5000, 20_000)
+        found = table.rows.read(["q", "time"], first, stop, place)
+        np.testing.assert_array_equal(found["q"], -rows[first:stop])
+        np.testing.assert_array_equal(found["time"], rows[first:stop] / 8)

@@ -125,6 +125,34 @@ def test_what_was_automatic_is_stated():
     assert resolved.max_gap == pytest.approx(0.025)
 
 
+@pytest.mark.parametrize("rate", [None, 200.0])
+def test_what_is_stated_to_be_late_is_moved_back(rate):
+    t = np.arange(0, 5, 0.01)
+    w = np.pi
+    late = sine_log(t, lag=0.03)  # of the velocity
+    tau = np.column_stack([np.cos(w * (t - 0.05)), np.sin(w * (t - 0.05))])
+    settings = SignalSettings(
+        cutoff=None, rate=rate, velocity="measured", torque_delay=0.05, velocity_delay=0.03
+    )
+    out = process(Log(t=t, q=late.q, v=late.v, tau=tau, joints=late.joints), settings)
+    np.testing.assert_allclose(out.tau[:, 0], np.cos(w * out.t), atol=1e-6)
+    np.testing.assert_allclose(out.v[:, 0], w * np.cos(w * out.t), atol=1e-6)
+    np.testing.assert_allclose(out.q[:, 0], np.sin(w * out.t), atol=1e-6)
+
+
+@pytest.mark.parametrize(("pause", "stretches"), [(0.024, 1), (0.026, 2), (1.0, 2)])
+def test_a_step_longer_than_two_and_a_half_others_is_a_gap(pause, stretches):
+    t = np.arange(400) * 0.01
+    t[200:] += pause - 0.01
+    out = process(sine_log(t), SignalSettings(cutoff=None, rate=100.0))
+    assert len(np.unique(out.segment)) == stretches
+    # 0.2 s are cut off at each end of each stretch
+    assert out.t[0] == pytest.approx(0.2)
+    assert out.t[-1] == pytest.approx(t[-1] - 0.2, abs=0.02)
+    inside = (out.t > t[199] - 0.195) & (out.t < t[200] + 0.195)
+    assert inside.any() == (stretches == 1)
+
+
 def test_full_turns_are_taken_out_of_free_joints_only():
     t = np.arange(0, 5, 0.01)
     angle = np.column_stack([2 * t, 0.1 * t])

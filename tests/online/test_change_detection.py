@@ -19,6 +19,17 @@ def test_noise_alone_is_no_change_and_a_shift_is_flagged_where_it_began(rng):
     np.testing.assert_array_equal(detector.evidence, 0.0)
 
 
+def test_a_change_began_when_its_evidence_last_left_zero():
+    detector = ChangeDetector(2, 40.0, 4.0)
+    squares = [16.0, 0.5, 0.5, 0.5, 0.5, 16.0, 16.0, 16.0, 16.0]  # 12 more, or 3.5 less, each
+    found = [detector.push(0.1 * k, np.array([1.0, s]), 1.0) for k, s in enumerate(squares)]
+    assert found[:-1] == [None] * 8
+    assert found[-1] == pytest.approx(0.5)
+    # half a sample is half the evidence
+    found = [detector.push(0.1 * k, np.array([1.0, 16.0]), 0.5) for k in range(7)]
+    assert found == [None] * 6 + [0.0]
+
+
 def test_a_single_outlier_is_no_change():
     detector = ChangeDetector(1, 40.0, 4.0)
     assert detector.push(0.0, np.array([1e6]), 1.0) is None

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from robotid.simulation.program import ProgramMotion
 
 from robotid.paper import plots
 from robotid.paper.study import MODELS, PaperSettings, study_model
+from robotid.simulation.motions import ProgramMotion
 
 
 @pytest.fixture(scope="module")

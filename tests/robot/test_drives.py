@@ -176,9 +176,8 @@ def test_the_layout_knows_its_sign_size_and_preference(model, term):
     assert [name.split(".")[0] for name in layout.drive_names] == [
         *JOINTS, *(["motor"] if term.is_shared else []),
     ]  # fmt: skip
-    ((found, values),) = layout.by_drive(np.arange(float(len(layout.names))))
-    assert found is term
-    np.testing.assert_array_equal(np.diff(values), 1.0)
+    assert {found for _, found in layout.drive_parameters} == {term}
+    np.testing.assert_array_equal(layout.drive_loads, R[: len(layout.drives)].T)
 
 
 def test_terms_of_one_drive_stand_side_by_side():

@@ -55,6 +55,31 @@ def test_shapes_of_links_that_are_fixed_to_each_other_make_one_body(tmp_path):
     assert (around @ points[np.abs(points[:, 2]) < 0.4, :2].T).max(axis=1).min() >= 0.1 - 1e-12
 
 
+@pytest.mark.parametrize(
+    ("shape", "low", "high"),
+    [
+        ('<box size="0.2 0.4 1"/>', [0.9, -0.2, -0.5], [1.1, 0.2, 0.5]),
+        ('<sphere radius="0.3"/>', [0.7, -0.3, -0.3], [1.3, 0.3, 0.3]),
+        # a prism of 16 sides around it
+        ('<cylinder radius="0.1" length="0.6"/>', [0.898, -0.102, -0.3], [1.102, 0.102, 0.3]),
+    ],
+)
+def test_the_extent_of_a_shape_is_that_which_the_urdf_states(tmp_path, shape, low, high):
+    own = f'<collision><origin xyz="1 0 0"/><geometry>{shape}</geometry></collision>'
+    seen = '<visual><geometry><box size="9 9 9"/></geometry></visual>'
+    flange = '<collision><origin xyz="1 0 1" rpy="0 0 0"/><geometry><box size="0 0 0"/>'
+    model = arm(tmp_path, own + seen, flange + "</geometry></collision>")
+    points = body_points(model)["one"][:-8]  # but for the flange's
+    np.testing.assert_allclose(points.min(axis=0), low, atol=6e-4)
+    np.testing.assert_allclose(points.max(axis=0), high, atol=6e-4)
+
+
+@pytest.mark.parametrize("shape", ['<sphere radius="x"/>', "<capsule/>", '<box size="1 1"/>'])
+def test_a_shape_that_is_not_understood_leaves_its_body_unbounded(tmp_path, shape):
+    own = f"<collision><geometry>{shape}</geometry></collision>"
+    assert body_points(arm(tmp_path, own, SPHERE)) == {}
+
+
 def test_a_body_whose_link_has_mass_but_no_shape_is_not_bounded(tmp_path):
     assert body_points(arm(tmp_path, BOX)) == {}
     with pytest.raises(SettingsError, match=r"no link has geometry in arm\.urdf"):

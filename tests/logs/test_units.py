@@ -1,0 +1,84 @@
+"""Units of a log file: what is stated becomes SI, what looks wrong is refused."""
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError
+from robotid.logs.data import Log
+from robotid.logs.formats import write_columns
+from robotid.logs.read import read_log
+from robotid.logs.units import LogUnits, check_units
+
+T = np.arange(400) * 0.01
+Q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T)])
+V = np.column_stack([1.6 * np.cos(2 * T), -0.9 * np.sin(3 * T)])
+A = np.column_stack([-3.2 * np.sin(2 * T), -2.7 * np.cos(3 * T)])
+TAU = np.column_stack([5 * Q[:, 0], 2 * Q[:, 1]])
+
+
+def log(**changes):
+    return Log(**{"t": T, "q": Q, "v": V, "tau": TAU, "joints": ("a", "b")} | changes)
+
+
+def table(t=T, scale=(1.0, 1.0)):
+    columns = {"time": t}
+    for kind, values in (("q", Q), ("dq", V), ("ddq", A)):
+        columns |= {f"{kind}_{j}": values[:, k] * scale[k] for k, j in enumerate("ab")}
+    return columns | {"tau_a": TAU[:, 0], "tau_b": TAU[:, 1]}
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_stated_time_becomes_seconds_and_velocities_stay(tmp_path, unit, per_second):
+    write_columns(table(T * per_second), tmp_path / "run.csv")
+    found = read_log(tmp_path / "run.csv", ["a", "b"], units=LogUnits(time=unit))
+    np.testing.assert_allclose(found.t, T, rtol=1e-14)
+    np.testing.assert_array_equal(found.v, V)
+
+
+def test_stated_degrees_become_radians_but_of_joints_that_slide(tmp_path):
+    write_columns(table(scale=(180 / np.pi, 1.0)), tmp_path / "run.csv")
+    units = LogUnits(angle="deg")
+    found = read_log(tmp_path / "run.csv", ["a", "b"], units=units, prismatic=["b"])
+    for values, wanted in ((found.q, Q), (found.v, V), (found.a, A)):
+        np.testing.assert_allclose(values, wanted, rtol=1e-13, atol=1e-15)
+    np.testing.assert_array_equal(found.tau, TAU)
+
+
+@pytest.mark.parametrize(("turns", "is_refused"), [(1.9, False), (2.1, True)])
+def test_more_than_two_turns_look_like_degrees(turns, is_refused):
+    q = Q.copy()
+    q[200, 0] = 2 * np.pi * turns
+    far = log(q=q, v=None)
+    if is_refused:
+        with pytest.raises(DataError, match=r"q_a reaches .* looks like degrees"):
+            check_units(far, LogUnits())
+    else:
+        check_units(far, LogUnits())
+    check_units(far, LogUnits(angle="rad"))
+    check_units(far, LogUnits(), prismatic=["a"])
+
+
+@pytest.mark.parametrize(("step", "unit"), [(0.2, "ms"), (10.0, "ms"), (1e4, "us"), (1e7, "ns")])
+def test_a_long_step_looks_like_another_unit(step, unit):
+    words = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+    slow = log(t=np.arange(400) * step, v=None)
+    with pytest.raises(DataError, match=f"looks like {words[unit]}") as caught:
+        check_units(slow, LogUnits())
+    assert caught.value.code == "time_unit"
+    check_units(slow, LogUnits(time="s"))
+    check_units(log(t=np.arange(400) * 0.1, v=None), LogUnits())
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "said"),
+    [
+        ({"v": V * 180 / np.pi}, "angle_unit", "the velocity looks like degrees"),
+        ({"q": Q * 180 / np.pi / 10, "v": V / 10}, "angle_unit", "the position looks like degrees"),
+        ({"v": -V}, "velocity_sign", "has the opposite sign of"),
+        ({"v": V / 1000}, "time_unit", "dq_a is 0.001 times"),
+    ],
+)
+def test_a_velocity_that_does_not_go_with_its_position_is_refused(changes, code, said):
+    with pytest.raises(DataError, match=said) as caught:
+        check_units(log(**changes), LogUnits())
+    assert caught.value.code == code
