@@ -32,11 +32,11 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.doubts import DOUBTFUL, is_outvoted
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
-__all__ = ["CODES", "alarming", "diagnose", "findings_to_dict"]
+__all__ = ["CODES", "alarming", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
@@ -44,6 +44,30 @@ CODES = (
     "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
     "velocity_scale",
 )  # fmt: skip
+
+
+def check_logs(
+    model: RobotModel,
+    logs: Sequence[Log],
+    *,
+    validation: Sequence[Log] = (),
+    signals: SignalSettings | None = None,
+) -> tuple[Finding, ...]:
+    """Ask the doctor what is wrong with logs, before anything is identified from them.
+
+    Args:
+        model: The robot.
+        logs: Logs to fit, of the model's joints in its order.
+        validation: Logs kept apart.
+        signals: How logs become trajectories; the defaults if None.
+
+    Returns:
+        The findings, errors first: each with a code, a severity, where, and what to do.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
+    return diagnose(model, logs, validation, signals or SignalSettings())
 
 
 def diagnose(

@@ -6,7 +6,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.signals import SignalSettings, process, resolve, unwrap
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process, resolve, unwrap
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel

@@ -12,7 +12,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.findings import Finding
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel

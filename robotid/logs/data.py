@@ -56,6 +56,9 @@ class Log:
         """Name of its file, "log" if it has none."""
         return Path(self.path).name or "log"
 
+    def __repr__(self) -> str:
+        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
+
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
         """Return the rows from start to end, both included.
 
@@ -161,6 +164,10 @@ class Trajectory:
             object.__setattr__(self, "direction", direction)
         if self.rate is not None and not 0 < self.rate < np.inf:
             raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
+
+    def __repr__(self) -> str:
+        stretches = len(np.unique(self.segment))
+        return f"<Trajectory: {_extent(self.t, self.joints, self.rate)}, in {stretches} stretches>"
 
     @property
     def squares(self) -> Array:
@@ -305,3 +312,12 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
 def _stamp(t: float) -> str:
     """Return a time stamp with three decimals, or with as many as it has."""
     return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
+
+
+def _extent(t: Array, joints: Sequence[str], rate: float | None = None) -> str:
+    """Return in words which joints are recorded, how long and how often."""
+    often = 1.0 / float(np.median(np.diff(t))) if rate is None and len(t) > 1 else rate or np.nan
+    return (
+        f"{len(t)} samples of {len(joints)} joints ({', '.join(joints)}) over "
+        f"{t[-1] - t[0] if len(t) else 0.0:.6g} s at {often:.4g} Hz"
+    )

@@ -132,5 +132,5 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(SettingsError, match="threshold is 0"):
         OnlineSettings(threshold=0)
-    with pytest.raises(SettingsError, match="walk is -1, wanted 0 or more"):
+    with pytest.raises(SettingsError, match="walk is -1, wanted 0 or a positive number"):
         OnlineSettings(walk=-1)
