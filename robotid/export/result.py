@@ -14,7 +14,7 @@ import numpy as np
 from robotid._files import file_sha256
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
-from robotid.export.sidecar import load_identified
+from robotid.export.urdf import load_identified
 from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation

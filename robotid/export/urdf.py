@@ -4,17 +4,18 @@ Only the inertials of the original file change, every other byte stays. What a U
 for, armature and friction of coupled drives above all, goes into ``<name>.drive.json`` beside it.
 """
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from robotid._files import folder_beside
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
-from robotid.export.sidecar import SCHEMA_VERSION, digest, load_identified, sidecar_facts
 from robotid.export.xml_splice import (
     Document,
     Edit,
@@ -29,12 +30,17 @@ from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import read_tree, read_with_yourdfpy
 from robotid.versions import __version__
 
-__all__ = ["write_urdf"]
+__all__ = ["load_identified", "read_sidecar", "write_urdf"]
 
+_SCHEMA_VERSION = 1
+_ENTRIES = {
+    "urdf_sha256": str, "joints": list, "locked": dict, "gravity": list, "free_flyer": bool,
+    "mimic": str, "terms": list, "drives": dict, "couplings": list, "lumped": dict,
+}  # fmt: skip
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over them
 
@@ -73,13 +79,13 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     sidecar = goal.with_name(f"{goal.stem}.drive.json")
     readers = ["robotid", "yourdfpy"] if _suits_yourdfpy(source) else ["robotid"]
     facts = {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": _SCHEMA_VERSION,
         "robotid": __version__,
         "robot": model.name,
         "urdf": goal.name,
-        "urdf_sha256": digest(content),
-        "source": {"urdf": source.name, "sha256": digest(original)},
-        **sidecar_facts(model, pi, places),
+        "urdf_sha256": _digest(content),
+        "source": {"urdf": source.name, "sha256": _digest(original)},
+        **_facts(model, pi, places),
         "read_back_with": readers,
     }
     with folder_beside(goal.parent) as partial:
@@ -90,6 +96,121 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
         if "yourdfpy" in readers:
             _check_masses(partial / goal.name)
     return sidecar
+
+
+def read_sidecar(path: str | Path) -> dict[str, Any]:
+    """Return the content of the sidecar of a written URDF, schema_version 1.
+
+    Args:
+        path: The ``.drive.json`` file.
+
+    Raises:
+        DataError: If it is missing, no JSON, of another schema, or lacks an entry.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(f"there is no sidecar {str(source)!r}; it is written beside the URDF")
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"{source.name} is not JSON: {error}") from error
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if version != _SCHEMA_VERSION:
+        raise DataError(
+            f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION}: the sidecar "
+            "that write_urdf puts beside a URDF"
+        )
+    wrong = [key for key, kind in _ENTRIES.items() if not isinstance(content.get(key), kind)]
+    if wrong:
+        raise DataError(f"{source.name} lacks the entries {wrong}; write it again with write_urdf")
+    return dict(content)
+
+
+def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, Array]:
+    """Return the model and the parameters of a URDF written with its sidecar.
+
+    Args:
+        urdf: The written URDF.
+        sidecar: Its ``.drive.json``.
+
+    Returns:
+        The model, and its standard parameters with the drive terms, shape (p,).
+
+    Raises:
+        DataError: If the sidecar cannot be used.
+        ModelError: If the URDF is missing, is not the one the sidecar was written with, or does
+            not hold the joints that the sidecar names.
+    """
+    facts, path = read_sidecar(sidecar), Path(urdf)
+    if not path.is_file():
+        raise ModelError(f"there is no URDF file {str(path)!r}")
+    found = _digest(path.read_bytes())
+    if found != facts["urdf_sha256"]:
+        raise ModelError(
+            f"{path.name} has changed since {Path(sidecar).name} was written: its sha256 is "
+            f"{found[:12]}..., wanted {facts['urdf_sha256'][:12]}...; restore the file, or write "
+            "both again"
+        )
+    try:
+        couplings = [Coupling(c["name"], tuple(c["ratios"].items())) for c in facts["couplings"]]
+        drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{Path(sidecar).name}: a coupling lacks {error}") from error
+    model = RobotModel.from_urdf(
+        path,
+        couplings=couplings,
+        **{
+            key: facts[key]
+            for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")
+        },
+    )
+    values = [_drive_value(drives, name, Path(sidecar).name) for name in model.layout.drive_names]
+    return model, np.array([*model.standard_parameters()[: model.layout.n_inertial], *values])
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
+    """Return what a URDF has no place for: how the model is built from it, and the drives."""
+    layout, first = model.layout, model.layout.n_inertial
+    values = dict(zip(layout.names, map(float, pi), strict=True))
+    units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
+    followers = {j.name for j in model.tree.movable if j.mimic and model.mimic == "coupled"}
+    return {
+        "joints": list(model.joints),
+        "locked": {j: float(x) for j, x in model.locked.items() if j not in followers},
+        "gravity": [float(g) for g in model.pin_model.gravity.linear],
+        "free_flyer": model.free_flyer,
+        "mimic": model.mimic,
+        "terms": list(layout.terms),
+        "drives": {j: {t: values[f"{j}.{t}"] for t in layout.terms} for j in layout.joints},
+        "couplings": [
+            {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
+            | {term: values[f"{c.name}.{term}"] for term in layout.coupling_terms}
+            for c in layout.couplings
+        ],
+        "lumped": _lumped(model, places),
+        "units": {"gravity": "m/s^2", "locked": "rad, or m if it slides", "ratios": "-", **units},
+    }
+
+
+def _lumped(model: RobotModel, places: Sequence[LinkPlace]) -> dict[str, list[str]]:
+    lumped: dict[str, list[str]] = {}
+    for place in places:
+        if place.is_lumped and place.link in model.tree.inertials:
+            lumped.setdefault(model.layout.bodies[place.body], []).append(place.link)
+    return lumped
+
+
+def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
+    owner, term = name.rsplit(".", 1)
+    entry = drives.get(owner)
+    value = entry.get(term) if isinstance(entry, dict) else None
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise DataError(f"{where}: {name} is {value!r}, wanted a finite number")
+    return float(value)
 
 
 def _check_parameters(model: RobotModel, pi: Array) -> None:

@@ -7,7 +7,7 @@ it. Nothing is ever written from a tree, so comments, order, quotes and line end
 import codecs
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from xml.parsers import expat
 
 from robotid.exceptions import ModelError
@@ -39,7 +39,6 @@ class Element:
         attributes: Its attributes.
         start: First byte of ``<tag``.
         inside: First byte after the ``>`` that ends the start tag.
-        close: First byte of ``</tag``; equal to ``inside`` if the tag closes itself.
         end: First byte after the element.
         children: The elements directly inside.
     """
@@ -48,7 +47,6 @@ class Element:
     attributes: Mapping[str, str]
     start: int
     inside: int
-    close: int
     end: int
     children: tuple["Element", ...]
 
@@ -62,9 +60,6 @@ class Element:
 
         Args:
             tag: Their name.
-
-        Returns:
-            The elements.
         """
         return tuple(child for child in self.children if child.tag == tag)
 
@@ -106,9 +101,6 @@ def parse(data: bytes, where: str) -> Document:
         data: Content of the file, in any encoding that XML names.
         where: Name of the file, for errors.
 
-    Returns:
-        The document.
-
     Raises:
         ModelError: If it is not well-formed, or an element comes out of an entity.
     """
@@ -117,9 +109,7 @@ def parse(data: bytes, where: str) -> Document:
         text = data.decode(codec).encode("utf-8")
     except UnicodeDecodeError as error:
         raise ModelError(f"{where} is not {codec} as it says: {error}") from error
-    reader = _Reader(text, where)
-    reader.run()
-    return Document(text, reader.done[0], codec)
+    return Document(text, _root(text, where), codec)
 
 
 def apply(document: Document, edits: Iterable[Edit]) -> bytes:
@@ -128,9 +118,6 @@ def apply(document: Document, edits: Iterable[Edit]) -> bytes:
     Args:
         document: The file.
         edits: The changes; spans must not overlap.
-
-    Returns:
-        Content of the new file.
 
     Raises:
         ModelError: If two spans overlap.
@@ -153,12 +140,9 @@ def replace(document: Document, element: Element, lines: Sequence[str]) -> Edit:
         element: What is replaced.
         lines: The new element, line by line: first, inner ones, last. They are indented like the
             file where the element starts a line of its own, and joined to one line elsewhere.
-
-    Returns:
-        The change.
     """
-    indent = _indent(document, element)
-    return Edit(element.start, element.end, _layout(document, lines, indent))
+    text = _layout(document, lines, _indent(document, element))
+    return Edit(element.start, element.end, text)
 
 
 def remove(document: Document, element: Element) -> Edit:
@@ -167,13 +151,9 @@ def remove(document: Document, element: Element) -> Edit:
     Args:
         document: The file.
         element: What is removed.
-
-    Returns:
-        The change.
     """
-    data = document.data
     indent = _indent(document, element)
-    rest = re.compile(rb"[ \t]*(\r\n|\n|\r)").match(data, element.end)
+    rest = re.compile(rb"[ \t]*(\r\n|\n|\r)").match(document.data, element.end)
     if indent is None or rest is None:
         return Edit(element.start, element.end, b"")
     return Edit(element.start - len(indent), rest.end(), b"")
@@ -186,24 +166,17 @@ def insert(document: Document, parent: Element, lines: Sequence[str]) -> Edit:
         document: The file.
         parent: Where it goes.
         lines: The new element, as for ``replace``.
-
-    Returns:
-        The change.
     """
     outer = _indent(document, parent)
     if parent.children:
-        last = parent.children[-1]
-        indent = _indent(document, last)
-        lead = b"" if indent is None else _newline(document) + indent
-        return Edit(last.end, last.end, lead + _layout(document, lines, indent))
-    indent = None if outer is None else outer + _unit(document)
-    lead = b"" if indent is None else _newline(document) + indent
-    text = lead + _layout(document, lines, indent)
-    if parent.is_self_closing:
-        tail = b"" if outer is None else _newline(document) + outer
-        closing = b"</" + parent.tag.encode() + b">"
-        return Edit(parent.end - 2, parent.end, b">" + text + tail + closing)
-    return Edit(parent.inside, parent.inside, text)
+        at, indent = parent.children[-1].end, _indent(document, parent.children[-1])
+    else:
+        at, indent = parent.inside, None if outer is None else outer + _unit(document)
+    text = _line_break(document, indent) + _layout(document, lines, indent)
+    if not parent.is_self_closing:
+        return Edit(at, at, text)
+    closing = _line_break(document, outer) + b"</" + parent.tag.encode() + b">"
+    return Edit(parent.end - 2, parent.end, b">" + text + closing)
 
 
 def set_attributes(document: Document, element: Element, values: Mapping[str, str]) -> list[Edit]:
@@ -213,9 +186,6 @@ def set_attributes(document: Document, element: Element, values: Mapping[str, st
         document: The file.
         element: The element.
         values: New values by attribute; one that the element lacks is added behind the others.
-
-    Returns:
-        The changes.
     """
     edits, missing = [], dict(values)
     for match in _ATTRIBUTE.finditer(document.data, element.start, element.inside):
@@ -230,47 +200,38 @@ def set_attributes(document: Document, element: Element, values: Mapping[str, st
     return edits
 
 
-@dataclass
-class _Reader:
-    """Expat's events put together to elements; open ones wait in ``stack``."""
+def _root(data: bytes, where: str) -> Element:
+    """Return the outermost element, put together from the events of expat."""
+    parser = expat.ParserCreate("utf-8")
+    top: list[Element] = []
+    inner = [top]  # children of the open elements
+    opened: list[tuple[dict[str, str], int, int]] = []  # attributes, start, inside of them
 
-    data: bytes
-    where: str
-    stack: list[tuple[str, dict[str, str], int, int]] = field(default_factory=list)
-    children: list[list[Element]] = field(default_factory=lambda: [[]])
-
-    @property
-    def done(self) -> list[Element]:
-        return self.children[0]
-
-    def run(self) -> None:
-        self.parser = expat.ParserCreate("utf-8")
-        self.parser.StartElementHandler = self._open
-        self.parser.EndElementHandler = self._close
-        try:
-            self.parser.Parse(self.data, True)
-        except expat.ExpatError as error:
-            raise ModelError(f"{self.where} is not well-formed XML: {error}") from error
-
-    def _open(self, tag: str, attributes: dict[str, str]) -> None:
-        start = self.parser.CurrentByteIndex
-        match = _TAG.match(self.data, start)
-        if match is None or not self.data.startswith(b"<" + tag.encode(), start):
+    def start_element(tag: str, attributes: dict[str, str]) -> None:
+        start = parser.CurrentByteIndex
+        match = _TAG.match(data, start)
+        if match is None or not data.startswith(b"<" + tag.encode(), start):
             raise ModelError(
-                f"{self.where}: <{tag}> near byte {start} comes out of an entity, where it cannot "
+                f"{where}: <{tag}> near byte {start} comes out of an entity, where it cannot "
                 "be edited; expand the entities of the file first: xmllint --noent"
             )
-        self.stack.append((tag, attributes, start, match.end()))
-        self.children.append([])
+        opened.append((attributes, start, match.end()))
+        inner.append([])
 
-    def _close(self, tag: str) -> None:
-        _, attributes, start, inside = self.stack.pop()
-        inner = tuple(self.children.pop())
-        close = end = inside
-        if self.data[inside - 2 : inside] != b"/>":
-            close = self.parser.CurrentByteIndex
-            end = self.data.index(b">", close) + 1
-        self.children[-1].append(Element(tag, attributes, start, inside, close, end, inner))
+    def end_element(tag: str) -> None:
+        attributes, start, end = opened.pop()
+        inside = end
+        if data[inside - 2 : inside] != b"/>":
+            end = data.index(b">", parser.CurrentByteIndex) + 1
+        children = tuple(inner.pop())
+        inner[-1].append(Element(tag, attributes, start, inside, end, children))
+
+    parser.StartElementHandler, parser.EndElementHandler = start_element, end_element
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise ModelError(f"{where} is not well-formed XML: {error}") from error
+    return top[0]
 
 
 def _codec(data: bytes, where: str) -> str:
@@ -303,16 +264,14 @@ def _unit(document: Document) -> bytes:
     return b"  "
 
 
-def _newline(document: Document) -> bytes:
+def _line_break(document: Document, indent: bytes | None) -> bytes:
+    """Return what starts a line as the file does, nothing without an indent."""
     found = re.search(rb"\r\n|\n|\r", document.data)
-    return found[0] if found else b"\n"
+    return b"" if indent is None else (found[0] if found else b"\n") + indent
 
 
 def _layout(document: Document, lines: Sequence[str], indent: bytes | None) -> bytes:
-    encoded = [line.encode() for line in lines]
-    if indent is None:
-        return b"".join(encoded)
-    inner = indent + _unit(document)
-    middle = [inner + line for line in encoded[1:-1]]
-    last = [indent + line for line in encoded[1:][-1:]]
-    return _newline(document).join([*encoded[:1], *middle, *last])
+    first, *others = [line.encode() for line in lines]
+    inner = None if indent is None else indent + _unit(document)
+    breaks = [_line_break(document, inner)] * (len(others) - 1) + [_line_break(document, indent)]
+    return first + b"".join(lead + line for lead, line in zip(breaks, others, strict=False))

@@ -16,9 +16,9 @@ from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Table, choose, prefixes
+from robotid.logs.table import Table, WritableFormat, choose, prefixes, told
 
-__all__ = ["open_hdf5", "open_mat", "open_npz", "write_hdf5", "write_mat", "write_npz"]
+__all__ = ["Hdf5Format", "MatFormat", "NpzFormat"]
 
 _CLOCKS = ("time", "t")
 _LISTS = ("joints", "joint_names")  # entries that name the columns of wide arrays
@@ -27,129 +27,67 @@ _MAT73 = b"MATLAB 7.3"  # how a MAT file starts that is HDF5 inside
 _MAT_NAME = 63  # characters that MATLAB allows in a name
 
 
-def open_npz(path: Path, source: LogSource) -> Table:
-    """Return the table in an NPZ file; pickled objects are not read.
+class NpzFormat(WritableFormat):
+    """NPZ files, whose names may hold slashes; pickled objects are not read."""
 
-    Args:
-        path: The file.
-        source: Which group, if names hold slashes.
+    def open(self, path: Path, source: LogSource) -> Table:
+        arrays: dict[str, Array] = {}
+        broken = (OSError, EOFError, zlib.error, zipfile.BadZipFile)
+        with told(path, "NPZ", broken), zipfile.ZipFile(path), np.load(path) as file:
+            for name in file.files:
+                with suppress(ValueError):  # of pickled objects
+                    arrays[name] = np.asarray(file[name])
+        return _table_of_arrays(path.name, {n: _entry(a) for n, a in arrays.items()}, source)
 
-    Returns:
-        The table.
-
-    Raises:
-        DataError: If the file is broken, or the group is missing or one of several.
-    """
-    arrays: dict[str, Array] = {}
-    broken = (OSError, EOFError, zlib.error, zipfile.BadZipFile)
-    with _told(path, "NPZ", broken), zipfile.ZipFile(path), np.load(path) as file:
-        for name in file.files:
-            with suppress(ValueError):  # of pickled objects
-                arrays[name] = np.asarray(file[name])
-    return _table_of_arrays(path.name, {n: _entry(a) for n, a in arrays.items()}, source)
+    def write(self, table: Mapping[str, Array], path: Path) -> None:
+        columns: dict[str, Any] = dict(table)
+        with path.open("wb") as file:
+            np.savez_compressed(file, **columns)
 
 
-def open_hdf5(path: Path, source: LogSource) -> Table:
-    """Return the table in an HDF5 file; only the columns that are read are loaded.
+class Hdf5Format(WritableFormat):
+    """HDF5 files, compressed when written; only the columns that are read are loaded."""
 
-    Args:
-        path: The file.
-        source: Which group.
-
-    Returns:
-        The table.
-
-    Raises:
-        DataError: If the file is broken, or the group is missing or one of several.
-        MissingDependencyError: If h5py is not installed.
-    """
-    with _open_hdf5(path) as file:
-        entries = _datasets(file, path, is_matlab=False)
-    return _table_of_arrays(path.name, entries, source)
-
-
-def open_mat(path: Path, source: LogSource) -> Table:
-    """Return the table in a MATLAB file of any version, v7.3 among them.
-
-    Args:
-        path: The file.
-        source: Which struct.
-
-    Returns:
-        The table.
-
-    Raises:
-        DataError: If the file is broken, or the struct is missing or one of several.
-        MissingDependencyError: If the file is v7.3 and h5py is not installed.
-    """
-    with path.open("rb") as file:
-        is_hdf5 = file.read(len(_MAT73)) == _MAT73
-    if is_hdf5:
+    def open(self, path: Path, source: LogSource) -> Table:
         with _open_hdf5(path) as file:
-            entries = _datasets(file, path, is_matlab=True)
-    else:
-        entries = _mat_variables(path)
-    return _table_of_arrays(path.name, entries, source)
+            entries = _datasets(file, path, is_matlab=False)
+        return _table_of_arrays(path.name, entries, source)
+
+    def write(self, table: Mapping[str, Array], path: Path) -> None:
+        with _h5py("writing HDF5").File(path, "w") as file:
+            for name, values in table.items():
+                file.create_dataset(name, data=values, compression="gzip", shuffle=True)
 
 
-def write_npz(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as a compressed NPZ file.
+class MatFormat(WritableFormat):
+    """MATLAB files of any version, v7.3 among them; column vectors of version 7 are written."""
 
-    Args:
-        table: Arrays of shape (N,) by name.
-        path: The file.
-    """
-    columns: dict[str, Any] = dict(table)
-    with path.open("wb") as file:
-        np.savez_compressed(file, **columns)
+    def open(self, path: Path, source: LogSource) -> Table:
+        with path.open("rb") as file:
+            is_hdf5 = file.read(len(_MAT73)) == _MAT73
+        if is_hdf5:
+            with _open_hdf5(path) as file:
+                entries = _datasets(file, path, is_matlab=True)
+        else:
+            entries = _mat_variables(path)
+        return _table_of_arrays(path.name, entries, source)
 
+    def write(self, table: Mapping[str, Array], path: Path) -> None:
+        from scipy.io import savemat
 
-def write_hdf5(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as compressed datasets of an HDF5 file.
-
-    Args:
-        table: Arrays of shape (N,) by name.
-        path: The file.
-
-    Raises:
-        MissingDependencyError: If h5py is not installed.
-    """
-    with _h5py("writing HDF5").File(path, "w") as file:
-        for name, values in table.items():
-            file.create_dataset(name, data=values, compression="gzip", shuffle=True)
-
-
-def write_mat(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as column vectors of a MATLAB file of version 7.
-
-    Args:
-        table: Arrays of shape (N,) by name.
-        path: The file.
-
-    Raises:
-        DataError: If a name cannot be a variable in MATLAB.
-    """
-    from scipy.io import savemat
-
-    for name in table:
-        if not (name.isidentifier() and name.isascii() and len(name) <= _MAT_NAME):
-            raise DataError(
-                f"MATLAB has no variable called {name!r} (letters, digits and _, at most "
-                f"{_MAT_NAME}); write another format"
-            )
-    with path.open("wb") as file:
-        savemat(file, dict(table), oned_as="column", do_compression=True)
+        for name in table:
+            if not (name.isidentifier() and name.isascii() and len(name) <= _MAT_NAME):
+                raise DataError(
+                    f"MATLAB has no variable called {name!r} (letters, digits and _, at most "
+                    f"{_MAT_NAME}); write another format"
+                )
+        with path.open("wb") as file:
+            savemat(file, dict(table), oned_as="column", do_compression=True)
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """One array of a file.
-
-    Attributes:
-        shape: Its shape.
-        is_number: Whether it holds real numbers.
-        load: Returns the array.
-    """
+    """One array of a file, loaded when it is asked for."""
 
     shape: tuple[int, ...]
     is_number: bool
@@ -169,17 +107,6 @@ def _table_of_arrays(where: str, entries: Mapping[str, _Entry], source: LogSourc
 
     A vector is a column of its own name. A matrix of N samples, along its longer side, is n
     columns ``q_<joint>`` in the order of an entry ``joints``, else ``q_0``, ``q_1``, ...
-
-    Args:
-        where: Name of the file, for errors.
-        entries: The arrays by path, as "arm/q_elbow".
-        source: Which group of them.
-
-    Returns:
-        The table.
-
-    Raises:
-        DataError: If the group is not in the file, or could be one of several.
     """
     group = _group(where, list(entries), source.topic)
     inside = {path[len(group) :]: path for path in entries if path.startswith(group)}
@@ -249,7 +176,8 @@ def _read(
     where: str, entries: Mapping[str, _Entry], columns: Mapping[str, _Column]
 ) -> dict[str, Array]:
     """Return columns; each array is loaded once, and all must be of one length."""
-    loaded = {path: np.asarray(entries[path].load()) for path in _paths(columns)}
+    paths = dict.fromkeys(column.path for column in columns.values())
+    loaded = {path: np.asarray(entries[path].load()) for path in paths}
     table: dict[str, Array] = {}
     for name, column in columns.items():
         values = loaded[column.path]
@@ -271,27 +199,12 @@ def _read(
     return table
 
 
-def _paths(columns: Mapping[str, _Column]) -> list[str]:
-    """Return the paths of the arrays that columns are in, each once."""
-    return list(dict.fromkeys(column.path for column in columns.values()))
-
-
 def _entry(array: Array) -> _Entry:
-    """Return an entry of an array in memory."""
+    """Return the entry of an array in memory."""
     return _Entry(array.shape, array.dtype.kind in "iuf", lambda: array)
 
 
-@contextmanager
-def _told(path: Path, kind: str, errors: tuple[type[Exception], ...]) -> Iterator[None]:
-    """Tell in our words what a reader says of a broken file."""
-    try:
-        yield
-    except errors as error:
-        raise DataError(f"{path.name}: broken {kind} file ({error}); export it again") from error
-
-
 def _h5py(purpose: str) -> ModuleType:
-    """Return h5py."""
     try:
         import h5py
     except ImportError as error:
@@ -302,9 +215,8 @@ def _h5py(purpose: str) -> ModuleType:
 
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file."""
     h5py = _h5py("reading HDF5 and MATLAB v7.3")
-    with _told(path, "HDF5", (OSError, RuntimeError)), h5py.File(path, "r") as file:
+    with told(path, "HDF5", (OSError, RuntimeError)), h5py.File(path, "r") as file:
         yield file
 
 
@@ -346,7 +258,7 @@ def _mat_variables(path: Path) -> dict[str, _Entry]:
     from scipy.io.matlab import MatReadError
 
     broken = (MatReadError, ValueError, TypeError, OSError, EOFError, NotImplementedError)
-    with _told(path, "MATLAB", broken):
+    with told(path, "MATLAB", broken):
         variables = loadmat(path, simplify_cells=True)
     entries: dict[str, _Entry] = {}
 

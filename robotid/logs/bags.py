@@ -5,7 +5,7 @@ The library rosbags reads all of them, without an installation of ROS.
 
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,9 +18,9 @@ from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Table, choose
+from robotid.logs.table import Format, Table, choose
 
-__all__ = ["open_bag"]
+__all__ = ["BagFormat"]
 
 _TYPE = "sensor_msgs/msg/JointState"
 _FIELDS = ("position", "velocity", "effort")
@@ -37,50 +37,40 @@ class _Block:
     values: "array[float]" = field(default_factory=lambda: array("d"))  # field by field
 
 
-def open_bag(path: Path, source: LogSource) -> Table:
-    """Return the joint states of one topic of a bag; a row is a message.
+class BagFormat(Format):
+    """Bags, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag: a row is a message.
 
     The columns are ``time`` [s] since the epoch, ``position_<joint>``, ``velocity_<joint>`` and
     ``effort_<joint>``. Each message may name its joints in another order. Messages that hold none
-    of the columns that are read, as those of another publisher, are passed over.
-
-    Args:
-        path: A .mcap, .db3 or .bag file, or the folder of a ROS 2 bag.
-        source: Which topic, and which clock.
-
-    Returns:
-        The table.
-
-    Raises:
-        DataError: If the bag is broken, the topic is missing, of another type, or one of several,
-            a message does not fit together, or only some of the messages hold what is read.
-        MissingDependencyError: If rosbags is not installed.
+    of the columns that are read, as those of another publisher, are passed over; a message that
+    does not fit together, or holds only some of what is read, is a ``DataError``.
     """
-    blocks: dict[Layout, _Block] = {}
-    count = 0
-    with _open(path) as (reader, decode):
-        topic = _choose_topic(path.name, reader, source.topic)
-        chosen = [c for c in reader.connections if c.topic == topic]
-        for count, (_, logged, raw) in enumerate(_told(path, reader.messages(chosen)), start=1):
-            message = _decoded(path, decode, raw)
-            layout, values = _content(path.name, topic, count - 1, message)
-            block = blocks.setdefault(layout, _Block())
-            block.number.append(count - 1)
-            clock = message.header.stamp
-            by_header = source.stamp == "header"
-            block.stamp.append(clock.sec * 10**9 + clock.nanosec if by_header else logged)
-            for part in values:
-                block.values.frombytes(part.tobytes())
-    where = f"{path.name}, topic {topic!r}"
-    if source.stamp == "header" and not any(any(block.stamp) for block in blocks.values()):
-        raise DataError(
-            f"{where}: the stamps in the headers of all {count} messages are 0. To use the time "
-            'of recording, state stamp = "log" (job file table [log], CLI --stamp log, Python '
-            'source=LogSource(stamp="log"))'
-        )
-    names = list(dict.fromkeys(n for layout in blocks for n in _columns(layout)))
-    names.sort(key=lambda name: _FIELDS.index(name.partition("_")[0]))
-    return Table(["time", *names], partial(_read, where, blocks))
+
+    def open(self, path: Path, source: LogSource) -> Table:
+        blocks: dict[Layout, _Block] = {}
+        count = 0
+        with _open(path) as (reader, decode):
+            topic = _choose_topic(path.name, reader, source.topic)
+            messages = _messages(path, reader, decode, topic)
+            for count, (logged, message) in enumerate(messages, start=1):
+                layout, values = _content(path.name, topic, count - 1, message)
+                block = blocks.setdefault(layout, _Block())
+                block.number.append(count - 1)
+                clock = message.header.stamp
+                by_header = source.stamp == "header"
+                block.stamp.append(clock.sec * 10**9 + clock.nanosec if by_header else logged)
+                for part in values:
+                    block.values.frombytes(part.tobytes())
+        where = f"{path.name}, topic {topic!r}"
+        if source.stamp == "header" and not any(any(block.stamp) for block in blocks.values()):
+            raise DataError(
+                f"{where}: the stamps in the headers of all {count} messages are 0. To use the "
+                'time of recording, state stamp = "log" (job file table [log], CLI --stamp log, '
+                'Python source=LogSource(stamp="log"))'
+            )
+        names = list(dict.fromkeys(n for layout in blocks for n in _columns(layout)))
+        names.sort(key=lambda name: _FIELDS.index(name.partition("_")[0]))
+        return Table(["time", *names], partial(_read, where, blocks))
 
 
 @contextmanager
@@ -106,10 +96,8 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes], Any]]]:
         reader.open()
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise _broken(path, error) from error
-    try:
+    with closing(reader):
         yield reader, lambda raw: deserialize(raw, _TYPE)
-    finally:
-        reader.close()
 
 
 def _broken(path: Path, error: Exception) -> DataError:
@@ -121,21 +109,17 @@ def _broken(path: Path, error: Exception) -> DataError:
     )
 
 
-def _told(path: Path, messages: Iterator[Any]) -> Iterator[Any]:
-    """Yield messages, and tell in our words where a bag breaks off."""
-    while True:
-        try:
-            message = next(messages)
-        except StopIteration:
-            return
-        except Exception as error:  # a parser of foreign bytes fails in many ways
-            raise _broken(path, error) from error
-        yield message
-
-
-def _decoded(path: Path, decode: Callable[[bytes], Any], raw: bytes) -> Any:  # noqa: ANN401
+def _messages(
+    path: Path,
+    reader: Any,  # noqa: ANN401
+    decode: Callable[[bytes], Any],
+    topic: str,
+) -> Iterator[tuple[int, Any]]:
+    """Yield time of recording [ns] and message; tell in our words where a bag breaks off."""
+    chosen = [c for c in reader.connections if c.topic == topic]
     try:
-        return decode(raw)
+        for _, logged, raw in reader.messages(chosen):
+            yield logged, decode(raw)
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise _broken(path, error) from error
 
@@ -215,18 +199,17 @@ def _read(where: str, blocks: dict[Layout, _Block], wanted: Sequence[str]) -> di
 def _require_whole(where: str, blocks: dict[Layout, _Block], columns: Sequence[str]) -> None:
     """Refuse messages that hold only some of the columns."""
     total = sum(len(block.number) for block in blocks.values())
-    partial_: dict[int, list[str]] = {}
+    lacking: dict[int, list[str]] = {}  # by number of the first message
     count = 0
     for layout, block in blocks.items():
         held = set(_columns(layout))
-        if lacking := [name for name in columns if name not in held]:
-            partial_[block.number[0]] = lacking
+        if missing := [name for name in columns if name not in held]:
+            lacking[block.number[0]] = missing
             count += len(block.number)
-    if partial_:
-        first = min(partial_)
+    if lacking:
+        first = min(lacking)
         raise DataError(
             f"{where}: {count} of {total} messages lack some of what is read, the first (message "
-            f"{first}) {listed(partial_[first])}. A row is one message: read only joints that are "
-            "always "
-            "published together, and leave out the others"
+            f"{first}) {listed(lacking[first])}. A row is one message: read only joints that are "
+            "always published together, and leave out the others"
         )

@@ -13,48 +13,35 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.logs.table import Place, RowReader, Table
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Place, RowReader, Table, WritableFormat, topic_note
 
-__all__ = ["open_csv", "write_csv"]
+__all__ = ["CsvFormat"]
 
 _BLOCK = 4096  # lines read at a time
 
 
-def open_csv(path: Path) -> Table:
-    """Return the table in a CSV file.
+class CsvFormat(WritableFormat):
+    """CSV files: UTF-8, the first line names the columns.
 
-    Args:
-        path: The file: UTF-8, its first line names the columns.
-
-    Returns:
-        The table.
-
-    Raises:
-        DataError: If there is no header, a cell is no number, or a row has another length.
+    The decimals written are the shortest that give the same bits.
     """
-    names, separator = _csv_header(path)
-    rows = _CsvRows(path, names, separator)
-    return Table(names, rows.read_all, rows=rows)
 
+    def open(self, path: Path, source: LogSource) -> Table:
+        names, separator = _csv_header(path)
+        rows = _CsvRows(path, names, separator)
+        return Table(names, rows.read_all, topic_note(path, source), rows)
 
-def write_csv(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as CSV: the shortest decimals that give the same bits.
-
-    Args:
-        table: Arrays of shape (N,) by name.
-        path: The file.
-    """
-    rows = np.column_stack(list(table.values()))
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table)
-        writer.writerows(row.tolist() for row in rows)
+    def write(self, table: Mapping[str, Array], path: Path) -> None:
+        rows = np.column_stack(list(table.values()))
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(table)
+            writer.writerows(row.tolist() for row in rows)
 
 
 @dataclass(frozen=True)
 class _CsvRows(RowReader):
-    """Rows of a CSV file; see ``RowReader``."""
-
     path: Path
     names: list[str]
     separator: str
@@ -65,15 +52,16 @@ class _CsvRows(RowReader):
             return sum(block.count(b"\n") for block in blocks) - 1
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
-        for lines, place, rows in self._blocks(Place(), None):
-            yield self._parse(lines, [name], place, 0, rows)[name], place
+        for lines, place, _ in self._blocks(Place(), None):
+            yield self._numbers(self._whole(lines, place.line), [name])[name], place
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
         parts = []
         for lines, place, rows in self._blocks(near, stop):
             start, end = max(first - place.row, 0), min(stop - place.row, rows)
             if start < end:
-                parts.append(self._parse(lines, wanted, place, start, end))
+                whole = self._whole(lines, place.line)
+                parts.append(self._numbers(islice(whole, start, end), wanted))
         return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
 
     def _blocks(self, near: Place, stop: int | None) -> Iterator[tuple[list[str], Place, int]]:
@@ -97,25 +85,8 @@ class _CsvRows(RowReader):
                 size = sum(map(len, raw))
                 place = Place(place.row + rows, place.line + len(raw), place.offset + size)
 
-    def _parse(
-        self, lines: Sequence[str], wanted: Sequence[str], place: Place, start: int, stop: int
-    ) -> dict[str, Array]:
-        """Return rows start to stop of some lines."""
-        rows = self._whole(lines, place.line)
-        return self._numbers(islice(rows, start, stop), wanted)
-
     def read_all(self, wanted: Sequence[str]) -> dict[str, Array]:
-        """Return whole columns.
-
-        Args:
-            wanted: Their names.
-
-        Returns:
-            The columns by name, shape (N,).
-
-        Raises:
-            DataError: If a cell is no number, or a row has another length.
-        """
+        """Return whole columns by name."""
         with _open_csv(self.path) as file:
             file.readline()
             rows = self._whole(file)
@@ -126,9 +97,9 @@ class _CsvRows(RowReader):
 
     def _numbers(self, rows: Iterable[str], wanted: Sequence[str]) -> dict[str, Array]:
         columns = [self.names.index(name) for name in wanted]
-        how: dict[str, Any] = {"comments": None, "quotechar": '"', "ndmin": 2}
+        form: dict[str, Any] = {"comments": None, "delimiter": self.separator, "quotechar": '"'}
         try:
-            values = np.loadtxt(rows, delimiter=self.separator, usecols=columns, **how)
+            values = np.loadtxt(rows, usecols=columns, ndmin=2, **form)
         except (DataError, UnicodeDecodeError):
             raise
         except ValueError as error:
@@ -197,7 +168,7 @@ def _csv_header(path: Path) -> tuple[list[str], str]:
 
 
 def _is_number(text: str) -> bool:
-    """Return whether a cell holds a number, NaN and infinity among them."""
+    """Whether a cell holds a number, NaN and infinity among them."""
     try:
         float(text)
     except ValueError:

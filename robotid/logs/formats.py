@@ -1,55 +1,30 @@
 """Tables in files: named columns of numbers in any format that is known by its suffix."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from pathlib import Path
 
 from robotid._files import written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.logs.arrays import open_hdf5, open_mat, open_npz, write_hdf5, write_mat, write_npz
-from robotid.logs.bags import open_bag
-from robotid.logs.csv_files import open_csv, write_csv
-from robotid.logs.parquet_files import open_parquet, write_parquet
+from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
+from robotid.logs.bags import BagFormat
+from robotid.logs.csv_files import CsvFormat
+from robotid.logs.parquet_files import ParquetFormat
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Table
+from robotid.logs.table import Format, Table, WritableFormat
 
 __all__ = ["open_table", "write_columns"]
 
-
-@dataclass(frozen=True)
-class _Format:
-    """How one format is opened and, if it is, written."""
-
-    open: Callable[[Path, LogSource], Table]
-    write: Callable[[Mapping[str, Array], Path], None] | None = None
-
-
-def _without_topics(open_file: Callable[[Path], Table]) -> Callable[[Path, LogSource], Table]:
-    """Return the opener of a format that has one table; a topic that is stated is noted."""
-
-    def open_only(path: Path, source: LogSource) -> Table:
-        table = open_file(path)
-        if source.topic is None:
-            return table
-        note = f"the topic {source.topic!r} is not used: {path.suffix} files have none"
-        return replace(table, notes=(note,))
-
-    return open_only
-
-
-_HDF5 = _Format(open_hdf5, write_hdf5)
-_BAG = _Format(open_bag)
-_FORMATS = {
-    ".csv": _Format(_without_topics(open_csv), write_csv),
-    ".parquet": _Format(_without_topics(open_parquet), write_parquet),
-    ".npz": _Format(open_npz, write_npz),
-    ".h5": _HDF5,
-    ".hdf5": _HDF5,
-    ".mat": _Format(open_mat, write_mat),
-    ".mcap": _BAG,
-    ".db3": _BAG,
-    ".bag": _BAG,
+_FORMATS: dict[str, Format] = {
+    ".csv": CsvFormat(),
+    ".parquet": ParquetFormat(),
+    ".npz": NpzFormat(),
+    ".h5": Hdf5Format(),
+    ".hdf5": Hdf5Format(),
+    ".mat": MatFormat(),
+    ".mcap": BagFormat(),
+    ".db3": BagFormat(),
+    ".bag": BagFormat(),
 }
 
 
@@ -68,7 +43,7 @@ def open_table(path: Path, source: LogSource) -> Table:
         MissingDependencyError: If a package that reads it is not installed.
     """
     if path.is_dir():
-        return open_bag(path, source)
+        return BagFormat().open(path, source)
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         raise DataError(
@@ -94,14 +69,14 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
         MissingDependencyError: If a package that writes it is not installed.
         OSError: If the folder cannot be written to.
     """
-    written = {suffix: f.write for suffix, f in _FORMATS.items() if f.write is not None}
+    written = {suffix: f for suffix, f in _FORMATS.items() if isinstance(f, WritableFormat)}
     suffix = path.suffix.lower()
     if suffix not in written:
         raise DataError(
             f"{path.name}: logs are written as {_listed(list(written))} files, not {suffix!r}"
         )
     with written_whole(path) as beside:
-        written[suffix](table, beside)
+        written[suffix].write(table, beside)
 
 
 def _listed(words: list[str]) -> str:

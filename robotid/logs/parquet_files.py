@@ -12,44 +12,26 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
-from robotid.logs.table import Place, RowReader, Table
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Place, RowReader, Table, WritableFormat, told, topic_note
 
-__all__ = ["load_pyarrow", "open_parquet", "write_parquet"]
+__all__ = ["ParquetFormat", "load_pyarrow"]
 
 _BATCH = 16384  # rows decoded at a time, where not all are wanted
 _BUFFER = 2**16  # bytes of each column read at a time there, not whole row groups
 
 
-def open_parquet(path: Path) -> Table:
-    """Return the table in a Parquet file.
+class ParquetFormat(WritableFormat):
+    """Parquet files; null becomes NaN."""
 
-    Args:
-        path: The file.
+    def open(self, path: Path, source: LogSource) -> Table:
+        with _open(path) as file:
+            names = list(file.schema_arrow.names)
+        return Table(names, partial(_read, path), topic_note(path, source), _ParquetRows(path))
 
-    Returns:
-        The table; null becomes NaN.
-
-    Raises:
-        DataError: If the file is broken, or a column read holds no numbers.
-        MissingDependencyError: If pyarrow is not installed.
-    """
-    with _open(path) as file:
-        names = list(file.schema_arrow.names)
-    return Table(names, partial(_read, path), rows=_ParquetRows(path))
-
-
-def write_parquet(table: Mapping[str, Array], path: Path) -> None:
-    """Write columns as Parquet.
-
-    Args:
-        table: Arrays of shape (N,) by name.
-        path: The file.
-
-    Raises:
-        MissingDependencyError: If pyarrow is not installed.
-    """
-    pa = load_pyarrow("writing Parquet")
-    pa.parquet.write_table(pa.table(dict(table)), path)
+    def write(self, table: Mapping[str, Array], path: Path) -> None:
+        pa = load_pyarrow("writing Parquet")
+        pa.parquet.write_table(pa.table(dict(table)), path)
 
 
 def load_pyarrow(purpose: str) -> ModuleType:
@@ -57,9 +39,6 @@ def load_pyarrow(purpose: str) -> ModuleType:
 
     Args:
         purpose: What it is needed for, as "reading Parquet".
-
-    Returns:
-        The package.
 
     Raises:
         MissingDependencyError: If it is not installed.
@@ -75,8 +54,6 @@ def load_pyarrow(purpose: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class _ParquetRows(RowReader):
-    """Rows of a Parquet file; see ``RowReader``."""
-
     path: Path
 
     def count(self) -> int:
@@ -120,17 +97,15 @@ class _ParquetRows(RowReader):
 
 @contextmanager
 def _open(path: Path, buffer: int = 0) -> Iterator[Any]:
-    """Open a Parquet file; what is wrong with it is told in our words."""
     pa = load_pyarrow("reading Parquet")
-    try:
-        with pa.parquet.ParquetFile(path, buffer_size=buffer) as file:
-            yield file
-    except (pa.ArrowInvalid, OSError) as error:
-        raise DataError(f"{path.name}: broken Parquet file ({error}); export it again") from error
+    with (
+        told(path, "Parquet", (pa.ArrowInvalid, OSError)),
+        pa.parquet.ParquetFile(path, buffer_size=buffer) as file,
+    ):
+        yield file
 
 
 def _read(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    """Return the wanted columns of a Parquet file; null becomes NaN."""
     with _open(path) as file:
         _check_types(file, wanted, path.name)
         table = file.read(columns=list(wanted))

@@ -1,14 +1,27 @@
 """What each file format gives: named columns, read whole or row by row."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.logs.settings import LogSource
 
-__all__ = ["Place", "RowReader", "Table", "choose", "prefixes"]
+__all__ = [
+    "Format",
+    "Place",
+    "RowReader",
+    "Table",
+    "WritableFormat",
+    "choose",
+    "prefixes",
+    "told",
+    "topic_note",
+]
 
 _PREFIXES = {
     "q": ("q_", "position_"),
@@ -84,6 +97,40 @@ class Table:
     rows: RowReader | None = None
 
 
+class Format(ABC):
+    """How one format of files is read."""
+
+    @abstractmethod
+    def open(self, path: Path, source: LogSource) -> Table:
+        """Return the table in a file; what is wrong with a column is told when it is read.
+
+        Args:
+            path: The file.
+            source: Which topic, group or struct of it, and which clock.
+
+        Raises:
+            DataError: If the file is broken, or its table is missing or one of several.
+            MissingDependencyError: If a package that reads it is not installed.
+        """
+
+
+class WritableFormat(Format):
+    """A format that is also written."""
+
+    @abstractmethod
+    def write(self, table: Mapping[str, Array], path: Path) -> None:
+        """Write columns to a file.
+
+        Args:
+            table: Arrays of shape (N,) by name.
+            path: The file.
+
+        Raises:
+            DataError: If the format cannot hold a name.
+            MissingDependencyError: If a package that writes it is not installed.
+        """
+
+
 def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:
     """Return how columns start, by quantity: the standard prefix first, then its aliases.
 
@@ -122,3 +169,33 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
         f'"{sorted(found)[0]}" (job file table [log], CLI --topic, Python '
         "source=LogSource(topic=...))"
     )
+
+
+def topic_note(path: Path, source: LogSource) -> tuple[str, ...]:
+    """Return the note that a topic is stated for a format that has one table, if it is.
+
+    Args:
+        path: The file.
+        source: Where in it.
+    """
+    if source.topic is None:
+        return ()
+    return (f"the topic {source.topic!r} is not used: {path.suffix} files have none",)
+
+
+@contextmanager
+def told(path: Path, kind: str, errors: tuple[type[Exception], ...]) -> Iterator[None]:
+    """Tell in our words what a reader says of a broken file.
+
+    Args:
+        path: The file.
+        kind: Name of its format.
+        errors: What the reader raises.
+
+    Raises:
+        DataError: In the place of those.
+    """
+    try:
+        yield
+    except errors as error:
+        raise DataError(f"{path.name}: broken {kind} file ({error}); export it again") from error

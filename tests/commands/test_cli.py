@@ -7,7 +7,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.export.sidecar import load_identified
+from robotid.export.urdf import load_identified
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

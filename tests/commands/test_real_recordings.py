@@ -8,7 +8,7 @@ import pytest
 from robotid.commands.identify import run_job
 from robotid.commands.job import read_job
 from robotid.export.result import read_result
-from robotid.export.sidecar import load_identified
+from robotid.export.urdf import load_identified
 from robotid.identification.evaluation import predict
 from robotid.robot.parameters import pseudo_inertia
 

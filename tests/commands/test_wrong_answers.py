@@ -12,8 +12,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings, read_job
-from robotid.export.sidecar import load_identified
-from robotid.export.urdf import write_urdf
+from robotid.export.urdf import load_identified, write_urdf
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log

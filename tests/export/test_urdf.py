@@ -8,8 +8,7 @@ import pytest
 
 from robotid.exceptions import DataError, ModelError
 from robotid.export import urdf
-from robotid.export.sidecar import load_identified, read_sidecar
-from robotid.export.urdf import write_urdf
+from robotid.export.urdf import load_identified, read_sidecar, write_urdf
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel

@@ -41,7 +41,7 @@ def test_elements_know_their_bytes():
     document = parse(data, "x.urdf")
     with_end, without = document.root.find_all("l")
     assert data[with_end.start : with_end.end] == b'<l n="a>b"><i/></l  >'
-    assert data[with_end.inside : with_end.close] == b"<i/>"
+    assert data[with_end.inside : with_end.end] == b"<i/></l  >"
     assert data[without.start : without.end] == b"<l n='/'/>"
     assert (with_end.is_self_closing, without.is_self_closing) == (False, True)
     assert with_end.attributes == {"n": "a>b"}

@@ -8,8 +8,7 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.job import job_from_settings
-from robotid.export.sidecar import load_identified, read_sidecar
-from robotid.export.urdf import write_urdf
+from robotid.export.urdf import load_identified, read_sidecar, write_urdf
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
