@@ -15,8 +15,8 @@ from robotid.paper.planar_2r import (
     regressor,
 )
 from robotid.paper.study import AMPLITUDE, DURATION, MODELS, paper_arm
-from robotid.simulation.integration import rk4
 from robotid.simulation.motions import ProgramMotion
+from robotid.simulation.plant import rk4
 
 __all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
 

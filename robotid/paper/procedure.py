@@ -24,8 +24,8 @@ from robotid.paper.formulas import (
     recursive_update,
     reference_acceleration,
 )
-from robotid.simulation.integration import rk4
 from robotid.simulation.motions import ProgramMotion
+from robotid.simulation.plant import rk4
 
 __all__ = ["History", "Influences", "LoopSettings", "random_torque", "run_procedure"]
 

@@ -10,9 +10,8 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
-from robotid.simulation.integration import rk4
 from robotid.simulation.motions import Motion
-from robotid.simulation.plant import RobotPlant
+from robotid.simulation.plant import RobotPlant, rk4
 
 __all__ = ["Noise", "another_robot", "simulate"]
 
@@ -46,7 +45,7 @@ def simulate(
     rng: np.random.Generator,
     noise: Noise | None = None,
 ) -> Log:
-    """Simulate a robot that tracks a motion, and return what its sensors log.
+    """Return what the sensors of a simulated robot log, v and the torque u, as it tracks a motion.
 
     The plant is M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u with the parameters pi,
     integrated by Runge-Kutta of order 4. The controller knows the model's own inertias only, not
@@ -60,9 +59,6 @@ def simulate(
         duration: Length of the log [s].
         rng: Source of the noise.
         noise: Sensor noise; none if None.
-
-    Returns:
-        The log, with measured velocities and the torque u.
 
     Raises:
         DataError: If the base floats, or the simulation diverges.
@@ -95,15 +91,14 @@ def simulate(
 
 
 def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
-    """Return parameters of a robot like the model, but not the same.
+    """Return standard parameters, shape (p,), of a robot like the model, but not the same.
+
+    Every link is 10 to 30 % heavier or lighter, 1.2 kg more are at 10 cm from the last joint, the
+    drives have armature and friction.
 
     Args:
         model: The robot as its URDF describes it.
         rng: Source of the differences.
-
-    Returns:
-        Standard parameters, shape (p,): every link 10 to 30 % heavier or lighter, 1.2 kg more at
-        10 cm from the last joint, drives with armature and friction.
     """
     size = model.layout.n_inertial
     pi = model.standard_parameters()
@@ -125,9 +120,8 @@ class _TrackedPlant:
     def __init__(self, model: RobotModel, pi: Array) -> None:
         self.model, self.plant = model, RobotPlant(model, pi)
         self.data = model.pin_model.createData()
-        self.inertia = np.maximum(
-            np.diag(self.plant.mass_matrix(np.zeros(len(model.joints)))), 0.02
-        )
+        mass = self.plant.mass_matrix(np.zeros(len(model.joints)))
+        self.inertia = np.maximum(np.diag(mass), 0.02)
 
     def torque(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array) -> Array:
         """Return the controller's torque."""

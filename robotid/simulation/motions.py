@@ -11,6 +11,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "random_fourier"]
 
+_HARMONICS = 5  # of a random motion
 _ROTARY_REACH = 1.2  # [rad] amplitude of a joint whose limits are wider or unknown
 _LINEAR_REACH = 0.15  # [m]
 _ROTARY_SPEED = 1.5  # [rad/s] peak speed where the limit is higher or unknown
@@ -21,13 +22,10 @@ class Motion(Protocol):
     """A motion that a controller can track."""
 
     def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations.
+        """Return q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
 
         Args:
             t: Times, shape (N,) [s].
-
-        Returns:
-            q, v, a, each of shape (N, n) [rad, rad/s, rad/s^2 or m, m/s, m/s^2].
         """
 
 
@@ -96,13 +94,10 @@ class ProgramMotion(Motion):
             raise SettingsError(f"duration is {self.duration}, wanted a positive number")
 
     def evaluate(self, t: Array | float) -> tuple[Array, Array, Array]:
-        """Return positions, velocities and accelerations.
+        """Return q, v and a [as of ``Motion``], each of shape t.shape + (n,), or (R, n).
 
         Args:
             t: Times of one motion, any shape, or one per motion, shape (R,) [s].
-
-        Returns:
-            q [rad], v [rad/s] and a [rad/s^2] (or m), each of shape t.shape + (n,), or (R, n).
         """
         A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration)[..., None]
         s = np.clip(np.asarray(t, dtype=float)[..., None] / T, 0.0, 1.0)  # t / T
@@ -116,7 +111,6 @@ def random_fourier(
     model: RobotModel,
     rng: np.random.Generator,
     *,
-    harmonics: int = 5,
     period: float = 10.0,
     centre: Array | None = None,
 ) -> FourierTrajectory:
@@ -125,18 +119,14 @@ def random_fourier(
     Args:
         model: The robot; position and speed limits of its URDF are kept where it states them.
         rng: Source of the coefficients.
-        harmonics: Number h of harmonics.
         period: Period [s].
         centre: Mean position, shape (n,) [rad or m]; the middle of the limits, or 0, if None.
-
-    Returns:
-        The motion.
 
     Raises:
         DataError: If the centre lies outside the limits.
     """
     n = len(model.joints)
-    sine, cosine = rng.standard_normal((2, harmonics, n)) / np.arange(1, harmonics + 1)[:, None]
+    sine, cosine = rng.standard_normal((2, _HARMONICS, n)) / np.arange(1, _HARMONICS + 1)[:, None]
     middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
     mean = np.array(middle) if centre is None else centre
     reach, speed = np.empty(n), np.empty(n)

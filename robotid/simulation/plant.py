@@ -1,5 +1,7 @@
 """The true robot: forward dynamics by Pinocchio, with the drives that a URDF does not know."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 
@@ -9,7 +11,7 @@ from robotid.robot.drives import TERMS, DriveMotion
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["RobotPlant"]
+__all__ = ["RobotPlant", "rk4"]
 
 _SIGN_SPEED = 2e-3  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
 
@@ -20,20 +22,15 @@ class RobotPlant:
     The drives' terms are those of the model; sign(v) is tanh(v / 2 mm/s), so that it can be
     integrated; drives that turn with several joints load all of them.
 
-    Attributes:
-        model: The robot.
+    Args:
+        model: The robot, with a fixed base.
+        pi: Its true standard parameters, shape (p,), drive terms included.
+
+    Raises:
+        DataError: If the base floats, or pi does not have p entries.
     """
 
     def __init__(self, model: RobotModel, pi: Array) -> None:
-        """Build the plant.
-
-        Args:
-            model: The robot, with a fixed base.
-            pi: Its true standard parameters, shape (p,), drive terms included.
-
-        Raises:
-            DataError: If the base floats, or pi does not have p entries.
-        """
         if model.free_flyer:
             raise DataError("a robot with a floating base cannot be simulated without contacts")
         if pi.shape != (len(model.layout.names),):
@@ -48,27 +45,21 @@ class RobotPlant:
         self._armature = drive_inertia(model.layout, pi)
 
     def mass_matrix(self, q: Array) -> Array:
-        """Return D(q), the mass matrix with the drives' armature.
+        """Return D(q), the mass matrix with the drives' armature, shape (n, n).
 
         Args:
             q: Joint coordinates, shape (n,) [rad or m].
-
-        Returns:
-            Mass matrix, shape (n, n).
         """
         x = self.model.configurations(q[None])
         mass: Array = rigid_mass_matrices(self._bodies, x, self._data)[0] + self._armature
         return mass
 
     def bias(self, q: Array, v: Array) -> Array:
-        """Return C(q, v), the torque of Coriolis, centrifugal, gravity and friction forces.
+        """Return C(q, v), Coriolis, centrifugal, gravity and friction torque, (n,) [N m or N].
 
         Args:
             q: Joint coordinates, shape (n,) [rad or m].
             v: Joint velocities, shape (n,) [rad/s or m/s].
-
-        Returns:
-            Torque, shape (n,) [N m or N].
         """
         G, L = self.model.velocity_map, self.model.layout.drive_ratios.T
         pin_model, x = self._bodies.pin_model, self.model.configurations(q[None])[0]
@@ -79,15 +70,12 @@ class RobotPlant:
         return bias
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
-        """Return the acceleration that a torque gives, a = D(q)^-1 (u - C(q, v)).
+        """Return the acceleration of a torque, D(q)^-1 (u - C(q, v)) [rad/s^2 or m/s^2], as q.
 
         Args:
             q: Joint coordinates, shape (n,), or (R, n) for R robots [rad or m].
             v: Joint velocities, shape as q [rad/s or m/s].
             u: Torque, shape as q [N m or N].
-
-        Returns:
-            Acceleration, shape as q [rad/s^2 or m/s^2].
 
         References:
             Tzvetkova, (11).
@@ -95,3 +83,29 @@ class RobotPlant:
         if q.ndim == 1:
             return np.linalg.solve(self.mass_matrix(q), u - self.bias(q, v))
         return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
+
+
+def rk4(
+    acceleration: Callable[[Array, Array, float], Array],
+    q: Array,
+    v: Array,
+    h: float | Array,
+    a: Array | None = None,
+) -> tuple[Array, Array]:
+    """Return positions and velocities one step later, by Runge-Kutta of order 4.
+
+    Args:
+        acceleration: Acceleration of a state q, v at a share of the step, 0, 0.5 or 1.
+        q: Positions, any shape [rad or m].
+        v: Velocities, shape as q.
+        h: Length of the step, a number or a shape that multiplies q [s].
+        a: Accelerations at the start of the step, where they are known.
+    """
+    a1 = acceleration(q, v, 0.0) if a is None else a
+    v2 = v + h / 2 * a1
+    a2 = acceleration(q + h / 2 * v, v2, 0.5)
+    v3 = v + h / 2 * a2
+    a3 = acceleration(q + h / 2 * v2, v3, 0.5)
+    v4 = v + h * a3
+    a4 = acceleration(q + h * v3, v4, 1.0)
+    return q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)

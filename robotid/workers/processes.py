@@ -1,7 +1,7 @@
 """Work on pieces: in this process, in worker processes, or by another backend.
 
 Every piece is worked on by itself with one BLAS thread, so what it comes down to has the same bits
-wherever that is done; results come back in the order of the pieces.
+wherever that is done.
 """
 
 import logging
@@ -13,17 +13,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import islice
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Self
 
 from threadpoolctl import threadpool_limits
 
-from robotid._typing import ProgressCallback, ignore_progress
 from robotid.exceptions import SettingsError, WorkerError
-from robotid.regressor.factors import available_cores
-from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.pieces import Outcome, Work, Workload, run_task
 
 if TYPE_CHECKING:
@@ -33,13 +30,9 @@ __all__ = [
     "Backend",
     "ProcessBackend",
     "SerialBackend",
-    "choose_workers",
-    "map_pieces",
     "named",
     "require_workers",
 ]
-
-_WORTH_WORKERS = 500_000  # samples from which workers pay their start, about a second each
 
 _log = logging.getLogger(__name__)
 
@@ -174,107 +167,18 @@ class ProcessBackend(Backend):
             ) from error
 
 
-def map_pieces(
-    work: Work,
-    pieces: Sequence[Workload],
-    what: str,
-    *,
-    backend: Backend | None = None,
-    progress: ProgressCallback | None = None,
-    checkpoint: Checkpoint | None = None,
-) -> Iterator[Any]:
-    """Do the same with every piece; no more results are in memory than are ahead of their turn.
-
-    Args:
-        work: What to do with a piece.
-        pieces: The pieces.
-        what: What the work is called.
-        backend: Where it is done; in this process if None.
-        progress: Called with (what, samples done, samples in all, "samples").
-        checkpoint: Where results are kept, if they are reductions, and, if resumed, taken from.
-
-    Yields:
-        One result per piece, in order, with the same bits whatever the backend.
-
-    Raises:
-        DataError: If a row cannot be used.
-        WorkerError: If a worker ends before its work.
-    """
-    chosen, report = backend or SerialBackend(), progress or ignore_progress
-    kept = frozenset() if checkpoint is None else checkpoint.finished()
-    missing = [(k, piece) for k, piece in enumerate(pieces) if k not in kept]
-    total = sum(piece.samples for piece in pieces)
-    done = total - sum(piece.samples for _, piece in missing)
-    _log.info(
-        "%s %d pieces, %d of them kept from before, %d samples in all: %s",
-        what, len(pieces), len(kept), total, chosen.description,
-    )  # fmt: skip
-    report(what, done, total, "samples")
-    early: dict[int, Any] = {}
-    left = len(missing)
-    with _resumable(checkpoint), closing(chosen.run(work, missing)) as finished:  # type: ignore[type-var]
-        for k in range(len(pieces)):
-            while k not in kept and k not in early:
-                index, result = next(finished)
-                early[index] = result
-                if checkpoint is not None:
-                    checkpoint.save(index, pieces[index].name, result)
-                done += pieces[index].samples
-                report(what, done, total, "samples")
-                left -= 1
-                if not left:
-                    next(finished, None)  # there is none: the work ends, and is not broken off
-            yield early.pop(k) if checkpoint is None or k not in kept else checkpoint.load(k)
-
-
-def choose_workers(pieces: Sequence[Workload], workers: int | None = None) -> int:
-    """Return how many worker processes to use.
-
-    Args:
-        pieces: The work.
-        workers: What the user asked for, or None.
-
-    Returns:
-        The number asked for; else one per core where the work pays their start, otherwise 1; never
-        more than there are pieces.
-
-    Raises:
-        SettingsError: If fewer than one is asked for.
-    """
-    if workers is None:
-        is_long = sum(piece.samples for piece in pieces) >= _WORTH_WORKERS
-        workers = available_cores() if is_long else 1
-    return max(1, min(require_workers(workers), len(pieces)))
-
-
 def require_workers(workers: int) -> int:
-    """Return a number of workers.
+    """Return a number of workers, which must be at least 1.
 
     Args:
         workers: The number.
 
-    Returns:
-        The same.
-
     Raises:
-        SettingsError: If it is less than 1.
+        SettingsError: If it is less.
     """
     if workers < 1:
         raise SettingsError(f"workers is {workers}, wanted at least 1")
     return workers
-
-
-@contextmanager
-def _resumable(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Note on what stops the work where finished pieces are kept."""
-    try:
-        yield
-    except GeneratorExit:
-        raise
-    except BaseException as error:
-        if checkpoint is not None:
-            error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
-        raise
 
 
 @contextmanager

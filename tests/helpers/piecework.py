@@ -19,7 +19,8 @@ from robotid.regressor.factors import Factors
 from robotid.regressor.reduction import Reduction, join
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.pieces import Piece, reduce_piece
-from robotid.workers.processes import ProcessBackend, SerialBackend, map_pieces
+from robotid.workers.plan import map_pieces
+from robotid.workers.processes import ProcessBackend, SerialBackend
 
 NAMES = ("a", "b", "c", "d", "e")
 

@@ -19,7 +19,8 @@ from robotid.exceptions import (
 from robotid.regressor.factors import available_cores
 from robotid.regressor.reduction import Reduction, join
 from robotid.workers.pieces import reduce_piece
-from robotid.workers.processes import ProcessBackend, choose_workers
+from robotid.workers.plan import choose_workers
+from robotid.workers.processes import ProcessBackend
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "piecework.py"
 

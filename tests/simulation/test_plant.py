@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.simulation.integration import rk4
+from robotid.simulation.plant import rk4
 
 
 def swing(q, v, _):
