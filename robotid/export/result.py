@@ -43,16 +43,13 @@ def build_result(
     findings: Sequence[Finding] = (),
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of result.json, plain values only and all of them finite.
+    """Return the content of result.json, schema 1: plain values only, all of them finite.
 
     Args:
         identification: What was found.
         settings: The job, in the shape of its file.
         findings: Warnings.
         outputs: Files written beside it, by kind.
-
-    Returns:
-        The dictionary, schema_version 1.
     """
     model, size = identification.model, identification.model.layout.n_inertial
     return {
@@ -104,9 +101,6 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     Args:
         evaluation: The recording.
         name: Which parameters predict.
-
-    Returns:
-        The dictionary.
     """
     return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
 
@@ -187,13 +181,10 @@ def load_result(path: str | Path) -> Result:
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
-    """Read a result.json.
+    """Return the content of a result.json.
 
     Args:
         path: The file.
-
-    Returns:
-        Its content.
 
     Raises:
         DataError: If it is missing, no JSON, or of another schema.
@@ -218,14 +209,11 @@ def read_result(path: str | Path) -> dict[str, Any]:
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
-    """Return the standard parameters that a result states.
+    """Return the parameters that a result states, (p,), SI units, in ``layout.names`` order.
 
     Args:
         result: Content of a result.json.
         model: Its robot.
-
-    Returns:
-        Parameters, shape (p,), SI units, in ``layout.names`` order.
 
     Raises:
         ModelError: If a parameter of the robot is not in it.

@@ -127,14 +127,11 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
 
 
 def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, Array]:
-    """Return the model and the parameters of a URDF written with its sidecar.
+    """Return the model and the standard parameters, shape (p,), of a URDF with its sidecar.
 
     Args:
         urdf: The written URDF.
         sidecar: Its ``.drive.json``.
-
-    Returns:
-        The model, and its standard parameters with the drive terms, shape (p,).
 
     Raises:
         DataError: If the sidecar cannot be used.

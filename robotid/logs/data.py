@@ -60,14 +60,11 @@ class Log:
         return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
 
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
-        """Return the rows from start to end, both included.
+        """Return the log from start to end, both included.
 
         Args:
             start: First time stamp kept, on the log's own clock [s]; None for the first row.
             end: Last time stamp kept [s]; None for the last row.
-
-        Returns:
-            The shorter log.
 
         Raises:
             DataError: If fewer than two rows are left.
@@ -91,9 +88,6 @@ class Log:
 
         Args:
             joints: Names of the joints kept, in the order wanted.
-
-        Returns:
-            The narrower log.
 
         Raises:
             DataError: If a joint is not in the log.
@@ -180,9 +174,6 @@ class Trajectory:
         Args:
             start: First sample.
             stop: Sample after the last one; beyond the end means to the end.
-
-        Returns:
-            The samples.
         """
         window = slice(start, stop)
         arrays = {key: getattr(self, key)[window] for key in ("t", "q", "v", "a", "tau")}
@@ -191,27 +182,21 @@ class Trajectory:
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """Return the question whether the nearest known name was meant, or "" if none is near.
+    """Return ". Did you mean 'x'?" of the nearest known name, or "" if none is near.
 
     Args:
         name: The name that is not known.
         known: The names that are.
-
-    Returns:
-        A sentence to put behind an error, with a full stop and a space before it.
     """
     near = difflib.get_close_matches(name, known, n=1)
     return f". Did you mean {near[0]!r}?" if near else ""
 
 
 def repeated(names: Sequence[str]) -> list[str]:
-    """Return the names that occur more than once.
+    """Return the names that occur more than once, each once, sorted.
 
     Args:
         names: The names.
-
-    Returns:
-        Each repeated name once, sorted.
     """
     return sorted(name for name, count in Counter(names).items() if count > 1)
 

@@ -29,14 +29,11 @@ _FORMATS: dict[str, Format] = {
 
 
 def open_table(path: Path, source: LogSource) -> Table:
-    """Return the table in a file.
+    """Return the table in a file; what is wrong with a column is told when it is read.
 
     Args:
         path: A file of a known suffix, or the folder of a ROS 2 bag.
         source: Where in the file.
-
-    Returns:
-        The table; what is wrong with a column is told when it is read.
 
     Raises:
         DataError: If the file is missing, of another suffix or broken, or its table is not found.

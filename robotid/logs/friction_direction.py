@@ -15,7 +15,7 @@ _RETURN = 4.0  # a parabola from zero to the far edge of the band has 2 to 4
 
 
 def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
-    """Return the direction of Coulomb friction at each instant, between -1 and 1.
+    """Return the direction of Coulomb friction at each instant, between -1 and 1, shape (N, c).
 
     It is the sign of the speed. A drive that sticks comes to rest at once and leaves again later:
     its friction holds whatever torque there is, from one bound to the other, while a smooth speed
@@ -28,9 +28,6 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
         w: Smooth speeds, shape (N, c) [rad/s or m/s].
         band: Speed from which the sign is sure [rad/s or m/s]; 0: everywhere.
         longest: Longest time that a drive sticks; what is slow for longer keeps its signs [s].
-
-    Returns:
-        Directions, shape (N, c) [-].
 
     References:
         Karnopp (1985), Computer simulation of stick-slip friction in mechanical dynamic systems.

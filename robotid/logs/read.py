@@ -39,7 +39,7 @@ def read_log(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
 ) -> Log:
-    """Return the log in a file.
+    """Return the log in a file, in SI units; its notes tell what was ignored.
 
     Args:
         path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, or the folder of
@@ -53,9 +53,6 @@ def read_log(
         units: Units of the file, if not SI.
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
-
-    Returns:
-        The log in SI units; its notes tell what was ignored.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -100,13 +97,10 @@ class LogLayout:
         return [name for names in self.columns.values() for name in names]
 
     def stamps(self, values: Array) -> Array:
-        """Return time stamps in seconds.
+        """Return time stamps in seconds, same shape.
 
         Args:
             values: The time column.
-
-        Returns:
-            Its values in seconds, same shape.
         """
         return values / PER_SECOND[self.units.time or "s"]
 
@@ -116,9 +110,6 @@ class LogLayout:
         Args:
             table: The wanted columns by name.
             first: Number in the file of their first row.
-
-        Returns:
-            The log.
 
         Raises:
             DataError: If a value is not finite, or time does not increase.
@@ -160,7 +151,7 @@ def lay_out(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
 ) -> tuple[LogLayout, Table]:
-    """Return which columns of a file make up a log, before any is read.
+    """Return which columns of a file make up a log, before any is read, and its opened table.
 
     Args:
         path: The file.
@@ -170,9 +161,6 @@ def lay_out(
         units: As of ``read_log``.
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
-
-    Returns:
-        The layout and the opened table.
 
     Raises:
         DataError: If the file does not hold what is wanted.

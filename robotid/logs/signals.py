@@ -65,7 +65,7 @@ def decide(
     has_acceleration: bool,
     lag: Callable[[], float],
 ) -> SignalSettings:
-    """Return the settings with everything automatic decided, from a few facts of the log.
+    """Return the settings as of ``resolve``, decided from a few facts of the log.
 
     Args:
         settings: The settings as the user gave them.
@@ -74,9 +74,6 @@ def decide(
         has_velocity: Whether it has measured velocities.
         has_acceleration: Whether it has measured accelerations.
         lag: Returns how late the measured velocity is [s]; called if that matters.
-
-    Returns:
-        The settings, as of ``resolve``.
 
     Raises:
         DataError: If measured velocity or acceleration is asked for and the log has none.
@@ -115,16 +112,13 @@ def decide(
 
 
 def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> Trajectory:
-    """Return the smooth trajectory of a log.
+    """Return the smooth trajectory of a log, with a ``segment`` number per stretch without a gap.
 
     Args:
         log: The log.
         settings: The settings; what is automatic in them is resolved first.
         speeds: As of ``process_stretches``; a model with Coulomb friction
             needs them wherever a filter smears its torque.
-
-    Returns:
-        The trajectory; rows of one uninterrupted stretch share a ``segment`` number.
 
     Raises:
         DataError: If no stretch is long enough.
@@ -145,16 +139,14 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
 
 
 def velocity_lag(log: Log) -> float:
-    """Return how late the measured velocity is against the derivative of the position.
+    """Return how late the measured velocity is against the derivative of the position [s].
 
     The delay minimises the distance between the measured velocity and the delayed derivative,
-    summed over the joints; found on a uniform grid and refined by a parabola.
+    summed over the joints; found on a uniform grid and refined by a parabola. It is positive if
+    the measured velocity is late, and 0 if the joints stand still.
 
     Args:
         log: A log with measured velocities.
-
-    Returns:
-        Delay [s]; positive if the measured velocity is late; 0 if the joints stand still.
 
     Raises:
         DataError: If the log has no velocities.
@@ -209,13 +201,10 @@ def unwrap(log: Log, is_free: Array) -> Log:
 
 
 def turns_note(joints: Sequence[str]) -> str:
-    """Return what the reader should know where full turns were taken out.
+    """Return the note that full turns were taken out.
 
     Args:
         joints: Names of the joints.
-
-    Returns:
-        The note.
     """
     return f"full turns taken out of the angle of {listed(joints)}"
 

@@ -118,15 +118,12 @@ def filter_reach(settings: SignalSettings) -> float:
 
 
 def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
-    """Return values after the zero-phase Butterworth filter.
+    """Return values after the zero-phase Butterworth filter, same shape; as they are without one.
 
     Args:
         values: Values over time, shape (N, ...).
         rate: Rows per second.
         settings: The settings.
-
-    Returns:
-        The filtered values, or the same without a cut-off; same shape.
     """
     if settings.cutoff is None or len(values) < 2:
         return values
@@ -145,9 +142,6 @@ def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError
         where: What the log is called.
         stretches: How many uninterrupted stretches it has.
         settings: The settings.
-
-    Returns:
-        The error.
     """
     return DataError(
         f"{where}: none of its {stretches} uninterrupted stretches is long "

@@ -67,16 +67,13 @@ class RowReader(ABC):
 
     @abstractmethod
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
-        """Return some rows.
+        """Return the columns of some rows by name, each (stop - first,); a missing value is NaN.
 
         Args:
             wanted: Names of the columns.
             first: First row.
             stop: Row after the last one.
             near: A place that ``scan`` told, at or before the first row.
-
-        Returns:
-            The columns by name, each of shape (stop - first,); a missing value is NaN.
         """
 
 
@@ -136,9 +133,6 @@ def prefixes(effort: str = "torque") -> dict[str, tuple[str, ...]]:
 
     Args:
         effort: What effort is: "torque" or "current".
-
-    Returns:
-        The prefixes of q, dq, ddq, tau and current.
     """
     if effort == "torque":
         return dict(_PREFIXES)
@@ -154,9 +148,6 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
         found: The places that would do, at least one.
         noun: What they are, as "topics of ...".
         listing: What the file holds, for the error.
-
-    Returns:
-        The place.
 
     Raises:
         DataError: If there are several.

@@ -14,14 +14,11 @@ _BLOCK = 2**17  # stamps looked at together
 
 
 def map_stamps(blocks: Iterable[Array], where: str) -> Array:
-    """Return the time stamps of a log, in a file that ends with the array.
+    """Return the time stamps of a log, shape (N,) [s], in a file that ends with the array.
 
     Args:
         blocks: The stamps, a block of rows at a time [s].
         where: What the log is called.
-
-    Returns:
-        All stamps, shape (N,) [s].
 
     Raises:
         DataError: If a stamp is not finite, or not after the one before.
@@ -51,13 +48,10 @@ def blocks_of(t: Array) -> Iterator[tuple[int, Array]]:
 
 
 def median_step(t: Array) -> float:
-    """Return the median time step; those of a long log are sorted in a temporary file.
+    """Return the median time step [s]; those of a long log are sorted in a temporary file.
 
     Args:
         t: The stamps, shape (N,), N >= 2 [s].
-
-    Returns:
-        The median [s].
     """
     if len(t) <= _BLOCK:
         return float(np.median(np.diff(t)))

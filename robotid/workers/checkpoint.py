@@ -56,9 +56,6 @@ class Checkpoint:
             pieces: The pieces.
             resume: Whether finished pieces of an interrupted run are used.
 
-        Returns:
-            The checkpoint.
-
         Raises:
             DataError: If the one to resume is of other inputs or cannot be read.
         """
@@ -85,13 +82,10 @@ class Checkpoint:
         return frozenset(int(path.stem.split("-")[1]) for path in self.folder.glob("piece-*.npz"))
 
     def load(self, index: int) -> Reduction:
-        """Return a reduction that is kept.
+        """Return a reduction that is kept, to the same bits.
 
         Args:
             index: Which piece.
-
-        Returns:
-            The reduction, to the same bits.
 
         Raises:
             DataError: If the file cannot be read or belongs to other inputs.

@@ -36,13 +36,10 @@ class Piece(Workload):
 
     @abstractmethod
     def reduce(self, *, threads: int | None = None) -> Reduction:
-        """Read the piece and reduce it to the factors of its base problem.
+        """Return the factors of the piece's base problem, of no samples if none of it is left.
 
         Args:
             threads: As of ``compress``; they do not change the result.
-
-        Returns:
-            The reduction; one of no samples if no sample of the piece is left.
 
         Raises:
             DataError: If a row cannot be used.
@@ -89,9 +86,6 @@ def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
         piece: The piece.
         threads: As of ``Piece.reduce``.
 
-    Returns:
-        The reduction.
-
     Raises:
         DataError: If a row cannot be used.
     """
@@ -99,15 +93,12 @@ def reduce_piece(piece: Piece, threads: int | None) -> Reduction:
 
 
 def run_task(work: Work, piece: Workload, level: int) -> Outcome:
-    """Work on a piece with one thread, and keep what is logged.
+    """Work on a piece with one thread; return the result and what was logged.
 
     Args:
         work: What to do with the piece.
         piece: The piece.
         level: Level from which on messages are kept.
-
-    Returns:
-        What the work returns, with the messages.
 
     Raises:
         DataError: If a row cannot be used.
