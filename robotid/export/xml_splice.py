@@ -32,23 +32,14 @@ _BOMS = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 
 @dataclass(frozen=True)
 class Element:
-    """One element and the bytes it takes.
+    """One element and the bytes it takes."""
 
-    Attributes:
-        tag: Its name as written, with the prefix.
-        attributes: Its attributes.
-        start: First byte of ``<tag``.
-        inside: First byte after the ``>`` that ends the start tag.
-        end: First byte after the element.
-        children: The elements directly inside.
-    """
-
-    tag: str
+    tag: str  # as written, with the prefix
     attributes: Mapping[str, str]
-    start: int
-    inside: int
-    end: int
-    children: tuple["Element", ...]
+    start: int  # first byte of "<tag"
+    inside: int  # first byte after the ">" that ends the start tag
+    end: int  # first byte after the element
+    children: tuple["Element", ...]  # the elements directly inside
 
     @property
     def is_self_closing(self) -> bool:
@@ -66,31 +57,19 @@ class Element:
 
 @dataclass(frozen=True)
 class Document:
-    """An XML file, read.
+    """An XML file, read."""
 
-    Attributes:
-        data: Its text in UTF-8; the offsets of the elements count these bytes.
-        root: Its outermost element.
-        codec: The codec of the file itself.
-    """
-
-    data: bytes
-    root: Element
-    codec: str
+    data: bytes  # its text in UTF-8; the offsets of the elements count these bytes
+    root: Element  # the outermost one
+    codec: str  # that of the file itself
 
 
 @dataclass(frozen=True)
 class Edit:
-    """A span of bytes and what comes in its place.
+    """A span of bytes and what comes in its place."""
 
-    Attributes:
-        start: First byte replaced.
-        stop: First byte kept again; equal to ``start`` to insert.
-        text: The new bytes.
-    """
-
-    start: int
-    stop: int
+    start: int  # first byte replaced
+    stop: int  # first byte kept again; equal to start to insert
     text: bytes
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -94,12 +94,8 @@ class _Entry:
     load: Callable[[], Any]
 
 
-@dataclass(frozen=True)
-class _Column:
-    """One column of an array; ``index`` None if the array is one."""
-
-    path: str
-    index: int | None = None
+#: Where a column is: the path of an array and the index in it, None if the array is one column.
+_Column: TypeAlias = tuple[str, int | None]
 
 
 def _table_of_arrays(where: str, entries: Mapping[str, _Entry], source: LogSource) -> Table:
@@ -161,7 +157,7 @@ def _columns_of(
     if len(shape) not in (1, 2) or (len(shape) == 2 and 0 in shape):
         return {}
     if slim and not is_wide:
-        return {name: _Column(path)}
+        return {name: (path, None)}
     count = 1 if slim else min(shape)
     if joints and is_wide and len(joints) != count:
         raise DataError(
@@ -169,23 +165,21 @@ def _columns_of(
             f"{listed(joints)}; give each joint one column"
         )
     names = joints if joints and len(joints) == count else [str(j) for j in range(count)]
-    return {f"{name}_{names[j]}": _Column(path, j) for j in range(count)}
+    return {f"{name}_{names[j]}": (path, j) for j in range(count)}
 
 
 def _read(
     where: str, entries: Mapping[str, _Entry], columns: Mapping[str, _Column]
 ) -> dict[str, Array]:
     """Return columns; each array is loaded once, and all must be of one length."""
-    paths = dict.fromkeys(column.path for column in columns.values())
-    loaded = {path: np.asarray(entries[path].load()) for path in paths}
+    loaded = {path: np.asarray(entries[path].load()) for path in {p for p, _ in columns.values()}}
     table: dict[str, Array] = {}
-    for name, column in columns.items():
-        values = loaded[column.path]
-        if column.index is None or values.size == max(values.shape):
+    for name, (path, index) in columns.items():
+        values = loaded[path]
+        if index is None or values.size == max(values.shape):
             values = values.ravel()
         else:
-            rows = values if values.shape[0] >= values.shape[1] else values.T
-            values = rows[:, column.index]
+            values = (values if values.shape[0] >= values.shape[1] else values.T)[:, index]
         table[name] = values.astype(np.float64)
     first = next(iter(table))
     for name, values in table.items():

@@ -57,7 +57,7 @@ class Log:
         return Path(self.path).name or "log"
 
     def __repr__(self) -> str:
-        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
+        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self)}>"
 
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
         """Return the log from start to end, both included.
@@ -78,10 +78,7 @@ class Log:
                 f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
             )
         kept = slice(rows[0], rows[-1] + 1)
-        cut: dict[str, Any] = {
-            name: x if x is None else x[kept] for name, x in self._arrays().items()
-        }
-        return replace(self, t=self.t[kept], **cut)
+        return replace(self, t=self.t[kept], **{k: x[kept] for k, x in self._arrays().items()})
 
     def select(self, joints: Sequence[str]) -> "Log":
         """Return the log of some joints.
@@ -99,14 +96,13 @@ class Log:
                     f"{suggestion(name, self.joints)}"
                 )
         kept = [self.joints.index(name) for name in joints]
-        cut: dict[str, Any] = {
-            name: x if x is None else x[:, kept] for name, x in self._arrays().items()
-        }
+        cut = {name: x[:, kept] for name, x in self._arrays().items()}
         return replace(self, joints=tuple(joints), **cut)
 
     def _arrays(self) -> dict[str, Any]:
-        """Return the arrays with a column per joint."""
-        return {"q": self.q, "tau": self.tau, "v": self.v, "a": self.a}
+        """Return the arrays with a column per joint, those that there are."""
+        arrays = {"q": self.q, "tau": self.tau, "v": self.v, "a": self.a}
+        return {name: x for name, x in arrays.items() if x is not None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +119,7 @@ class Trajectory:
         rate: Rate of the uniform grid [Hz]; None if the rows are as recorded.
         segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
         direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
-            shape (N, c) [-], in the order of ``friction_speeds``; None: the
-            sign of the speed itself.
+            shape (N, c) [-], in the order of ``friction_speeds``; None: the speed's own sign.
     """
 
     t: Array
@@ -161,7 +156,7 @@ class Trajectory:
 
     def __repr__(self) -> str:
         stretches = len(np.unique(self.segment))
-        return f"<Trajectory: {_extent(self.t, self.joints, self.rate)}, in {stretches} stretches>"
+        return f"<Trajectory: {_extent(self, self.rate)}, in {stretches} stretches>"
 
     @property
     def squares(self) -> Array:
@@ -175,10 +170,9 @@ class Trajectory:
             start: First sample.
             stop: Sample after the last one; beyond the end means to the end.
         """
-        window = slice(start, stop)
-        arrays = {key: getattr(self, key)[window] for key in ("t", "q", "v", "a", "tau")}
-        direction = None if self.direction is None else self.direction[window]
-        return replace(self, segment=self.segment[window], direction=direction, **arrays)
+        names = ["t", "q", "v", "a", "tau", "segment"]
+        names += [] if self.direction is None else ["direction"]
+        return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
@@ -299,8 +293,9 @@ def _stamp(t: float) -> str:
     return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
 
 
-def _extent(t: Array, joints: Sequence[str], rate: float | None = None) -> str:
+def _extent(motion: Log | Trajectory, rate: float | None = None) -> str:
     """Return in words which joints are recorded, how long and how often."""
+    t, joints = motion.t, motion.joints
     often = 1.0 / float(np.median(np.diff(t))) if rate is None and len(t) > 1 else rate or np.nan
     return (
         f"{len(t)} samples of {len(joints)} joints ({', '.join(joints)}) over "

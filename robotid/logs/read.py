@@ -69,27 +69,16 @@ def read_log(
 
 @dataclass(frozen=True)
 class LogLayout:
-    """Which columns of a file make up a log, and how.
-
-    Attributes:
-        path: The file.
-        joints: Names of the joints, in the order wanted.
-        columns: Names in the file by quantity: "time", "q", "tau", and "dq" and "ddq" if complete.
-        factors: What makes each torque column a torque, by joint.
-        units: Units of the file.
-        prismatic: Names of joints that slide.
-        source: Where in the file.
-        notes: What the reader should know.
-    """
+    """Which columns of a file make up a log, and how."""
 
     path: str
-    joints: tuple[str, ...]
-    columns: Mapping[str, Sequence[str]]
-    factors: tuple[float, ...]
-    units: LogUnits
-    prismatic: tuple[str, ...]
-    source: LogSource
-    notes: tuple[str, ...]
+    joints: tuple[str, ...]  # in the order wanted
+    columns: Mapping[str, Sequence[str]]  # names in the file of "time", "q", "tau", "dq", "ddq"
+    factors: tuple[float, ...]  # what makes each torque column a torque, by joint
+    units: LogUnits  # of the file
+    prismatic: tuple[str, ...]  # names of joints that slide
+    source: LogSource  # where in the file
+    notes: tuple[str, ...]  # what the reader should know
 
     @property
     def wanted(self) -> list[str]:
@@ -175,11 +164,16 @@ def lay_out(
         file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, [*opened.notes]
     )
     found = finder.find_all()  # names of columns by kind
-    factors = finder.factors(found["tau"])
     layout = LogLayout(
-        str(file), tuple(joints), found, tuple(factors.tolist()), units, tuple(prismatic), source,
-        tuple(finder.notes),
-    )  # fmt: skip
+        path=str(file),
+        joints=tuple(joints),
+        columns=found,
+        factors=finder.factors(found["tau"]),
+        units=units,
+        prismatic=tuple(prismatic),
+        source=source,
+        notes=tuple(finder.notes),
+    )
     return layout, opened
 
 
@@ -197,7 +191,11 @@ def write_log(log: Log, path: str | Path) -> None:
         MissingDependencyError: If a package that writes the format is not installed.
         OSError: If the folder cannot be written to.
     """
-    write_columns(_to_table(log), Path(path))
+    table = {"time": log.t}
+    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
+        if values is not None:
+            table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    write_columns(table, Path(path))
 
 
 @dataclass(frozen=True)
@@ -231,10 +229,10 @@ class _Finder:
             )
         return found
 
-    def factors(self, torques: Sequence[str]) -> Array:
-        """Return what makes each column a torque, shape (n,): a current's gain, or 1."""
+    def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
+        """Return what makes each of n columns a torque: a current's gain, or 1."""
         currents = {self._find_of("current", joint): joint for joint in self.joints}
-        return np.array([self.gains[currents[n]] if n in currents else 1.0 for n in torques])
+        return tuple(float(self.gains[currents[n]]) if n in currents else 1.0 for n in torques)
 
     def _check_arguments(self) -> None:
         """Refuse names twice in the file, and gains and columns of what is not read."""
@@ -243,19 +241,11 @@ class _Finder:
                 f"{self.where} has more than one column {listed(twice)}; rename or remove one"
             )
         for joint, gain in self.gains.items():
-            if joint not in self.joints:
-                raise SettingsError(
-                    f"{self.where}: a gain is given for {joint!r}, which is not among the joints "
-                    f"read: {listed(self.joints)}{suggestion(joint, self.joints)}"
-                )
+            self._require_read(joint, "a gain is given for")
             if not np.isfinite(gain) or gain == 0:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
         for joint in self.source.joints:
-            if joint not in self.joints:
-                raise SettingsError(
-                    f"{self.where}: log.joints renames {joint!r}, which is not among the joints "
-                    f"read: {listed(self.joints)}{suggestion(joint, self.joints)}"
-                )
+            self._require_read(joint, "log.joints renames")
         known = ["time", *(f"{kind}_{joint}" for kind in prefixes() for joint in self.joints)]
         for standard, name in self.columns.items():
             if standard not in known:
@@ -268,6 +258,13 @@ class _Finder:
                     f"{self.where} has no column {name!r}, which columns gives for {standard!r}; "
                     f"columns found: {listed(self.names)}{suggestion(name, self.names)}"
                 )
+
+    def _require_read(self, joint: str, what: str) -> None:
+        if joint not in self.joints:
+            raise SettingsError(
+                f"{self.where}: {what} {joint!r}, which is not among the joints read: "
+                f"{listed(self.joints)}{suggestion(joint, self.joints)}"
+            )
 
     def _find(self, standard: str, aliases: Sequence[str]) -> str | None:
         """Return the column of one quantity, or None."""
@@ -284,12 +281,12 @@ class _Finder:
 
     def _find_of(self, kind: str, joint: str) -> str | None:
         """Return the column of one quantity of one joint, or None."""
-        named = self.source.joints.get(joint, joint)
-        return self._find(f"{kind}_{joint}", [prefix + named for prefix in self._prefixes()[kind]])
+        named, starts = self._named(joint), prefixes(self.source.effort)[kind]
+        return self._find(f"{kind}_{joint}", [prefix + named for prefix in starts])
 
-    def _prefixes(self) -> dict[str, tuple[str, ...]]:
-        """Return how columns start, by quantity."""
-        return prefixes(self.source.effort)
+    def _named(self, joint: str) -> str:
+        """Return the name of a joint in the file."""
+        return self.source.joints.get(joint, joint)
 
     def _find_torque(self, joint: str) -> str:
         """Return the column of a joint's torque, or of its current if that has a gain."""
@@ -325,10 +322,9 @@ class _Finder:
         """Refuse a file without a column, naming those of its kind and the nearest."""
         standard = f"{kind}_{joint}" if joint else kind
         noun = f"{_NOUNS[kind]} columns" if joint else "columns"
-        known = self._prefixes()
+        known, named = prefixes(self.source.effort), self._named(joint)
         starts = (*known.get(kind, ("",)), *(known["current"] if kind == "tau" else ()))
-        named = self.source.joints.get(joint, joint)
-        others = {self.source.joints.get(other, other) for other in self.joints}
+        others = {self._named(other) for other in self.joints}
         found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
         for name in self.names:
             for prefix in [prefix for prefix in starts if name.startswith(prefix)]:
@@ -336,23 +332,12 @@ class _Finder:
                 if name[len(prefix) :] not in others:
                     ends[name[len(prefix) :]] = name
         nearest = difflib.get_close_matches(named or kind, ends, n=1)
+        near = repr(ends[nearest[0]]) if nearest else "..."
+        hint = f"Did you mean {near}? " if nearest else ""
         sought = f"{kind}_{named}" if joint else kind
-        leave_out = (
-            f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
-        )
-        near, hint = (repr(ends[nearest[0]]), "Did you mean {}? ") if nearest else ("...", "")
+        stood = f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
         raise DataError(
-            f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. "
-            f"{hint.format(near)}"
-            f"Rename it, or pass columns={{{standard!r}: {near}}}{leave_out}",
+            f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
+            f"Rename it, or pass columns={{{standard!r}: {near}}}{stood}",
             code="missing_column",
         )
-
-
-def _to_table(log: Log) -> dict[str, Array]:
-    """Return the columns of a log by standard name."""
-    table = {"time": log.t}
-    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
-        if values is not None:
-            table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
-    return table

@@ -17,14 +17,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import Stretch, process_stretches, too_short
 
-__all__ = [
-    "decide",
-    "process",
-    "resolve",
-    "turns_note",
-    "unwrap",
-    "velocity_lag",
-]
+__all__ = ["decide", "process", "resolve", "turns_note", "unwrap", "velocity_lag"]
 
 _LATE = 0.02  # [s] a measured velocity that lags more than this is not used by "auto"
 _GAP_STEPS = 2.5  # a step longer than this many median steps may be a gap
@@ -79,35 +72,31 @@ def decide(
         DataError: If measured velocity or acceleration is asked for and the log has none.
         SettingsError: If the cut-off is not below half the rate.
     """
-    rate = settings.rate
-    if rate is None and settings.cutoff is not None:
+    rate, cutoff = settings.rate, settings.cutoff
+    if rate is None and cutoff is not None:
         rate = 1.0 / step
-    if settings.cutoff is not None and rate is not None and settings.cutoff >= rate / 2:
+    if cutoff is not None and rate is not None and cutoff >= rate / 2:
         raise SettingsError(
-            f"{where}: cutoff {settings.cutoff:g} Hz is not below half the rate "
-            f"{rate:g} Hz; lower the cutoff or set cutoff = false"
+            f"{where}: cutoff {cutoff:g} Hz is not below half the rate {rate:g} Hz; lower the "
+            "cutoff or set cutoff = false"
         )
-    velocity = settings.velocity
-    if velocity == "measured" and not has_velocity:
-        raise DataError(
-            f"{where} has no measured velocity for every joint; add dq_<joint> "
-            "columns, or set velocity = 'differentiated'"
-        )
+    measured = {"velocity": ("dq", has_velocity), "acceleration": ("ddq", has_acceleration)}
+    for quantity, (column, is_there) in measured.items():
+        if getattr(settings, quantity) == "measured" and not is_there:
+            raise DataError(
+                f"{where} has no measured {quantity} for every joint; add {column}_<joint> "
+                f"columns, or set {quantity} = 'differentiated'"
+            )
+    velocity, acceleration = settings.velocity, settings.acceleration
     if velocity == "auto":
         is_timely = has_velocity and lag() - settings.velocity_delay < _LATE
         velocity = "measured" if is_timely else "differentiated"
-    acceleration = settings.acceleration
-    if acceleration == "measured" and not has_acceleration:
-        raise DataError(
-            f"{where} has no measured acceleration for every joint; add ddq_<joint> "
-            "columns, or set acceleration = 'differentiated'"
-        )
     if acceleration == "auto":
         is_used = has_acceleration and velocity == "measured"
         acceleration = "measured" if is_used else "differentiated"
     gap = settings.max_gap
     if gap is None:
-        gap = max(_GAP_STEPS * step, _GAP_CYCLES / settings.cutoff if settings.cutoff else 0.0)
+        gap = max(_GAP_STEPS * step, _GAP_CYCLES / cutoff if cutoff else 0.0)
     return replace(settings, rate=rate, velocity=velocity, acceleration=acceleration, max_gap=gap)
 
 
@@ -117,8 +106,8 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
     Args:
         log: The log.
         settings: The settings; what is automatic in them is resolved first.
-        speeds: As of ``process_stretches``; a model with Coulomb friction
-            needs them wherever a filter smears its torque.
+        speeds: As of ``process_stretches``; a model with Coulomb friction needs them wherever a
+            filter smears its torque.
 
     Raises:
         DataError: If no stretch is long enough.
@@ -175,10 +164,8 @@ def unwrap(log: Log, is_free: Array) -> Log:
 
     Args:
         log: The log.
-        is_free: Which joints may, shape (n,), bool: continuous, or revolute without limits.
-
-    Returns:
-        The log; a note names the joints that were changed.
+        is_free: Which joints may, shape (n,), bool: continuous, or revolute without limits. A
+            note names those that were changed.
 
     Raises:
         DataError: If a joint with limits jumps by a full turn.

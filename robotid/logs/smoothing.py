@@ -25,21 +25,13 @@ _ALL = slice(None)
 
 @dataclass(frozen=True)
 class Stretch:
-    """A stretch of a log without a gap.
+    """A stretch of a log without a gap."""
 
-    Attributes:
-        first: Its first row.
-        stop: The row after its last one.
-        start: Time stamp of its first row [s].
-        end: Time stamp of its last row [s].
-        number: Number of the stretch.
-    """
-
-    first: int
-    stop: int
-    start: float
-    end: float
-    number: int = 0
+    first: int  # its first row
+    stop: int  # the row after its last one
+    start: float  # time stamp of its first row [s]
+    end: float  # time stamp of its last row [s]
+    number: int = 0  # of the stretch
 
     @property
     def rows(self) -> int:

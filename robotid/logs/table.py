@@ -34,17 +34,11 @@ _PREFIXES = {
 
 @dataclass(frozen=True)
 class Place:
-    """Where in a file a row starts.
+    """Where in a file a row starts."""
 
-    Attributes:
-        row: Number of the row.
-        line: Number of its line, of a text file.
-        offset: Bytes before it, of a text file.
-    """
-
-    row: int = 0
-    line: int = 0
-    offset: int = 0
+    row: int = 0  # its number
+    line: int = 0  # number of its line, of a text file
+    offset: int = 0  # bytes before it, of a text file
 
 
 class RowReader(ABC):
@@ -79,19 +73,12 @@ class RowReader(ABC):
 
 @dataclass(frozen=True)
 class Table:
-    """The columns of one file.
+    """The columns of one file."""
 
-    Attributes:
-        names: The columns, in the file's order.
-        read: Returns some of them by name, each of shape (N,); a missing value is NaN.
-        notes: What the reader should know.
-        rows: Reads the file row by row; None if its format is only read whole.
-    """
-
-    names: list[str]
-    read: Callable[[Sequence[str]], dict[str, Array]]
-    notes: tuple[str, ...] = ()
-    rows: RowReader | None = None
+    names: list[str]  # in the file's order
+    read: Callable[[Sequence[str]], dict[str, Array]]  # some by name, (N,); NaN where missing
+    notes: tuple[str, ...] = ()  # what the reader should know
+    rows: RowReader | None = None  # reads row by row; None if the format is only read whole
 
 
 class Format(ABC):

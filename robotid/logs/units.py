@@ -1,7 +1,6 @@
 """Units of a log: stated, or suspected and refused; never guessed."""
 
 from collections.abc import Collection
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,19 +36,18 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     Raises:
         DataError: If time, angle or the sign of the velocity is suspect.
     """
-    where = log.name
     turns = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
     if units.time is None:
-        _check_step(float(np.median(np.diff(log.t))), where)
-        _check_clock(log, factor, where)
+        _check_step(float(np.median(np.diff(log.t))), log.name)
+        _check_clock(log, factor)
     if units.angle is None:
         check_reach(log, units, prismatic)
-        _check_degrees(log, np.where(turns, factor, np.nan), where)
+        _check_degrees(log, np.where(turns, factor, np.nan))
     for j in np.flatnonzero(_is_near(factor, -1.0)):
         raise DataError(
-            f"{where}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of q_{log.joints[j]}. "
-            "Negate one of them in the recording, or leave the dq columns out",
+            f"{log.name}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of "
+            f"q_{log.joints[j]}. Negate one of them in the recording, or leave the dq columns out",
             code="velocity_sign",
         )
 
@@ -67,13 +65,13 @@ def _check_step(step: float, where: str) -> None:
     )
 
 
-def _check_clock(log: Log, factor: Array, where: str) -> None:
+def _check_clock(log: Log, factor: Array) -> None:
     """Refuse time stamps that make the measured velocity wrong by a power of 1000."""
     for power, unit in ((1, "ms"), (2, "us"), (3, "ns"), (-1, "s"), (-2, "s"), (-3, "s")):
         for j in np.flatnonzero(_is_near(np.abs(factor), 1000.0**power)):
             looks = f"; the time looks like {_TIME_NAMES[unit]}" if power > 0 else ""
             raise DataError(
-                f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt{looks}. "
+                f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt{looks}. "
                 f"{_how_to_state('time', unit, 's')}",
                 code="time_unit",
             )
@@ -97,20 +95,21 @@ def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     j = int(np.argmax(reach))
     if reach[j] > _FARTHEST:
         raise DataError(
-            f"{Path(log.path).name or 'log'}: q_{log.joints[j]} reaches {reach[j]:.4g}, which "
+            f"{log.name}: q_{log.joints[j]} reaches {reach[j]:.4g}, which "
             f"looks like degrees (in radians {reach[j] / (2 * np.pi):.1f} turns). "
             f"{_how_to_state('angle', 'deg', 'rad')}",
             code="angle_unit",
         )
 
 
-def _check_degrees(log: Log, factor: Array, where: str) -> None:
+def _check_degrees(log: Log, factor: Array) -> None:
     """Refuse joints of which only one of position and velocity is in degrees."""
     for wrong, ratio in (("velocity", _DEGREES), ("position", 1 / _DEGREES)):
         for j in np.flatnonzero(_is_near(np.abs(factor), ratio)):
             raise DataError(
-                f"{where}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the {wrong} "
-                "looks like degrees, the other like radians. Convert one of them in the recording. "
+                f"{log.name}: dq_{log.joints[j]} is {abs(factor[j]):.3g} times d(q)/dt: the "
+                f"{wrong} looks like degrees, the other like radians. Convert one of them in the "
+                "recording. "
                 f"{_how_to_state('angle', 'deg', 'rad', both=True)}",
                 code="angle_unit",
             )

@@ -22,17 +22,11 @@ _LONGEST_STEP = 0.005  # [s] of Runge-Kutta, whatever the rate of the log
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of white sensor noise; 0 for none.
+    """Standard deviations of white sensor noise; 0 for none."""
 
-    Attributes:
-        q: Of positions [rad or m].
-        v: Of velocities [rad/s or m/s].
-        tau: Of torques, as a share of each joint's root mean square torque [-].
-    """
-
-    q: float = 0.0
-    v: float = 0.0
-    tau: float = 0.0
+    q: float = 0.0  # of positions [rad or m]
+    v: float = 0.0  # of velocities [rad/s or m/s]
+    tau: float = 0.0  # of torques, as a share of each joint's root mean square torque [-]
 
 
 def simulate(

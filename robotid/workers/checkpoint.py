@@ -29,15 +29,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A folder with a file per finished piece, each for one set of inputs only.
-
-    Attributes:
-        folder: Where the files are.
-        key: SHA-256 of all that determines the reductions, in hexadecimal.
-    """
+    """A folder with a file per finished piece, each for one set of inputs only."""
 
     folder: Path
-    key: str
+    key: str  # SHA-256 of all that determines the reductions, in hexadecimal
 
     @classmethod
     def open(

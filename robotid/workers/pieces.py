@@ -52,15 +52,10 @@ Work: TypeAlias = Callable[[Any, int | None], Any]
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a worker sends home.
+    """What a worker sends home."""
 
-    Attributes:
-        result: What it made of its piece.
-        messages: Logger, level and text of what was logged meanwhile.
-    """
-
-    result: Any
-    messages: tuple[tuple[str, int, str], ...]
+    result: Any  # what it made of its piece
+    messages: tuple[tuple[str, int, str], ...]  # logger, level, text of what was logged meanwhile
 
     def log(self) -> None:
         """Log in this process what the worker had to say."""
