@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -107,15 +107,10 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What an identification wrote: a result.json, and the URDF and sidecar beside it.
+    """What an identification wrote: a result.json, and the URDF and sidecar beside it."""
 
-    Attributes:
-        path: The result.json.
-        content: What it holds.
-    """
-
-    path: Path
-    content: Mapping[str, Any]
+    path: Path  # of the result.json
+    content: Mapping[str, Any]  # what it holds
 
     def __repr__(self) -> str:
         return (
@@ -153,8 +148,7 @@ class Result:
     @property
     def verdict(self) -> Mapping[str, Any]:
         """How far to trust it: "status", "reasons" and "per_joint"."""
-        verdict: Mapping[str, Any] = self.content["verdict"]
-        return verdict
+        return dict(self.content["verdict"])
 
     @property
     def metrics(self) -> dict[str, Mapping[str, Any]]:
@@ -173,7 +167,7 @@ def load_result(path: str | Path) -> Result:
         The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and all of its content.
 
     Raises:
-        DataError: If it is missing, no JSON, or of another schema.
+        DataError: As of ``read_result``.
     """
     source = Path(path)
     source = source / "result.json" if source.is_dir() else source
@@ -230,26 +224,23 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
 
 def _inputs(identification: Identification) -> list[dict[str, Any]]:
     inputs = [{"role": "urdf", **_source(identification.model.tree.path)}]
-    for role, evaluations in (
-        ("identification", identification.fitted),
-        ("validation", identification.validation),
-    ):
-        for evaluation in evaluations:
-            recording = evaluation.recording
-            extent = recording.extent
-            inputs.append(
-                {
-                    "role": role,
-                    **_source(recording.log.path),
-                    "samples": extent.samples,
-                    "rate": extent.rate,
-                    "start": extent.start,
-                    "end": extent.end,
-                    "rows_used": extent.rows_used,
-                    "segments": extent.segments,
-                    "signals": dataclasses.asdict(recording.signals),
-                }
-            )
+    used = [("identification", e.recording) for e in identification.fitted]
+    used += [("validation", e.recording) for e in identification.validation]
+    for role, recording in used:
+        extent = recording.extent
+        inputs.append(
+            {
+                "role": role,
+                **_source(recording.log.path),
+                "samples": extent.samples,
+                "rate": extent.rate,
+                "start": extent.start,
+                "end": extent.end,
+                "rows_used": extent.rows_used,
+                "segments": extent.segments,
+                "signals": dataclasses.asdict(recording.signals),
+            }
+        )
     return inputs
 
 
@@ -259,48 +250,31 @@ def _source(path: str) -> dict[str, Any]:
 
 def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
     mapping, units = identification.mapping, identification.model.layout.units
-    return [
-        {
-            "name": name,
-            "expression": expression,
-            "value": float(value),
-            "std_error": _finite(error),
-            "interval_95": [_finite(end) for end in interval],
-            "unit": units[i],
-        }
-        for name, expression, value, error, interval, i in zip(
-            mapping.base_names,
-            mapping.expressions,
-            identification.base,
-            identification.base_error,
-            identification.base_interval,
-            mapping.independent,
-            strict=True,
-        )
-    ]
+    return _records(
+        name=mapping.base_names,
+        expression=mapping.expressions,
+        value=identification.base.tolist(),
+        std_error=map(_finite, identification.base_error),
+        interval_95=([_finite(end) for end in ends] for ends in identification.base_interval),
+        unit=(units[i] for i in mapping.independent),
+    )
 
 
 def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:
     layout = identification.model.layout
-    return [
-        {
-            "name": name,
-            "value": float(value),
-            "std_error": _finite(error),
-            "unit": unit,
-            "prior": float(prior),
-            "source": source,
-        }
-        for name, value, error, unit, prior, source in zip(
-            layout.names[part],
-            identification.standard[part],
-            identification.standard_error[part],
-            layout.units[part],
-            identification.prior[part],
-            identification.sources[part],
-            strict=True,
-        )
-    ]
+    return _records(
+        name=layout.names[part],
+        value=identification.standard[part].tolist(),
+        std_error=map(_finite, identification.standard_error[part]),
+        unit=layout.units[part],
+        prior=identification.prior[part].tolist(),
+        source=identification.sources[part],
+    )
+
+
+def _records(**columns: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return a dictionary for each row of some columns."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _consistency(identification: Identification) -> dict[str, Any]:

@@ -236,11 +236,8 @@ def _indent(document: Document, element: Element) -> bytes | None:
 
 def _unit(document: Document) -> bytes:
     """Return by how much the file indents: that of the first element inside the outermost one."""
-    for child in document.root.children:
-        indent = _indent(document, child)
-        if indent:
-            return indent
-    return b"  "
+    indents = (_indent(document, child) for child in document.root.children)
+    return next((indent for indent in indents if indent), b"  ")
 
 
 def _line_break(document: Document, indent: bytes | None) -> bytes:
