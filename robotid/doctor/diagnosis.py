@@ -6,7 +6,6 @@ unless its code is ignored.
 
 import difflib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from robotid.doctor.channels import (
@@ -93,10 +92,10 @@ def diagnose(
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
     for log, (motion, _) in zip(kept, motions[len(fitted) :], strict=True):
         if motion is not None:
-            findings += check_repeated_motion(first, motion, _name(log))
+            findings += check_repeated_motion(first, motion, log.name)
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     if probes:
-        names = ", ".join(_name(log) for log in fitted)
+        names = ", ".join(log.name for log in fitted)
         moving = [probe.motion for probe in probes]
         findings += check_excitation(model, structural_mapping(model), moving, signals, names)
     return by_severity(findings)
@@ -157,7 +156,7 @@ def _examine_log(
     model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
 ) -> tuple[Trajectory | None, Probe | None]:
     """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
-    name = _name(log)
+    name = log.name
     findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in log.notes]
     for check in (check_clock, check_gaps, check_stale_rows, check_quantisation, check_clipping):
         findings += check(log)
@@ -186,7 +185,3 @@ def _examine_log(
     if not any(finding.severity == "error" for finding in torques):
         findings += check_torque_delay(model, motion, signals, name)
     return motion, probe
-
-
-def _name(log: Log) -> str:
-    return Path(log.path).name or "log"

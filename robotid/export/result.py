@@ -54,7 +54,7 @@ def build_result(
     Returns:
         The dictionary, schema_version 1.
     """
-    model, verdict = identification.model, identification.verdict
+    model, size = identification.model, identification.model.layout.n_inertial
     return {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
@@ -65,7 +65,7 @@ def build_result(
         "inputs": _inputs(identification),
         "outputs": dict(outputs or {}),
         "structure": {
-            "standard": model.layout.n_inertial,
+            "standard": size,
             "base_inertial": len(structural_mapping(model, inertial_only=True).K),
             "base": len(identification.base),
             "rank": identification.determination.rank,
@@ -79,8 +79,8 @@ def build_result(
             "stretches": identification.errors.stretches,
             "inflation": identification.errors.inflation,
         },
-        "standard_parameters": _standard_parameters(identification),
-        "drive_parameters": _drive_parameters(identification),
+        "standard_parameters": _entries(identification, slice(0, size)),
+        "drive_parameters": _entries(identification, slice(size, None)),
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
@@ -94,7 +94,7 @@ def build_result(
             "identification": identification.metrics("wls").to_dict(),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
-        "verdict": verdict.to_dict(),
+        "verdict": identification.verdict.to_dict(),
     }
 
 
@@ -290,14 +290,6 @@ def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
             strict=True,
         )
     ]
-
-
-def _standard_parameters(identification: Identification) -> list[dict[str, Any]]:
-    return _entries(identification, slice(0, identification.model.layout.n_inertial))
-
-
-def _drive_parameters(identification: Identification) -> list[dict[str, Any]]:
-    return _entries(identification, slice(identification.model.layout.n_inertial, None))
 
 
 def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:

@@ -45,7 +45,7 @@ class Log:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        where = _where(self.path)
+        where = self.name
         _settle(self, where, {"q": self.q, "dq": self.v, "ddq": self.a, "tau": self.tau})
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
@@ -53,6 +53,11 @@ class Log:
 
     def __repr__(self) -> str:
         return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
+
+    @property
+    def name(self) -> str:
+        """Name of its file, "log" if it has none."""
+        return Path(self.path).name or "log"
 
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
         """Return the rows from start to end, both included.
@@ -72,7 +77,7 @@ class Log:
         rows = np.flatnonzero((self.t >= first) & (self.t <= last))
         if len(rows) < 2:
             raise DataError(
-                f"{_where(self.path)}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
+                f"{self.name}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
                 f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
             )
         kept = slice(rows[0], rows[-1] + 1)
@@ -96,7 +101,7 @@ class Log:
         for name in joints:
             if name not in self.joints:
                 raise DataError(
-                    f"joint {name!r} is not in {_where(self.path)}; joints: {listed(self.joints)}"
+                    f"joint {name!r} is not in {self.name}; joints: {listed(self.joints)}"
                     f"{suggestion(name, self.joints)}"
                 )
         kept = [self.joints.index(name) for name in joints]
@@ -307,11 +312,6 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
 def _stamp(t: float) -> str:
     """Return a time stamp with three decimals, or with as many as it has."""
     return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
-
-
-def _where(path: str) -> str:
-    """Return what a log is called in errors."""
-    return Path(path).name or "log"
 
 
 def _extent(t: Array, joints: Sequence[str], rate: float | None = None) -> str:

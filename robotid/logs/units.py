@@ -37,7 +37,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     Raises:
         DataError: If time, angle or the sign of the velocity is suspect.
     """
-    where = Path(log.path).name or "log"
+    where = log.name
     turns = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
     if units.time is None:

@@ -33,7 +33,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
 from robotid.simulation.motions import ProgramMotion
 from robotid.versions import __version__
-from robotid.viewer.replays import Torques, write_replay
+from robotid.viewer.replays import Torques, replay
 
 __all__ = ["run_paper"]
 
@@ -271,18 +271,13 @@ def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
     estimates = study.history.estimates[:, 0]
     last = len(estimates) - 1
     guesses = {"first guess": estimates[0], f"after {last} iterations": estimates[-1]}
-    write_replay(
-        arm,
+    torques = Torques(
         t,
-        q,
-        target,
-        torques=Torques(
-            t,
-            torque(dynamics, q, v, a, study.P),
-            {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
-        ),
-        notes=["Program motion (28); arcs are coloured by the residual of the first guess."],
+        torque(dynamics, q, v, a, study.P),
+        {label: torque(dynamics, q, v, a, P) for label, P in guesses.items()},
     )
+    notes = ["Program motion (28); arcs are coloured by the residual of the first guess."]
+    replay(arm, t, q, torques=torques, notes=notes).write(target)
 
 
 def _counter(what: str, most: int, report: ProgressCallback) -> Callable[[int], None]:

@@ -41,11 +41,10 @@ class RobotPlant:
         self.model = model
         self._bodies = model.with_parameters(pi)
         self._data = self._bodies.pin_model.createData()
-        names = np.array([term.name for _, term in model.layout.drive_parameters])
-        theta = pi[model.layout.n_inertial :]
-        self._drives = [
-            (TERMS[name], np.where(names == name, theta, 0.0)) for name in model.layout.terms
-        ]
+        theta = {name: np.zeros(len(model.layout.drives)) for name in model.layout.terms}
+        for i, (drive, term) in enumerate(model.layout.drive_parameters, model.layout.n_inertial):
+            theta[term.name][drive] = pi[i]
+        self._drives = [(TERMS[name], of_drives) for name, of_drives in theta.items()]
         self._armature = drive_inertia(model.layout, pi)
 
     def mass_matrix(self, q: Array) -> Array:
@@ -71,9 +70,9 @@ class RobotPlant:
         Returns:
             Torque, shape (n,) [N m or N].
         """
-        G, L = self.model.velocity_map, self.model.layout.drive_loads
+        G, L = self.model.velocity_map, self.model.layout.drive_ratios.T
         pin_model, x = self._bodies.pin_model, self.model.configurations(q[None])[0]
-        w = L.T @ v  # (k,)
+        w = L.T @ v  # (d,), speeds of the drives
         motion = DriveMotion(w, np.zeros_like(w), np.tanh(w / _SIGN_SPEED))
         drives = sum((theta * term.column(motion) for term, theta in self._drives), 0.0 * w)
         bias: Array = G.T @ pin.nonLinearEffects(pin_model, self._data, x, G @ v) + L @ drives

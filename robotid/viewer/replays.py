@@ -20,7 +20,7 @@ from robotid.robot.model import RobotModel
 from robotid.viewer.page import frame, page
 from robotid.viewer.scene import coordinates, mass_marks, packed, robot_scene
 
-__all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay", "write_replay"]
+__all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay"]
 
 _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
@@ -177,33 +177,6 @@ def replay(
         view=_view(model, scene.corners, [q] if ghost is None else [q, ghost[2]]),
     )
     return Replay(data)
-
-
-def write_replay(
-    model: RobotModel,
-    t: Array,
-    q: Array,
-    target: str | Path,
-    **options: Any,  # noqa: ANN401
-) -> Path:
-    """Write a page that plays a motion.
-
-    Args:
-        model: The robot.
-        t: Times, shape (N,), strictly increasing [s].
-        q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
-        target: The HTML file to write.
-        options: Those of ``replay``.
-
-    Returns:
-        Path of the file.
-
-    Raises:
-        DataError: If times and positions do not fit each other or the model, or if the folder of
-            the target does not exist.
-        SettingsError: If the rate is not positive.
-    """
-    return replay(model, t, q, **options).write(target)
 
 
 def live_page(

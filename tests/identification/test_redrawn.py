@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.estimation import EXACT, NOISE
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
@@ -14,12 +15,8 @@ from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
-
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
 
 
 @pytest.fixture

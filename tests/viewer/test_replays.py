@@ -8,7 +8,7 @@ from helpers.replay_data import shown
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
-from robotid.viewer.replays import Bands, Mark, Torques, replay, write_replay
+from robotid.viewer.replays import Bands, Mark, Torques, replay
 
 URDF = """<robot name="&lt;b&gt;x&lt;/b&gt;">
   <link name="base"/><link name="turner"/><link name="slider"/><link name="tip"/>
@@ -38,7 +38,7 @@ def motion():
 @pytest.fixture(scope="module")
 def page(arm, motion, tmp_path_factory):
     folder = tmp_path_factory.mktemp("replay")
-    path = write_replay(arm, *motion, folder / "replay.html")
+    path = replay(arm, *motion).write(folder / "replay.html")
     assert path == folder / "replay.html"
     assert [p.name for p in folder.iterdir()] == ["replay.html"]
     return path.read_text(encoding="utf-8")
@@ -129,7 +129,7 @@ def test_a_floating_base_moves(tmp_path):
     q[:, 0], q[:, 2], q[:, 7] = t, 0.5, 0.3
     q[:, 5:7] = np.column_stack([np.sin(t / 2), np.cos(t / 2)])
     q[5:, 3:7] *= -1  # the same turn, written in the other of two ways
-    data = shown(write_replay(model, t, q, tmp_path / "r.html").read_text(encoding="utf-8"))
+    data = shown(replay(model, t, q).write(tmp_path / "r.html").read_text(encoding="utf-8"))
     base, turner, _ = world_poses(data["scene"]["nodes"], data["motion"]["q"][-1])
     np.testing.assert_allclose(base.translation, [1.0, 0.0, 0.5], atol=1e-6)
     np.testing.assert_allclose(pin.log3(base.rotation), [0.0, 0.0, 1.0], atol=1e-6)
@@ -277,7 +277,7 @@ def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(arm, motion):
 def test_a_long_motion_of_seven_joints_stays_below_20_mb(panda, tmp_path):
     t = np.arange(200_000) / 100.0
     q = np.sin(t)[:, None] * np.ones(7)
-    assert write_replay(panda, t, q, tmp_path / "r.html").stat().st_size < 20e6
+    assert replay(panda, t, q).write(tmp_path / "r.html").stat().st_size < 20e6
 
 
 def test_no_process_no_socket_and_no_output_is_left(arm, motion, tmp_path, capfd, monkeypatch):
@@ -290,7 +290,7 @@ def test_no_process_no_socket_and_no_output_is_left(arm, motion, tmp_path, capfd
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     monkeypatch.setattr(zmq.Context, "socket", refuse)
-    write_replay(arm, *motion, tmp_path / "r.html")
+    replay(arm, *motion).write(tmp_path / "r.html")
     assert capfd.readouterr() == ("", "")
 
 
@@ -303,7 +303,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_beside_it(arm, motion, tmp_pa
 
     monkeypatch.setattr(os, "replace", refuse)
     with pytest.raises(OSError, match="disk full"):
-        write_replay(arm, *motion, target)
+        replay(arm, *motion).write(target)
     assert target.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
 
@@ -323,15 +323,15 @@ def test_a_failure_leaves_the_old_file_and_nothing_beside_it(arm, motion, tmp_pa
 )
 def test_what_does_not_fit_is_refused(arm, motion, tmp_path, change, message):
     with pytest.raises(DataError, match=message):
-        write_replay(arm, *change(*motion), tmp_path / "r.html")
+        replay(arm, *change(*motion)).write(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_rate_that_is_not_positive_is_refused(arm, motion, tmp_path):
+def test_a_rate_that_is_not_positive_is_refused(arm, motion):
     with pytest.raises(SettingsError, match=r"rate is 0\.0, wanted a positive number"):
-        write_replay(arm, *motion, tmp_path / "r.html", rate=0.0)
+        replay(arm, *motion, rate=0.0)
 
 
 def test_a_missing_folder_is_named(arm, motion, tmp_path):
     with pytest.raises(DataError, match=r"there is no folder '.*nowhere' to write r\.html in"):
-        write_replay(arm, *motion, tmp_path / "nowhere" / "r.html")
+        replay(arm, *motion).write(tmp_path / "nowhere" / "r.html")

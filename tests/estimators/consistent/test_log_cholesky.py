@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.synthetic import exact_log, truth
 
-from robotid.estimators import Consistent
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.log_cholesky import (
     LogCholesky,
@@ -18,25 +18,14 @@ from robotid.estimators.consistent.log_cholesky import (
 )
 from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
-from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
-from robotid.regressor.torque import build_problem
 from robotid.robot.parameters import inertial_from_pseudo_inertia
-
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
 
 
 def make_case(ur5, rng, noise):
-    log = exact_log(ur5, truth(ur5), rng, noise=noise)
-    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
-    factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
-    prior = ur5.standard_parameters()
-    return Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory])), factors
+    case = Case(ur5, rng, noise)
+    return consistent(case), compress(case.problem)
 
 
 @pytest.fixture

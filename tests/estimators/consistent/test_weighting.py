@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
@@ -13,24 +14,16 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress, compress_stretches, gather, merge
 from robotid.regressor.torque import build_problem
 
-EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
-
 
 @pytest.fixture
 def case(ur5, rng):
-    log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
-    trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
-    problem = mapping.reduce(build_problem(ur5, trajectory))
-    prior = ur5.standard_parameters()
-    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
-    return fit, problem
+    case = Case(ur5, rng, NOISE)
+    return consistent(case), case.problem
 
 
 def cut(problem, count):
