@@ -51,13 +51,13 @@ class Log:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
         require_increasing(self.t, where)
 
-    def __repr__(self) -> str:
-        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
-
     @property
     def name(self) -> str:
         """Name of its file, "log" if it has none."""
         return Path(self.path).name or "log"
+
+    def __repr__(self) -> str:
+        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
 
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
         """Return the rows from start to end, both included.
