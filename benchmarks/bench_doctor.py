@@ -30,7 +30,7 @@ from robotid.commands.doctor import examine
 from robotid.commands.job import Job, LogEntry, read_job
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.formats import write_columns
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.simulation.closed_loop import another_robot

@@ -25,7 +25,7 @@ from robotid.identification.evaluation import pool
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.simulation.closed_loop import another_robot
 from robotid.simulation.motions import random_fourier

@@ -27,7 +27,7 @@ from robotid.identification.pipeline import identify
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.simulation.closed_loop import another_robot
 from robotid.identification.standard_errors import quantile
 

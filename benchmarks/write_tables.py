@@ -4,6 +4,7 @@
 
 What stands between the marks of a page is what the benchmark printed, with its command, versions
 and machine; the mark keeps a digest of it, so that tests/test_docs.py sees a figure typed by hand.
+A mark with "-" for its digest holds figures of an earlier run, to be written anew.
 """
 
 import argparse

@@ -4,18 +4,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from robotid.commands.identify import run_job
     from robotid.commands.job import read_job
-    from robotid.commands.replay import replay_identified
-    from robotid.estimators import OLS, WLS, Consistent, Estimate, Estimator
-    from robotid.exceptions import DataError, ModelError, RobotIdError
+    from robotid.doctor.diagnosis import check_logs
+    from robotid.doctor.urdf import inspect_urdf
+    from robotid.exceptions import RobotIdError
+    from robotid.export.result import load_result
     from robotid.export.urdf import write_urdf
-    from robotid.identification.pipeline import EstimatorSettings, Identification, identify
+    from robotid.identification.pipeline import Identification, identify
+    from robotid.identification.settings import EstimatorSettings
     from robotid.logs.data import Log, Trajectory
     from robotid.logs.read import read_log, write_log
-    from robotid.logs.signals import SignalSettings
-    from robotid.logs.table import LogSource
-    from robotid.logs.units import LogUnits
-    from robotid.regressor.base_parameters import BaseMapping
+    from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+    from robotid.online.identifier import OnlineIdentifier
     from robotid.report.document import write_report
     from robotid.robot.model import RobotModel
     from robotid.robot.parameters import Coupling
@@ -23,51 +24,48 @@ if TYPE_CHECKING:
     from robotid.viewer.replays import replay
 
 __all__ = [
-    "OLS",
-    "WLS",
-    "BaseMapping",
-    "Consistent",
     "Coupling",
-    "DataError",
-    "Estimate",
-    "Estimator",
     "EstimatorSettings",
     "Identification",
     "Log",
     "LogSource",
     "LogUnits",
-    "ModelError",
+    "OnlineIdentifier",
     "RobotIdError",
     "RobotModel",
     "SignalSettings",
     "Trajectory",
     "__version__",
+    "check_logs",
     "identify",
+    "inspect_urdf",
+    "load_result",
     "read_job",
     "read_log",
     "replay",
-    "replay_identified",
+    "run_job",
     "write_log",
     "write_report",
     "write_urdf",
 ]
 
 _HOMES = {
-    "regressor.base_parameters": ["BaseMapping"],
-    "logs.data": ["Log", "Trajectory"],
-    "estimators": ["OLS", "WLS", "Consistent", "Estimate", "Estimator"],
-    "exceptions": ["DataError", "ModelError", "RobotIdError"],
-    "identification.pipeline": ["EstimatorSettings", "Identification", "identify"],
+    "commands.identify": ["run_job"],
     "commands.job": ["read_job"],
+    "doctor.diagnosis": ["check_logs"],
+    "doctor.urdf": ["inspect_urdf"],
+    "exceptions": ["RobotIdError"],
+    "export.result": ["load_result"],
+    "export.urdf": ["write_urdf"],
+    "identification.pipeline": ["Identification", "identify"],
+    "identification.settings": ["EstimatorSettings"],
+    "logs.data": ["Log", "Trajectory"],
     "logs.read": ["read_log", "write_log"],
-    "logs.table": ["LogSource"],
+    "logs.settings": ["LogSource", "LogUnits", "SignalSettings"],
+    "online.identifier": ["OnlineIdentifier"],
+    "report.document": ["write_report"],
     "robot.model": ["RobotModel"],
     "robot.parameters": ["Coupling"],
-    "commands.replay": ["replay_identified"],
-    "report.document": ["write_report"],
-    "logs.signals": ["SignalSettings"],
-    "logs.units": ["LogUnits"],
-    "export.urdf": ["write_urdf"],
     "versions": ["__version__"],
     "viewer.replays": ["replay"],
 }
@@ -79,3 +77,8 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401
         if name in names:
             return getattr(import_module(f"robotid.{home}"), name)
     raise AttributeError(f"module 'robotid' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Return the public names alone, whichever rooms have been loaded."""
+    return __all__

@@ -3,8 +3,8 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from robotid.commands.console import (
     print_comparison,
@@ -12,20 +12,21 @@ from robotid.commands.console import (
     print_files,
     print_inspection,
     print_result,
-    print_table,
-    print_verdict,
+    print_validation,
     shown_log,
 )
 from robotid.commands.flags import (
     add_job_flags,
     add_log_flags,
+    add_progress_flags,
     add_source_flags,
+    add_verbose_flag,
+    add_work_flags,
     job_from_flags,
     refuse_log_flags,
     source_settings,
 )
 from robotid.commands.progress import terminal_progress
-from robotid.commands.work_flags import add_progress_flags, add_verbose_flag, add_work_flags
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from robotid.commands.job import Job
 
 __all__ = ["main"]
+
+_Run: TypeAlias = Callable[[argparse.Namespace], int | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0 done, 1 the data or the model do not allow it or the doctor found an error
         that is not ignored, 2 wrong usage, 130 Ctrl-C.
     """
-    options = _parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    options = _parser(words).parse_args(words)
     try:
         with shown_log(is_verbose=getattr(options, "verbose", False)):
             code: int | None = options.run(options)
@@ -61,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code or 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser of a command line, with the flags of its own command alone."""
     parser = argparse.ArgumentParser(
         prog="robotid",
         description="Identify a robot's inertial and drive parameters from its URDF and motion "
@@ -69,93 +74,97 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"robotid {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    chosen = next((word for word in words if not word.startswith("-")), None)
+    for name, (summary, add_flags, run) in _COMMANDS.items():
+        command = commands.add_parser(name, help=summary)
+        command.set_defaults(run=run)
+        if name == chosen:
+            add_flags(command)
+    return parser
 
-    demo = commands.add_parser("demo", help="simulate a UR5, identify it, report: needs no input")
-    demo.add_argument("--out", default="robotid-demo", metavar="DIR", help="folder to write to")
-    demo.set_defaults(run=_demo)
 
-    paper = commands.add_parser("paper", help="the paper's simulation: figures, tables, numbers")
-    paper.add_argument("--out", default="robotid-paper", metavar="DIR", help="folder to write to")
-    paper.add_argument("--json", action="store_true", help="print paper.json")
-    paper.add_argument("--quick", action="store_true", help="few iterations and motions: a try-out")
-    add_progress_flags(paper)
-    paper.set_defaults(run=_paper)
+def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    parser.add_argument("--out", default=folder, metavar="DIR", help="folder to write to")
 
-    inspect = commands.add_parser("inspect", help="joints, parameters and faults of a URDF")
-    inspect.add_argument("urdf", metavar="URDF")
-    inspect.add_argument("--free-flyer", action="store_true", help="the base floats")
-    inspect.add_argument("--json", action="store_true", help="print one JSON object")
-    inspect.set_defaults(run=_inspect)
 
-    identify = commands.add_parser(
-        "identify", help="identify a robot: JOB.toml, or URDF LOG [LOG ...]"
+def _add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
+    parser.add_argument("--json", action="store_true", help=f"print {what}")
+
+
+def _demo_flags(parser: argparse.ArgumentParser) -> None:
+    _add_out(parser, "robotid-demo")
+
+
+def _paper_flags(parser: argparse.ArgumentParser) -> None:
+    _add_out(parser, "robotid-paper")
+    _add_json(parser, "paper.json")
+    parser.add_argument(
+        "--quick", action="store_true", help="few iterations and motions: a try-out"
     )
-    identify.add_argument("source", metavar="JOB.toml | URDF")
-    identify.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
-    identify.add_argument("--out", default="robotid-out", metavar="DIR", help="folder to write to")
-    identify.add_argument("--json", action="store_true", help="print result.json")
-    add_job_flags(identify)
-    add_work_flags(identify)
-    add_progress_flags(identify)
-    add_verbose_flag(identify)
-    identify.set_defaults(run=_identify)
+    add_progress_flags(parser)
 
-    track = commands.add_parser("track", help="run over a log as if live: history, step changes")
-    track.add_argument("source", metavar="URDF")
-    track.add_argument("logs", nargs=1, metavar="LOG")
-    track.add_argument("--out", default="robotid-track", metavar="DIR", help="folder to write to")
-    track.add_argument("--json", action="store_true", help="print track.json")
-    add_log_flags(track.add_argument_group("the log"))
-    add_verbose_flag(track)
-    _add_serve_flags(track, "show it in the browser while it runs, in true time")
-    track.set_defaults(run=_track, validate=[], estimator=None)
 
-    replay = commands.add_parser(
-        "replay", help="play a log in the browser: robot, torques, what was identified"
-    )
-    replay.add_argument("source", metavar="URDF")
-    replay.add_argument("logs", nargs=1, metavar="LOG")
-    replay.add_argument(
+def _inspect_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("urdf", metavar="URDF")
+    parser.add_argument("--free-flyer", action="store_true", help="the base floats")
+    _add_json(parser)
+
+
+def _identify_flags(parser: argparse.ArgumentParser) -> None:
+    _doctor_flags(parser, "result.json")
+    _add_out(parser, "robotid-out")
+    add_work_flags(parser)
+    add_progress_flags(parser)
+
+
+def _doctor_flags(parser: argparse.ArgumentParser, json_: str = "one JSON object") -> None:
+    parser.add_argument("source", metavar="JOB.toml | URDF")
+    parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
+    _add_json(parser, json_)
+    add_job_flags(parser)
+    add_verbose_flag(parser)
+
+
+def _track_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", metavar="URDF")
+    parser.add_argument("logs", nargs=1, metavar="LOG")
+    _add_out(parser, "robotid-track")
+    _add_json(parser, "track.json")
+    add_log_flags(parser.add_argument_group("the log"))
+    add_verbose_flag(parser)
+    _add_serve_flags(parser, "show it in the browser while it runs, in true time")
+
+
+def _replay_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", metavar="URDF")
+    parser.add_argument("logs", nargs=1, metavar="LOG")
+    parser.add_argument(
         "results", nargs="*", metavar="RESULT", help="result.json, track.json or their folder"
     )
-    replay.add_argument("--html", metavar="FILE", help="page to write; default: replay.html")
-    replay.add_argument("--ghost", metavar="LOG", help="second motion, shown as a ghost")
-    _add_serve_flags(replay, "track the log again, in true time, and show it as it goes")
-    add_log_flags(replay.add_argument_group("the log, unless a RESULT says it"))
-    replay.set_defaults(run=_replay, validate=[], estimator=None)
+    parser.add_argument("--html", metavar="FILE", help="page to write; default: replay.html")
+    parser.add_argument("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+    _add_serve_flags(parser, "track the log again, in true time, and show it as it goes")
+    add_log_flags(parser.add_argument_group("the log, unless a RESULT says it"))
 
-    doctor = commands.add_parser(
-        "doctor", help="what is wrong with logs: JOB.toml, or URDF LOG ..."
-    )
-    doctor.add_argument("source", metavar="JOB.toml | URDF")
-    doctor.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
-    doctor.add_argument("--json", action="store_true", help="print one JSON object")
-    add_job_flags(doctor)
-    add_verbose_flag(doctor)
-    doctor.set_defaults(run=_doctor)
 
-    validate = commands.add_parser("validate", help="measure a result's prediction on other logs")
-    validate.add_argument("result", metavar="RESULT.json")
-    validate.add_argument("logs", nargs="+", metavar="LOG")
-    validate.add_argument("--json", action="store_true", help="print one JSON object")
-    validate.set_defaults(run=_validate)
+def _validate_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("result", metavar="RESULT.json")
+    parser.add_argument("logs", nargs="+", metavar="LOG")
+    _add_json(parser)
 
-    compare = commands.add_parser("compare", help="several results side by side")
-    compare.add_argument("results", nargs="+", metavar="RESULT.json")
-    compare.add_argument("--out", metavar="FILE.html", help="page to write")
-    compare.add_argument("--json", action="store_true", help="print one JSON object")
-    compare.set_defaults(run=_compare)
 
-    convert = commands.add_parser(
-        "convert", help="write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names"
-    )
-    convert.add_argument("log", metavar="IN", help="a log of any format, or a bag's folder")
-    convert.add_argument("out", metavar="OUT", help="file to write; its suffix says the format")
-    convert.add_argument("--joints", metavar="A,B,...", help="joints to write; default: all")
-    add_source_flags(convert)
-    convert.add_argument("--json", action="store_true", help="print one JSON object")
-    convert.set_defaults(run=_convert)
-    return parser
+def _compare_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("results", nargs="+", metavar="RESULT.json")
+    parser.add_argument("--out", metavar="FILE.html", help="page to write")
+    _add_json(parser)
+
+
+def _convert_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", metavar="IN", help="a log of any format, or a bag's folder")
+    parser.add_argument("out", metavar="OUT", help="file to write; its suffix says the format")
+    parser.add_argument("--joints", metavar="A,B,...", help="joints to write; default: all")
+    add_source_flags(parser)
+    _add_json(parser)
 
 
 def _add_serve_flags(parser: argparse.ArgumentParser, help_: str) -> None:
@@ -314,11 +323,7 @@ def _validate(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(found, allow_nan=False))
         return
-    print(f"predicted with {found['predicted_with']}")
-    for recording in found["validation"]:
-        print(f"\n{recording['log']}")
-        print_table(recording["per_joint"], {})
-    print_verdict(found["verdict"])
+    print_validation(found)
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -340,7 +345,7 @@ def _convert(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
     from robotid.commands.convert import convert
-    from robotid.logs.table import LogSource
+    from robotid.logs.settings import LogSource
 
     joints = options.joints.split(",") if options.joints else None
     source = LogSource(**source_settings(options))
@@ -366,3 +371,30 @@ def _print_paper(result: dict[str, Any]) -> None:
     print("\nrandom motions that converged to 1e-3")
     for name, found in result["trajectories"].items():
         print(f"  {name:10} {found['converged']} of {found['runs']}")
+
+
+#: What each command is for, what adds its flags, and what runs it.
+_COMMANDS: Mapping[str, tuple[str, Callable[[argparse.ArgumentParser], None], _Run]] = {
+    "demo": ("simulate a UR5, identify it, report: needs no input", _demo_flags, _demo),
+    "paper": ("the paper's simulation: figures, tables, numbers", _paper_flags, _paper),
+    "inspect": ("joints, parameters and faults of a URDF", _inspect_flags, _inspect),
+    "identify": (
+        "identify a robot: JOB.toml, or URDF LOG [LOG ...]",
+        _identify_flags,
+        _identify,
+    ),
+    "track": ("run over a log as if live: history, step changes", _track_flags, _track),
+    "replay": (
+        "play a log in the browser: robot, torques, what was identified",
+        _replay_flags,
+        _replay,
+    ),
+    "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor_flags, _doctor),
+    "validate": ("measure a result's prediction on other logs", _validate_flags, _validate),
+    "compare": ("several results side by side", _compare_flags, _compare),
+    "convert": (
+        "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names",
+        _convert_flags,
+        _convert,
+    ),
+}

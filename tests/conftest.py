@@ -11,7 +11,7 @@ from robotid.doctor.urdf import inspect_urdf
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf, example_urdfs
 from robotid.robot.model import RobotModel
 

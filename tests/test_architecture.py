@@ -18,6 +18,7 @@ LINES = [
     "",
     "exceptions",
     "findings versions _files _html _typing",
+    "_settings",
     "robot logs",
     "regressor",
     "estimators simulation workers",
@@ -130,6 +131,19 @@ def test_help_needs_neither_numpy_nor_pinocchio():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip().endswith("[]")
+
+
+def test_the_package_shows_its_public_api_and_nothing_else():
+    import robotid.logs.data  # a room that was loaded stays out of sight
+
+    assert dir(robotid) == [
+        "Coupling", "EstimatorSettings", "Identification", "Log", "LogSource", "LogUnits",
+        "OnlineIdentifier", "RobotIdError", "RobotModel", "SignalSettings", "Trajectory",
+        "__version__", "check_logs", "identify", "inspect_urdf", "load_result", "read_job",
+        "read_log", "replay", "run_job", "write_log", "write_report", "write_urdf",
+    ]  # fmt: skip
+    with pytest.raises(AttributeError, match="has no attribute 'OLS'"):
+        _ = robotid.OLS
 
 
 def all_modules():

@@ -26,7 +26,7 @@ def checkpoint_inputs(job: Job) -> dict[str, Any]:
     Raises:
         OSError: If a file does not exist.
     """
-    settings = {key: value for key, value in job.to_settings().items() if key not in _NO_MATTER}
+    settings = {key: value for key, value in job.to_dict().items() if key not in _NO_MATTER}
     settings["reduction"] = {"rows_in_memory": job.rows_in_memory}
     return {
         "versions": code_versions(),

@@ -14,8 +14,7 @@ __all__ = [
     "print_files",
     "print_inspection",
     "print_result",
-    "print_table",
-    "print_verdict",
+    "print_validation",
     "shown_log",
 ]
 
@@ -77,58 +76,38 @@ def print_result(result: dict[str, Any]) -> None:
     Args:
         result: The content of result.json.
     """
-    structure = result["structure"]
+    from robotid.identification.summary import error_lines, verdict_lines
+
+    structure, wls = result["structure"], result["wls"]
     print(
         f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
         f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
         f"total mass {result['consistency']['total_mass']:.2f} kg"
     )
-    print("\nfitted recordings")
-    print_table(result["identification"]["per_joint"], result["wls"]["identification"]["per_joint"])
-    for ours, wls in zip(result["validation"], result["wls"]["validation"], strict=True):
-        print(f"\nkept apart: {ours['log']}")
-        print_table(ours["per_joint"], wls["per_joint"])
+    _print_lines("fitted recordings", *error_lines(result["identification"], wls["identification"]))
+    for ours, theirs in zip(result["validation"], wls["validation"], strict=True):
+        _print_lines(f"kept apart: {ours['log']}", *error_lines(ours, theirs))
     for warning in result["warnings"]:
-        print(f"\n{warning['code']}: {warning['message']}")
-    print_verdict(result["verdict"])
+        _print_lines(f"{warning['code']}: {warning['message']}")
+    _print_lines(*verdict_lines(result["verdict"]))
 
 
-def print_table(per_joint: dict[str, Any], wls: dict[str, Any]) -> None:
-    """Print the metrics of each joint.
-
-    Args:
-        per_joint: Metrics by joint, as in result.json.
-        wls: Those of weighted least squares, or none.
-    """
-    width = max(len(joint) for joint in per_joint)
-    print(f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %")
-    for joint, m in per_joint.items():
-        other = wls.get(joint, {}).get("relative_error_pct")
-        urdf, gravity = (m.get(f"{key}_relative_error_pct") for key in ("urdf", "gravity_only"))
-        cells = [_cell(other), _cell(urdf), _cell(gravity, 9)]
-        rmse = f"{m['rmse']:.3g} {m['unit']}"
-        error = _cell(m["relative_error_pct"], 7)
-        flag = "" if m.get("better_than_constant", True) else "  worse than a constant"
-        print(f"  {joint:{width}}  {error}   {rmse:10}{cells[0]} {cells[1]}  {cells[2]}{flag}")
-
-
-def _cell(value: float | None, width: int = 7) -> str:
-    return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
-
-
-def print_verdict(verdict: dict[str, Any]) -> None:
-    """Print a verdict with its reasons.
+def print_validation(found: dict[str, Any]) -> None:
+    """Print how well a result predicts other logs.
 
     Args:
-        verdict: Status and reasons, as in result.json.
+        found: What ``robotid validate --json`` prints.
     """
-    print(f"\nverdict: {verdict['status']}")
-    for reason in verdict["reasons"]:
-        print(f"  - {reason}")
-    joints = verdict["per_joint"]
-    for status in dict.fromkeys(joint["status"] for joint in joints.values()):
-        names = [name for name, joint in joints.items() if joint["status"] == status]
-        print(f"  {status}: {', '.join(names)}")
+    from robotid.identification.summary import error_lines, verdict_lines
+
+    print(f"predicted with {found['predicted_with']}")
+    for recording in found["validation"]:
+        _print_lines(recording["log"], *error_lines(recording))
+    _print_lines(*verdict_lines(found["verdict"]))
+
+
+def _print_lines(*lines: str) -> None:
+    print("\n" + "\n".join(lines))
 
 
 def print_files(folder: str, names: Sequence[str]) -> None:
@@ -169,6 +148,8 @@ def print_comparison(content: dict[str, Any]) -> None:
     Args:
         content: What ``robotid compare --json`` prints.
     """
+    from robotid.identification.summary import cell
+
     labels = [result["label"] for result in content["results"]]
     for result in content["results"]:
         verdict = result["verdict"]["status"]
@@ -187,7 +168,7 @@ def print_comparison(content: dict[str, Any]) -> None:
     print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
     for entry in content["base_parameters"]:
         cells = "".join(f"{value:10.4g}" for value in entry["values"])
-        cells += "".join(_cell(value, 10) for value in entry["differences"])
+        cells += "".join(cell(value, 10) for value in entry["differences"])
         print(f"  {entry['name']:{width}}{cells}")
     for key in ("settings", "versions"):
         for row in content[key]:
@@ -199,8 +180,10 @@ def print_comparison(content: dict[str, Any]) -> None:
 
 
 def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
+    from robotid.identification.summary import cell
+
     width = max(len(entry["joint"]) for entry in per_joint)
     print(f"  {'joint':{width}}" + "".join(f"{label:>9}" for label in labels))
     for entry in per_joint:
-        cells = "".join(_cell(value, 9) for value in entry["relative_error_pct"])
+        cells = "".join(cell(value, 9) for value in entry["relative_error_pct"])
         print(f"  {entry['joint']:{width}}{cells}")

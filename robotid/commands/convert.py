@@ -7,7 +7,8 @@ from pathlib import Path
 from robotid.exceptions import DataError
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.formats import open_table, write_columns
-from robotid.logs.table import LogSource, prefixes
+from robotid.logs.settings import LogSource
+from robotid.logs.table import prefixes
 
 __all__ = ["Conversion", "convert"]
 

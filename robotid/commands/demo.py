@@ -11,7 +11,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.replay import replay_identified
 from robotid.identification.pipeline import Identification
 from robotid.logs.read import write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Noise, another_robot, simulate

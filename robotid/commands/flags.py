@@ -1,7 +1,7 @@
-"""Flags of the command line that describe a job, and the job that they describe."""
+"""Flags of the command line: those that describe a job, those of the work, and the job itself."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +13,62 @@ if TYPE_CHECKING:
 __all__ = [
     "add_job_flags",
     "add_log_flags",
+    "add_progress_flags",
     "add_source_flags",
+    "add_verbose_flag",
+    "add_work_flags",
     "job_from_flags",
     "refuse_log_flags",
     "source_settings",
 ]
+
+
+def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
+    pairs = {}
+    for word in words:
+        name, _, number = word.partition("=")
+        try:
+            pairs[name] = float(number)
+        except ValueError as error:
+            raise SettingsError(f"{flag} {word!r}: wanted JOINT=NUMBER") from error
+    return pairs
+
+
+def _cutoff(word: str, flag: str) -> float | bool:
+    try:
+        return False if word == "false" else float(word)
+    except ValueError as error:
+        raise SettingsError(f"{flag} {word!r}: wanted a frequency [Hz] or false") from error
+
+
+#: Key of the job file that each flag states, and what argparse is told of it.
+_FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
+    "--estimator": ("estimator.name", {"metavar": "NAME"}),
+    "--joints": ("joints", {"metavar": "A,B,..."}),
+    "--lock": ("locked", {"metavar": "JOINT=POSITION", "action": "append"}),
+    "--gain": ("torque.gains", {"metavar": "JOINT=N_M_PER_A", "action": "append"}),
+    "--rate": ("signals.rate", {"metavar": "HZ", "type": float}),
+    "--cutoff": ("signals.cutoff", {"metavar": "HZ"}),
+    "--friction": (
+        "model.friction",
+        {"metavar": "MODEL", "help": "none, viscous or viscous+coulomb"},
+    ),
+    "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
+    "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
+    "--time-unit": ("units.time", {"metavar": "UNIT"}),
+    "--angle-unit": ("units.angle", {"metavar": "UNIT"}),
+    "--topic": ("log.topic", {"metavar": "NAME"}),
+    "--effort": ("log.effort", {"metavar": "MEANING"}),
+    "--stamp": ("log.stamp", {"metavar": "CLOCK"}),
+}
+#: How the words of a flag become the value of its key, where they are not it themselves.
+_READ: Mapping[str, Callable[[Any, str], Any]] = {
+    "--joints": lambda word, _: word.split(","),
+    "--lock": _pairs,
+    "--gain": _pairs,
+    "--cutoff": _cutoff,
+}
+_SOURCE = ("--topic", "--effort", "--stamp")
 
 
 def add_job_flags(parser: argparse.ArgumentParser) -> None:
@@ -26,10 +77,12 @@ def add_job_flags(parser: argparse.ArgumentParser) -> None:
     Args:
         parser: Parser of the command.
     """
+    from robotid.identification.settings import ESTIMATORS
+
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
-    flags.add_argument("--validate", nargs="+", default=[], metavar="LOG", help="logs kept apart")
-    names = "consistent (default), log_cholesky, wls, ols, tls, rls, kalman, prx or gradient"
-    flags.add_argument("--estimator", metavar="NAME", help=names)
+    flags.add_argument("--validate", nargs="+", metavar="LOG", help="logs kept apart")
+    names = f"which estimator: consistent (default), {', '.join(ESTIMATORS)}"
+    flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help=names)
     add_log_flags(flags)
 
 
@@ -39,25 +92,7 @@ def add_log_flags(flags: "argparse._ArgumentGroup") -> None:
     Args:
         flags: Group that they go to.
     """
-    flags.add_argument("--joints", metavar="A,B,...", help="joints to identify, in order")
-    flags.add_argument("--lock", action="append", default=[], metavar="JOINT=POSITION")
-    flags.add_argument("--gain", action="append", default=[], metavar="JOINT=N_M_PER_A")
-    flags.add_argument("--rate", type=float, metavar="HZ", help="grid to resample to")
-    flags.add_argument("--cutoff", metavar="HZ", help="of the low-pass filter, or false")
-    flags.add_argument("--friction", metavar="MODEL", help="none, viscous or viscous+coulomb")
-    flags.add_argument(
-        "--dynamics", action="store_true", help="write friction into the URDF's <dynamics> too"
-    )
-    flags.add_argument(
-        "--ignore",
-        action="append",
-        default=[],
-        metavar="CODE",
-        help="error of the doctor that you know better",
-    )
-    flags.add_argument("--time-unit", metavar="UNIT", help="s, ms, us or ns")
-    flags.add_argument("--angle-unit", metavar="UNIT", help="rad or deg")
-    add_source_flags(flags)
+    _add(flags, [flag for flag in _FLAGS if flag != "--estimator"])
 
 
 def add_source_flags(flags: "argparse._ActionsContainer") -> None:
@@ -66,9 +101,63 @@ def add_source_flags(flags: "argparse._ActionsContainer") -> None:
     Args:
         flags: Parser or group that they go to.
     """
-    flags.add_argument("--topic", metavar="NAME", help="topic of a bag, or group of a file")
-    flags.add_argument("--effort", metavar="MEANING", help="torque (default) or current")
-    flags.add_argument("--stamp", metavar="CLOCK", help="of a bag: header (default) or log")
+    _add(flags, _SOURCE)
+
+
+def _add(flags: "argparse._ActionsContainer", wanted: Sequence[str]) -> None:
+    """Add flags; what they are for is said by the keys of the job file."""
+    from robotid.commands.job import Job
+
+    keys = Job.paths()
+    for flag in wanted:
+        at, about = _FLAGS[flag]
+        help_ = keys[at].words if at in keys else about["help"]
+        flags.add_argument(flag, **(about | {"help": help_}))
+
+
+def add_work_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say who reduces long logs; they never change a result.
+
+    Args:
+        parser: Parser of the command.
+    """
+    flags = parser.add_argument_group("long logs; the result has the same bits in any case")
+    flags.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="worker processes; default: that of the job file, else one per core for long logs",
+    )
+    flags.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster, as tcp://host:8786"
+    )
+    flags.add_argument(
+        "--resume", action="store_true", help="go on from where an interrupted run in --out ended"
+    )
+
+
+def add_progress_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that shows progress where it is not shown by itself.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument(
+        "--progress",
+        action="store_true",
+        help="show progress on stderr although it is no terminal, or beside --json",
+    )
+
+
+def add_verbose_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that shows what the library logs.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument(
+        "--verbose", action="store_true", help="say on stderr what is chosen, and why"
+    )
 
 
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:
@@ -80,8 +169,7 @@ def source_settings(options: argparse.Namespace) -> dict[str, Any]:
     Returns:
         The settings by name.
     """
-    given = {name: getattr(options, name) for name in ("topic", "effort", "stamp")}
-    return {name: value for name, value in given.items() if value is not None}
+    return dict(_stated(options, _SOURCE).get("log", {}))
 
 
 def job_from_flags(options: argparse.Namespace) -> "Job":
@@ -108,38 +196,14 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
         return read_job(options.source)
     if not options.logs:
         raise SettingsError("no log was given: robotid identify URDF LOG [LOG ...], or JOB.toml")
-    table: dict[str, Any] = {
+    kept = getattr(options, "validate", None) or ()
+    table = {
         "urdf": options.source,
         "identification": [{"log": log} for log in options.logs],
-        "validation": [{"log": log} for log in options.validate],
-        "locked": _pairs(options.lock, "--lock"),
-        "torque": {"gains": _pairs(options.gain, "--gain")},
-        "signals": {},
-        "units": {},
-        "doctor": {"ignore": options.ignore},
+        "validation": [{"log": log} for log in kept],
+        **_stated(options, list(_FLAGS)),
     }
-    if options.joints:
-        table["joints"] = options.joints.split(",")
-    if options.estimator:
-        table["estimator"] = {"name": options.estimator}
-    if options.friction:
-        table["model"] = {"friction": options.friction}
-    if options.rate is not None:
-        table["signals"]["rate"] = options.rate
-    if options.cutoff is not None:
-        table["signals"]["cutoff"] = _cutoff(options.cutoff)
-    if options.dynamics:
-        table["output"] = {"dynamics": True}
-    table["log"] = source_settings(options)
-    units = {"time": options.time_unit, "angle": options.angle_unit}
-    table["units"] = {key: value for key, value in units.items() if value}
     return job_from_settings(table, "command line", Path())
-
-
-_JOB_FLAGS = (
-    "validate", "joints", "lock", "gain", "estimator", "rate", "cutoff", "friction",
-    "time_unit", "angle_unit", "dynamics", "topic", "effort", "stamp", "ignore",
-)  # fmt: skip
 
 
 def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
@@ -157,22 +221,20 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
 
 
 def _given(options: argparse.Namespace) -> list[str]:
-    return [name for name in _JOB_FLAGS if getattr(options, name)]
+    names = ["validate", *(flag[2:].replace("-", "_") for flag in _FLAGS)]
+    return [name for name in names if getattr(options, name, None)]
 
 
-def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
-    pairs = {}
-    for word in words:
-        name, _, number = word.partition("=")
-        try:
-            pairs[name] = float(number)
-        except ValueError as error:
-            raise SettingsError(f"{flag} {word!r}: wanted JOINT=NUMBER") from error
-    return pairs
-
-
-def _cutoff(word: str) -> float | bool:
-    try:
-        return False if word == "false" else float(word)
-    except ValueError as error:
-        raise SettingsError(f"--cutoff {word!r}: wanted a frequency [Hz] or false") from error
+def _stated(options: argparse.Namespace, flags: Sequence[str]) -> dict[str, Any]:
+    """Return what flags state, as a table of a job file."""
+    table: dict[str, Any] = {}
+    for flag in flags:
+        value = getattr(options, flag[2:].replace("-", "_"), None)
+        if value is None:
+            continue
+        *tables, key = _FLAGS[flag][0].split(".")
+        inside = table
+        for name in tables:
+            inside = inside.setdefault(name, {})
+        inside[key] = _READ[flag](value, flag) if flag in _READ else value
+    return table

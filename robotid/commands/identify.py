@@ -72,7 +72,7 @@ def run_job(
             )
             outputs |= {"urdf": name, "sidecar": sidecar.name}
         write_report(identification, partial / "report.html", findings=findings)
-        result = build_result(identification, job.to_settings(), findings, outputs)
+        result = build_result(identification, job.to_dict(), findings, outputs)
         write_json(result, partial / "result.json")
     if "urdf" not in outputs:
         _remove_urdf(target / name)
@@ -98,7 +98,7 @@ def _identify(
     if not fitted:
         raise DataError("no log was given; at least one is needed to identify anything")
     diagnosis = examine_logs(job, model, fitted, kept)
-    is_robust = job.estimator.robust != "none"
+    is_robust = job.estimator.is_robust
     alarms = alarming(diagnosis, job.ignore, is_robust=is_robust)
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
     chosen, checkpoint = plan or WorkPlan(job.workers or 1), None

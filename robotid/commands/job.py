@@ -2,98 +2,165 @@
 
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from robotid.commands.job_keys import KEYS, check_keys
+from robotid._settings import Key, Range, Settings, check_keys, setting
 from robotid.exceptions import SettingsError
-from robotid.identification.settings import EstimatorSettings
-from robotid.logs.data import Log
-from robotid.logs.read import LogLayout, lay_out, read_log
-from robotid.logs.signals import SignalSettings
-from robotid.logs.table import LogSource, Table
-from robotid.logs.units import LogUnits
-from robotid.robot.drives import DRIVE_TERMS, TERMS, friction_models
-from robotid.robot.model import GRAVITY, RobotModel
-from robotid.robot.parameters import Coupling
+from robotid.identification.settings import ConsistentSettings, EstimatorSettings
+from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+
+if TYPE_CHECKING:
+    from robotid.logs.data import Log
+    from robotid.logs.read import LogLayout
+    from robotid.logs.table import Table
+    from robotid.robot.model import RobotModel
+    from robotid.robot.parameters import Coupling
 
 __all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
 
-_NUMBER = (int, float)
+
+def _absolute(path: Path) -> str:
+    return str(path.resolve())
+
+
+def _default_terms() -> tuple[str, ...]:
+    from robotid.robot.drives import DRIVE_TERMS
+
+    return DRIVE_TERMS
+
+
+def _model_keys() -> dict[str, Any]:
+    from robotid.robot.drives import TERMS
+
+    return {
+        "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
+        for name, term in TERMS.items()
+    }
+
+
+def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
+    from robotid.robot.drives import TERMS, friction_models
+
+    friction, models = table.get("friction", "viscous+coulomb"), friction_models()
+    if friction not in models:
+        raise SettingsError(f"friction is {friction!r}, wanted one of {list(models)}")
+    return tuple(
+        name
+        for name, term in TERMS.items()
+        if (name in models[friction] if term.is_friction else table.get(name, term.is_default))
+    )
+
+
+def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
+    from robotid.robot.drives import TERMS, friction_models
+
+    chosen = tuple(term for term in terms if TERMS[term].is_friction)
+    friction = next(name for name, model in friction_models().items() if model == chosen)
+    return {key: friction if key == "friction" else key in terms for key in _model_keys()}
+
+
+def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> "tuple[Coupling, ...]":
+    from robotid.robot.parameters import Coupling
+
+    for table in tables:
+        for joint, ratio in table["ratios"].items():
+            if isinstance(ratio, bool) or not isinstance(ratio, int | float):
+                raise SettingsError(f"ratios.{joint} is {ratio!r}, wanted a number")
+    return tuple(
+        Coupling(table["name"], tuple((j, float(r)) for j, r in table["ratios"].items()))
+        for table in tables
+    )
+
+
+def _dump_couplings(couplings: "Sequence[Coupling]") -> list[dict[str, Any]]:
+    return [{"name": coupling.name, "ratios": dict(coupling.ratios)} for coupling in couplings]
 
 
 @dataclass(frozen=True)
-class LogEntry:
-    """One log of a job.
+class LogEntry(Settings):
+    """One log of a job."""
 
-    Attributes:
-        path: The file.
-        start: Start of the window in the log's own time [s], or None.
-        end: End of the window [s], or None.
-    """
-
-    path: Path
-    start: float | None = None
-    end: float | None = None
+    path: Path = field(
+        metadata={"key": Key("the file", at="log", reads=(str,), load=Path, dump=_absolute)}
+    )
+    start: float | None = setting(None, "start of the window in the log's own time [s]")
+    end: float | None = setting(None, "end of the window [s]")
 
 
 @dataclass(frozen=True)
-class Job:
-    """Everything that is needed to run an identification.
+class Job(Settings):
+    """Everything that is needed to run an identification."""
 
-    Attributes:
-        urdf: The URDF file.
-        joints: Joints to identify, in order; None for all movable ones.
-        locked: Positions of joints held still [rad or m].
-        gravity: Gravity in the root link's frame [m/s^2].
-        free_flyer: Whether the base floats.
-        mimic: "independent" or "coupled".
-        signals: How logs become trajectories.
-        terms: Drive terms to identify.
-        gains: Torque per current of joints logged as current [N m/A or N/A].
-        couplings: Drives that turn with several joints.
-        columns: Column names in the logs that differ from the standard ones.
-        source: Which topic of the logs, names of joints in them, meaning of effort.
-        units: Units of the logs, if not SI.
-        estimator: The estimator and its settings.
-        dynamics: Whether the written URDF's ``<dynamics>`` also get the identified friction.
-        identification: Logs to fit.
-        validation: Logs kept apart.
-        ignore: Codes of the doctor's errors that the user knows better.
-        rows_in_memory: Rows of all logs together above which they are read in pieces.
-        workers: Processes that work on the pieces; None for one per core where that is long.
-    """
-
-    urdf: Path
-    joints: tuple[str, ...] | None = None
-    locked: Mapping[str, float] = field(default_factory=dict)
-    gravity: tuple[float, ...] = GRAVITY
-    free_flyer: bool = False
-    mimic: str = "independent"
-    signals: SignalSettings = field(default_factory=SignalSettings)
-    terms: tuple[str, ...] = DRIVE_TERMS
-    gains: Mapping[str, float] = field(default_factory=dict)
-    couplings: tuple[Coupling, ...] = ()
-    columns: Mapping[str, str] = field(default_factory=dict)
-    source: LogSource = field(default_factory=LogSource)
-    units: LogUnits = field(default_factory=LogUnits)
-    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
-    dynamics: bool = False
-    identification: tuple[LogEntry, ...] = ()
-    validation: tuple[LogEntry, ...] = ()
-    ignore: tuple[str, ...] = ()
-    rows_in_memory: int = 2**17
-    workers: int | None = None
+    urdf: Path = field(
+        metadata={"key": Key("the URDF file", reads=(str,), load=Path, dump=_absolute)}
+    )
+    joints: tuple[str, ...] | None = setting(
+        None, "joints to identify, in order; all movable ones if not stated"
+    )
+    locked: Mapping[str, float] = setting({}, "positions of joints held still [rad or m]")
+    gravity: tuple[float, ...] = setting(
+        (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
+    )
+    free_flyer: bool = setting(False, "whether the base floats; no log format has its motion yet")
+    mimic: str = setting(
+        "independent", "independent, or coupled: a mimic joint moves with its leader"
+    )
+    signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
+    terms: tuple[str, ...] = setting(
+        _default_terms,
+        "drive terms to identify",
+        at="model",
+        reads=_model_keys,
+        load=_load_terms,
+        dump=_dump_terms,
+    )
+    gains: Mapping[str, float] = setting(
+        {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
+    )
+    couplings: "tuple[Coupling, ...]" = setting(
+        (),
+        "drives that turn with several joints, each with a name and its ratios by joint [-]",
+        at="coupling",
+        reads=[{"name": (str,), "ratios": (dict,)}],
+        load=_load_couplings,
+        dump=_dump_couplings,
+    )
+    columns: Mapping[str, str] = setting(
+        {}, "column names in the logs that differ from the standard ones"
+    )
+    source: LogSource = setting(LogSource(), "where in the log files the signals are", at="log")
+    units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
+    estimator: EstimatorSettings = setting(
+        ConsistentSettings(), "which estimator, and its own settings"
+    )
+    dynamics: bool = setting(
+        False,
+        "whether the written URDF's <dynamics> also get the identified friction",
+        at="output.dynamics",
+    )
+    identification: tuple[LogEntry, ...] = setting((), "logs to fit")
+    validation: tuple[LogEntry, ...] = setting((), "logs kept apart")
+    ignore: tuple[str, ...] = setting(
+        (), "codes of the doctor's errors that you know better", at="doctor.ignore"
+    )
+    rows_in_memory: int = setting(
+        2**17,
+        "rows of all logs together above which they are read in pieces",
+        at="reduction.rows_in_memory",
+        within=Range("a positive number", lambda x: x >= 1),
+    )
+    workers: int | None = setting(
+        None,
+        "processes that work on the pieces; one per core for long logs if not stated",
+        at="reduction.workers",
+        within=Range("at least 1", lambda x: x >= 1),
+    )
 
     def __post_init__(self) -> None:
-        if self.rows_in_memory < 1:
-            raise SettingsError(
-                f"reduction: rows_in_memory is {self.rows_in_memory}, wanted a positive number"
-            )
-        if self.workers is not None and self.workers < 1:
-            raise SettingsError(f"reduction: workers is {self.workers}, wanted at least 1")
+        super().__post_init__()
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
@@ -101,7 +168,7 @@ class Job:
                 "your own Trajectory with RobotModel.from_urdf(..., free_flyer=True)"
             )
 
-    def model(self) -> RobotModel:
+    def model(self) -> "RobotModel":
         """Return the robot.
 
         Returns:
@@ -110,6 +177,8 @@ class Job:
         Raises:
             ModelError: If the URDF cannot be used, or a joint is not in it.
         """
+        from robotid.robot.model import RobotModel
+
         return RobotModel.from_urdf(
             self.urdf,
             joints=self.joints,
@@ -121,7 +190,7 @@ class Job:
             couplings=self.couplings,
         )
 
-    def read(self, entry: LogEntry, model: RobotModel) -> Log:
+    def read(self, entry: LogEntry, model: "RobotModel") -> "Log":
         """Return one log of the job.
 
         Args:
@@ -134,9 +203,11 @@ class Job:
         Raises:
             DataError: If the file cannot be used.
         """
+        from robotid.logs.read import read_log
+
         return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
 
-    def lay_out(self, entry: LogEntry, model: RobotModel) -> tuple[LogLayout, Table]:
+    def lay_out(self, entry: LogEntry, model: "RobotModel") -> "tuple[LogLayout, Table]":
         """Return which columns of a log's file are read, before any is.
 
         Args:
@@ -149,9 +220,11 @@ class Job:
         Raises:
             DataError: If the file cannot be used.
         """
+        from robotid.logs.read import lay_out
+
         return lay_out(entry.path, **self._reading(model))
 
-    def _reading(self, model: RobotModel) -> dict[str, Any]:
+    def _reading(self, model: "RobotModel") -> dict[str, Any]:
         return {
             "joints": model.joints,
             "gains": self.gains,
@@ -159,53 +232,6 @@ class Job:
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
-        }
-
-    def to_settings(self) -> dict[str, Any]:
-        """Return the job as plain values, in the shape of the job file, paths made absolute."""
-        signals = {
-            key: getattr(self.signals, key)
-            for key in KEYS["signals"]
-            if getattr(self.signals, key) is not None
-        }
-        if self.signals.cutoff is None:
-            signals["cutoff"] = False
-        chosen = tuple(term for term in self.terms if TERMS[term].is_friction)
-        friction = next(name for name, terms in friction_models().items() if terms == chosen)
-        return {
-            "urdf": str(self.urdf.resolve()),
-            **({"joints": list(self.joints)} if self.joints is not None else {}),
-            "locked": dict(self.locked),
-            "gravity": list(self.gravity),
-            "free_flyer": self.free_flyer,
-            "mimic": self.mimic,
-            "signals": signals,
-            "model": {
-                key: friction if key == "friction" else key in self.terms for key in KEYS["model"]
-            },
-            "torque": {"gains": dict(self.gains)},
-            "columns": dict(self.columns),
-            "log": {
-                **({"topic": self.source.topic} if self.source.topic is not None else {}),
-                "joints": dict(self.source.joints),
-                "effort": self.source.effort,
-                "stamp": self.source.stamp,
-            },
-            "units": {
-                key: value
-                for key, value in (("time", self.units.time), ("angle", self.units.angle))
-                if value is not None
-            },
-            "coupling": [{"name": c.name, "ratios": dict(c.ratios)} for c in self.couplings],
-            "estimator": self.estimator.to_dict(),
-            "output": {"dynamics": self.dynamics},
-            "identification": [_entry_settings(entry) for entry in self.identification],
-            "validation": [_entry_settings(entry) for entry in self.validation],
-            "doctor": {"ignore": list(self.ignore)},
-            "reduction": {
-                "rows_in_memory": self.rows_in_memory,
-                **({"workers": self.workers} if self.workers is not None else {}),
-            },
         }
 
 
@@ -246,50 +272,15 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
     Raises:
         SettingsError: If a key or a value is wrong.
     """
-    check_keys(table, KEYS, where)
+    check_keys(table, Job.schema(), where)
     if "urdf" not in table:
         raise SettingsError(f"{where} has no key 'urdf'; name the robot's URDF file")
-    model = table.get("model", {})
-    friction, models = model.get("friction", "viscous+coulomb"), friction_models()
-    if friction not in models:
-        raise SettingsError(f"{where}: friction is {friction!r}, wanted one of {list(models)}")
-    wanted = {
-        name: name in models[friction] if term.is_friction else model.get(name, term.is_default)
-        for name, term in TERMS.items()
-    }
-    joints = table.get("joints")
-    entries = {
-        key: tuple(
-            LogEntry(_path(entry["log"], where, folder), entry.get("start"), entry.get("end"))
-            for entry in table.get(key, [])
-        )
-        for key in ("identification", "validation")
-    }
+    found = dict(table, urdf=_path(table["urdf"], where, folder))
+    for key in ("identification", "validation"):
+        entries = table.get(key, [])
+        found[key] = [dict(entry, log=_path(entry["log"], where, folder)) for entry in entries]
     try:
-        return Job(
-            urdf=_path(table["urdf"], where, folder),
-            joints=tuple(joints) if joints is not None else None,
-            locked=_numbers(table.get("locked", {}), where, "locked"),
-            gravity=tuple(table.get("gravity", GRAVITY)),
-            free_flyer=table.get("free_flyer", False),
-            mimic=table.get("mimic", "independent"),
-            signals=_signals(table.get("signals", {})),
-            terms=tuple(term for term in TERMS if wanted[term]),
-            gains=_numbers(table.get("torque", {}).get("gains", {}), where, "gains"),
-            couplings=tuple(
-                Coupling(c["name"], tuple(_numbers(c["ratios"], where, "ratios").items()))
-                for c in table.get("coupling", [])
-            ),
-            columns=table.get("columns", {}),
-            source=LogSource(**table.get("log", {})),
-            units=LogUnits(**table.get("units", {})),
-            estimator=EstimatorSettings(**table.get("estimator", {})),
-            dynamics=table.get("output", {}).get("dynamics", False),
-            ignore=tuple(table.get("doctor", {}).get("ignore", ())),
-            rows_in_memory=table.get("reduction", {}).get("rows_in_memory", 2**17),
-            workers=table.get("reduction", {}).get("workers"),
-            **entries,
-        )
+        return Job.from_dict(found)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
 
@@ -300,24 +291,3 @@ def _path(text: str, where: str, folder: Path) -> Path:
     if "$" in expanded:
         raise SettingsError(f"{where}: path {text!r} names an environment variable that is not set")
     return folder / expanded
-
-
-def _signals(table: Mapping[str, Any]) -> SignalSettings:
-    settings = dict(table)
-    if isinstance(settings.get("cutoff"), bool):
-        if settings["cutoff"]:
-            raise SettingsError("cutoff is true, wanted a frequency [Hz], or false for no filter")
-        settings["cutoff"] = None
-    return SignalSettings(**settings)
-
-
-def _numbers(table: Mapping[str, Any], where: str, name: str) -> dict[str, float]:
-    for key, value in table.items():
-        if isinstance(value, bool) or not isinstance(value, _NUMBER):
-            raise SettingsError(f"{where}: {name}.{key} is {value!r}, wanted a number")
-    return {key: float(value) for key, value in table.items()}
-
-
-def _entry_settings(entry: LogEntry) -> dict[str, Any]:
-    window = {"start": entry.start, "end": entry.end}
-    return {"log": str(entry.path.resolve()), **{k: v for k, v in window.items() if v is not None}}

@@ -17,7 +17,8 @@ from robotid.identification.pipeline import Identification
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
-from robotid.logs.table import LogSource, prefixes
+from robotid.logs.settings import LogSource
+from robotid.logs.table import prefixes
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.viewer.unexplained import find_unexplained

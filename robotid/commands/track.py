@@ -89,7 +89,7 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
         "robotid": __version__,
         "robot": model.name,
         "joints": list(model.joints),
-        "settings": job.to_settings(),
+        "settings": job.to_dict(),
         "inputs": [
             {"role": "urdf", "path": str(job.urdf), "sha256": file_sha256(job.urdf)},
             {"role": "log", "path": log.path, "sha256": file_sha256(log.path)},

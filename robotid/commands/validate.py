@@ -8,8 +8,7 @@ from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import alarming, diagnose
-from robotid.export.result import read_result, recording_metrics, stated_parameters
-from robotid.export.sidecar import load_identified
+from robotid.export.result import load_result, recording_metrics, stated_parameters
 from robotid.findings import Finding
 from robotid.identification.doubts import doubts_of
 from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
@@ -40,14 +39,13 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         ModelError: If the URDF is missing or was changed.
         SettingsError: If the settings in the result are not usable.
     """
-    result = read_result(path)
-    folder = Path(path).parent
+    loaded = load_result(path)
+    result = loaded.content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     job = job_from_settings(settings, Path(path).name, Path())
     source = job.model()
-    outputs = result["outputs"]
-    if "urdf" in outputs:
-        model, pi = load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
+    if loaded.has_urdf:
+        model, pi = loaded.identified
     else:
         model, pi = source, stated_parameters(result, source)
     prior = source.standard_parameters()
@@ -58,7 +56,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     verdict = _verdict(job, source, result, evaluations, kept, fitted, missing)
     return {
         "result": str(path),
-        "predicted_with": outputs.get("urdf", "base parameters of result.json"),
+        "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [recording_metrics(e, "estimate") for e in evaluations],
         "verdict": verdict.to_dict(),
     }
@@ -111,7 +109,7 @@ def _verdict(
         for finding in diagnose(model, fitted, looks, job.signals)
         if finding.where.split(": ")[0] in names and finding.code not in job.ignore
     ]
-    alarms = alarming(found, job.ignore, is_robust=job.estimator.robust != "none")
+    alarms = alarming(found, job.ignore, is_robust=job.estimator.is_robust)
     stated = result["verdict"]
     return judge(
         Metrics({}, 0.0),
@@ -139,7 +137,7 @@ def _doubts(
 ) -> list[Doubt]:
     """Return the doubts of the result, but for its own validation, and those of the new logs."""
     own = [Doubt(**doubt) for doubt in stated.get("doubts", ())]
-    is_robust = job.estimator.robust != "none"
+    is_robust = job.estimator.is_robust
     doubts = [doubt for doubt in own if doubt.code != "repeated_motion"]
     doubts += doubts_of(found, model.joints, names, is_robust=is_robust)
     if missing:

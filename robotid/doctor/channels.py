@@ -1,11 +1,11 @@
 """What each channel of a log shows of its sensor: steps, limits, spikes, noise, lag; no model."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.clock import runs_of
 from robotid.findings import Finding, listed
 from robotid.logs.data import Log
 from robotid.logs.signals import velocity_lag
@@ -57,13 +57,13 @@ def check_quantisation(log: Log) -> Iterator[Finding]:
             names = [log.joints[j] for j in chosen]
             evidence = {f"steps_{log.joints[j]}": float(count[j]) for j in chosen}
             message = (
-                f"{_name(log)}: {kind} of {listed(names)} moves in steps of "
+                f"{log.name}: {kind} of {listed(names)} moves in steps of "
                 f"{steps[chosen].max():.3g}, "
                 f"{count[chosen].min():.0f} of them over its range; "
                 + ("it is uninformative: scale or log it finer" if few else "log more digits")
             )
             severity = "warning" if few and kind == "tau" else "note"
-            yield Finding("quantised", severity, f"{_name(log)}: {kind}", message, evidence)
+            yield Finding("quantised", severity, f"{log.name}: {kind}", message, evidence)
 
 
 def check_clipping(log: Log) -> Iterator[Finding]:
@@ -79,24 +79,25 @@ def check_clipping(log: Log) -> Iterator[Finding]:
     for joint, x in zip(log.joints, log.tau.T, strict=True):
         if moving.any() and np.ptp(x) == 0:
             message = (
-                f"{_name(log)}: the torque of {joint} is {x[0] + 0.0:.6g} in every row while the "
+                f"{log.name}: the torque of {joint} is {x[0] + 0.0:.6g} in every row while the "
                 "robot moves: the channel is dead, and nothing of this joint's drive can be "
                 f"identified; log tau_{joint}, or leave the joint out"
             )
             evidence = {"value": float(x[0]) + 0.0}
-            yield Finding("constant_torque", "warning", f"{_name(log)}: {joint}", message, evidence)
+            yield Finding("constant_torque", "warning", f"{log.name}: {joint}", message, evidence)
             continue
         for limit in (float(x.max()), float(x.min())):
             at = (x == limit) & moving
-            if at.mean() < _CLIPPED or _longest_run(at) < _PLATEAU or _steps(x) < _COARSE:
+            plateau = max((stop - start for start, stop in runs_of(at)), default=0)
+            if at.mean() < _CLIPPED or plateau < _PLATEAU or _steps(x) < _COARSE:
                 continue
             message = (
-                f"{_name(log)}: the torque of {joint} stays at its limit {limit:.6g} in "
+                f"{log.name}: the torque of {joint} stays at its limit {limit:.6g} in "
                 f"{100 * at.mean():.3g} % of the rows while the robot moves: it is clipped, and "
                 "those rows are wrong; record a gentler motion or cut them out"
             )
             evidence = {"limit": limit, "share": float(at.mean())}
-            yield Finding("clipped", "warning", f"{_name(log)}: {joint}", message, evidence)
+            yield Finding("clipped", "warning", f"{log.name}: {joint}", message, evidence)
 
 
 def check_spikes(log: Log) -> Iterator[Finding]:
@@ -118,7 +119,7 @@ def check_spikes(log: Log) -> Iterator[Finding]:
                 continue
             energy = float(np.sum(height**2) / np.sum((x - np.median(x)) ** 2))
             message = (
-                f"{_name(log)}: {kind} of {joint} jumps by up to {np.abs(height).max():.4g} for "
+                f"{log.name}: {kind} of {joint} jumps by up to {np.abs(height).max():.4g} for "
                 f"{len(rows)} rows, the first at t = {log.t[rows[0]]:.6g} s; remove these rows "
                 "from the recording"
             )
@@ -130,7 +131,7 @@ def check_spikes(log: Log) -> Iterator[Finding]:
             }
             absurd = evidence["largest"] > _ABSURD * reach and energy > _HARM
             severity = "error" if absurd else "note"
-            yield Finding("spikes", severity, f"{_name(log)}: {kind}_{joint}", message, evidence)
+            yield Finding("spikes", severity, f"{log.name}: {kind}_{joint}", message, evidence)
 
 
 def check_noise(log: Log) -> Iterator[Finding]:
@@ -149,16 +150,16 @@ def check_noise(log: Log) -> Iterator[Finding]:
         shown = ", ".join(f"{level:.2g}" for level in noise)
         evidence = dict(zip(log.joints, noise.tolist(), strict=True))
         message = (
-            f"{_name(log)}: white noise of {kind} {shown} (standard deviation per joint, in the "
+            f"{log.name}: white noise of {kind} {shown} (standard deviation per joint, in the "
             "channel's unit); nothing needs doing"
         )
-        yield Finding("noise", "note", f"{_name(log)}: {kind}", message, evidence)
+        yield Finding("noise", "note", f"{log.name}: {kind}", message, evidence)
         for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
             message = (
-                f"{_name(log)}: the torque of {log.joints[j]} is {100 * share[j]:.0f} % noise; "
+                f"{log.name}: the torque of {log.joints[j]} is {100 * share[j]:.0f} % noise; "
                 "record longer, faster, or with a lower cutoff"
             )
-            where = f"{_name(log)}: {log.joints[j]}"
+            where = f"{log.name}: {log.joints[j]}"
             yield Finding("noisy_torque", "note", where, message, {"share": float(share[j])})
 
 
@@ -188,11 +189,11 @@ def check_velocity_delay(log: Log, stated: float = 0.0) -> Iterator[Finding]:
         else "if the torque is as late, keep velocity = 'measured'; else differentiate"
     )
     message = (
-        f"{_name(log)}: the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late "
+        f"{log.name}: the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late "
         f"against d(q)/dt; {what}, or state [signals] velocity_delay = {lag + stated:.4f}"
     )
     evidence = {"delay": lag, "std_error": error}
-    yield Finding("velocity_delay", severity, _name(log), message, evidence)
+    yield Finding("velocity_delay", severity, log.name, message, evidence)
 
 
 def check_velocity_order(log: Log) -> Iterator[Finding]:
@@ -212,12 +213,12 @@ def check_velocity_order(log: Log) -> Iterator[Finding]:
         if k == j or alike[j, k] < _ALIKE or alike[j, j] > 0.5 * alike[j, k]:
             continue
         message = (
-            f"{_name(log)}: dq_{log.joints[k]} is d(q)/dt of q_{joint} (correlation "
+            f"{log.name}: dq_{log.joints[k]} is d(q)/dt of q_{joint} (correlation "
             f"{alike[j, k]:.2f}; with dq_{joint} {alike[j, j]:.2f}): position or velocity columns "
             "are in another order; name them rightly"
         )
         evidence = {"correlation": float(alike[j, k]), "own_correlation": float(alike[j, j])}
-        yield Finding("velocity_order", "error", f"{_name(log)}: {joint}", message, evidence)
+        yield Finding("velocity_order", "error", f"{log.name}: {joint}", message, evidence)
 
 
 def check_velocity_scale(log: Log, velocity: str) -> Iterator[Finding]:
@@ -248,12 +249,12 @@ def check_velocity_scale(log: Log, velocity: str) -> Iterator[Finding]:
         factor = 0.0 if is_dead else float(np.sqrt(b / a))
         what = "hardly changes while the position moves" if is_dead else "is in another unit"
         message = (
-            f"{_name(log)}: dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured "
+            f"{log.name}: dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured "
             f"velocity {what}, and every friction and inertia with it; correct the column, or set "
             "[signals] velocity = 'differentiated'"
         )
         severity = "note" if velocity == "differentiated" else "error"
-        where = f"{_name(log)}: {joint}"
+        where = f"{log.name}: {joint}"
         yield Finding("velocity_scale", severity, where, message, {"factor": factor})
 
 
@@ -289,11 +290,6 @@ def _quantum(x: Array) -> float:
 def _steps(x: Array) -> float:
     quantum = _quantum(x)
     return float(np.ptp(x)) / quantum if quantum > 0 else float("inf")
-
-
-def _longest_run(flags: Array) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
 
 
 def _spikes(t: Array, x: Array, reach: float) -> tuple[Array, Array]:
@@ -343,7 +339,3 @@ def _correlation(one: Array, other: Array) -> Array:
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
     found: Array = np.divide(a.T @ b, size, out=np.zeros_like(size), where=size > 0)
     return found
-
-
-def _name(log: Log) -> str:
-    return Path(log.path).name or "log"

@@ -1,7 +1,6 @@
 """What a log shows of its own clock and of its joints' motion, without a model of the robot."""
 
 from collections.abc import Collection, Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +8,14 @@ from robotid._typing import Array
 from robotid.findings import Finding
 from robotid.logs.data import Log
 
-__all__ = ["check_clock", "check_gaps", "check_stale_rows", "check_standstill", "check_static"]
+__all__ = [
+    "check_clock",
+    "check_gaps",
+    "check_stale_rows",
+    "check_standstill",
+    "check_static",
+    "runs_of",
+]
 
 _JITTER = 0.05  # spread of the steps over their median from which jitter is reported
 _GAP = 2.5  # a step longer than this many median steps is a gap
@@ -36,7 +42,7 @@ def check_clock(log: Log) -> Iterator[Finding]:
     median = float(np.median(step))
     usual = step[step < _GAP * median]
     spread = float(np.std(usual)) / median
-    name = _name(log)
+    name = log.name
     evidence = {"rate": 1 / median, "samples": len(log.t), "duration": float(log.t[-1] - log.t[0])}
     message = (
         f"{name}: {len(log.t)} rows in {evidence['duration']:.4g} s, {1 / median:.4g} Hz in the "
@@ -71,12 +77,12 @@ def check_gaps(log: Log) -> Iterator[Finding]:
     longest = int(gaps[np.argmax(step[gaps])])
     severity = "warning" if step[longest] > max(_LONG, _GAP * median) else "note"
     message = (
-        f"{_name(log)}: {len(gaps)} gaps, the longest of {step[longest]:.3g} s at t = "
+        f"{log.name}: {len(gaps)} gaps, the longest of {step[longest]:.3g} s at t = "
         f"{log.t[longest]:.6g} s; nothing is filtered or differentiated across long ones, and the "
         "rows beside them are lost: record without interruption if you can"
     )
     evidence = {"gaps": len(gaps), "longest": float(step[longest]), "at": float(log.t[longest])}
-    yield Finding("gap", severity, _name(log), message, evidence)
+    yield Finding("gap", severity, log.name, message, evidence)
 
 
 def check_stale_rows(log: Log) -> Iterator[Finding]:
@@ -94,19 +100,19 @@ def check_stale_rows(log: Log) -> Iterator[Finding]:
     speed = np.abs(np.diff(log.q, axis=0)).max(axis=1) / np.diff(log.t)
     passing = np.zeros(len(same), dtype=bool)
     passing[1:-1] = (speed[:-2] > _STILL) | (speed[2:] > _STILL)
-    runs = _runs(same)
+    runs = runs_of(same)
     stale = sum(stop - start for start, stop in runs if passing[start] or passing[stop - 1])
     if stale == 0:
         return
     share = stale / len(log.t)
     message = (
-        f"{_name(log)}: {stale} rows ({100 * share:.2g} %) repeat the row before in every channel "
+        f"{log.name}: {stale} rows ({100 * share:.2g} %) repeat the row before in every channel "
         "while the robot moves: the logger ran faster than the robot's state; log each state "
         "once, with its own time stamp"
     )
     evidence = {"rows": stale, "share": share, "longest_run": max(e - s for s, e in runs)}
     severity = "warning" if share > _STALE else "note"
-    yield Finding("stale_rows", severity, _name(log), message, evidence)
+    yield Finding("stale_rows", severity, log.name, message, evidence)
 
 
 def check_standstill(log: Log, motion_t: Array, motion_v: Array) -> Iterator[Finding]:
@@ -128,11 +134,11 @@ def check_standstill(log: Log, motion_t: Array, motion_v: Array) -> Iterator[Fin
     if max(before, after) < _REST:
         return
     message = (
-        f"{_name(log)}: the robot rests for the first {before:.3g} s and the last {after:.3g} s; "
+        f"{log.name}: the robot rests for the first {before:.3g} s and the last {after:.3g} s; "
         "rows of resting joints are left out where friction is identified; cut them with start "
         f"= {motion_t[moving[0]]:.4g} and end = {motion_t[moving[-1]]:.4g}"
     )
-    yield Finding("standstill", "note", _name(log), message, {"before": before, "after": after})
+    yield Finding("standstill", "note", log.name, message, {"before": before, "after": after})
 
 
 def check_static(
@@ -155,28 +161,31 @@ def check_static(
         evidence = {"range": reach, "moving_share": share}
         if reach < _STATIC:
             message = (
-                f"{_name(log)}: {joint} stands still (range {reach:.2g}): its friction, its "
+                f"{log.name}: {joint} stands still (range {reach:.2g}): its friction, its "
                 "inertia and much of what it carries cannot be identified from this log; move it, "
                 "or lock it"
             )
             yield Finding("static_joint", "warning", _at(log, joint), message, evidence)
         elif reach < (_HARDLY_SLIDES if joint in prismatic else _HARDLY) or share < _MOVING:
             message = (
-                f"{_name(log)}: {joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} "
+                f"{log.name}: {joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} "
                 "% of the time): what it alone excites is poorly known; move it farther and longer"
             )
             yield Finding("hardly_moves", "note", _at(log, joint), message, evidence)
 
 
-def _runs(flags: Array) -> list[tuple[int, int]]:
-    """Return the (start, stop) of each run of true flags."""
+def runs_of(flags: Array) -> list[tuple[int, int]]:
+    """Return where flags are true without a break.
+
+    Args:
+        flags: Shape (N,), bool.
+
+    Returns:
+        First row and row after the last one of each run.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
-def _name(log: Log) -> str:
-    return Path(log.path).name or "log"
-
-
 def _at(log: Log, joint: str) -> str:
-    return f"{_name(log)}: {joint}"
+    return f"{log.name}: {joint}"

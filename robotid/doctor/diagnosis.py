@@ -6,7 +6,6 @@ unless its code is ignored.
 
 import difflib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from robotid.doctor.channels import (
@@ -33,11 +32,11 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.doubts import DOUBTFUL, is_outvoted
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
-__all__ = ["CODES", "alarming", "diagnose", "findings_to_dict"]
+__all__ = ["CODES", "alarming", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
@@ -45,6 +44,30 @@ CODES = (
     "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
     "velocity_scale",
 )  # fmt: skip
+
+
+def check_logs(
+    model: RobotModel,
+    logs: Sequence[Log],
+    *,
+    validation: Sequence[Log] = (),
+    signals: SignalSettings | None = None,
+) -> tuple[Finding, ...]:
+    """Ask the doctor what is wrong with logs, before anything is identified from them.
+
+    Args:
+        model: The robot.
+        logs: Logs to fit, of the model's joints in its order.
+        validation: Logs kept apart.
+        signals: How logs become trajectories; the defaults if None.
+
+    Returns:
+        The findings, errors first: each with a code, a severity, where, and what to do.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
+    return diagnose(model, logs, validation, signals or SignalSettings())
 
 
 def diagnose(
@@ -69,10 +92,10 @@ def diagnose(
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
     for log, (motion, _) in zip(kept, motions[len(fitted) :], strict=True):
         if motion is not None:
-            findings += check_repeated_motion(first, motion, _name(log))
+            findings += check_repeated_motion(first, motion, log.name)
     probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
     if probes:
-        names = ", ".join(_name(log) for log in fitted)
+        names = ", ".join(log.name for log in fitted)
         moving = [probe.motion for probe in probes]
         findings += check_excitation(model, structural_mapping(model), moving, signals, names)
     return by_severity(findings)
@@ -133,7 +156,7 @@ def _examine_log(
     model: RobotModel, log: Log, signals: SignalSettings, findings: list[Finding]
 ) -> tuple[Trajectory | None, Probe | None]:
     """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
-    name = _name(log)
+    name = log.name
     findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in log.notes]
     for check in (check_clock, check_gaps, check_stale_rows, check_quantisation, check_clipping):
         findings += check(log)
@@ -162,7 +185,3 @@ def _examine_log(
     if not any(finding.severity == "error" for finding in torques):
         findings += check_torque_delay(model, motion, signals, name)
     return motion, probe
-
-
-def _name(log: Log) -> str:
-    return Path(log.path).name or "log"

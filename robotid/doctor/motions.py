@@ -13,7 +13,7 @@ from robotid.findings import Finding
 from robotid.identification.prior import spread_of
 from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress, merge
 from robotid.robot.model import RobotModel

@@ -6,16 +6,15 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.signals import SignalSettings, process, resolve, unwrap
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process, resolve, unwrap
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
 __all__ = ["Probe", "smooth_motion", "take_probe"]
 
-_MARGIN = (
-    0.15  # [s] rows this near to the end of a stretch are left out: the filter is not settled there
-)
+_MARGIN = 0.15  # [s] rows nearer to the end of a stretch are left out: the filter has not settled
 _STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
 _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
 

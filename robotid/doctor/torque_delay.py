@@ -12,7 +12,8 @@ import numpy as np
 from robotid._typing import Array
 from robotid.findings import Finding
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
+from robotid.logs.smoothing import low_pass
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
@@ -191,10 +192,10 @@ def _window(
     top = np.maximum(np.abs(motion.v).max(axis=0), _STILL)
     signs = [np.tanh(v / speed) for speed in (_STILL, 0.1 * top, 0.3 * top)]
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v)], axis=2)
-    own = _filtered(own, step, signals)[::every][inner]
+    own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
     W = joint_torque_regressor(model, *state).reshape(len(coarse), len(model.joints), -1)
-    W = _filtered(W, step * every, signals)[inner]
+    W = low_pass(W, 1 / (step * every), signals)[inner]
     size = model.layout.n_inertial
     coupled = W[:, :, size + len(model.joints) * len(model.layout.terms) :]
     at = motion.t[coarse[inner]]
@@ -213,18 +214,6 @@ def _distance(at: Array, turns: Array) -> Array:
     after = np.searchsorted(bounds, at)
     distance: Array = np.minimum(at - bounds[after - 1], bounds[after] - at)
     return distance
-
-
-def _filtered(x: Array, step: float, signals: SignalSettings) -> Array:
-    """Return columns over time, axis 0, after the filter that the torque went through."""
-    if signals.cutoff is None or len(x) < 2:
-        return x
-    from scipy.signal import butter, sosfiltfilt
-
-    sos = butter(signals.order, signals.cutoff, fs=1.0 / step, output="sos")
-    pad = min(len(x) - 1, int(2 / (step * signals.cutoff)))  # two periods
-    filtered: Array = sosfiltfilt(sos, x, axis=0, padlen=pad)
-    return filtered
 
 
 def _squares(

@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,10 @@ import numpy as np
 from robotid._files import file_sha256
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.export.sidecar import load_identified
 from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
-from robotid.identification.metrics import Metrics
 from robotid.identification.pipeline import Identification
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -23,7 +25,9 @@ from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import __version__, versions
 
 __all__ = [
+    "Result",
     "build_result",
+    "load_result",
     "read_result",
     "recording_metrics",
     "stated_parameters",
@@ -78,7 +82,7 @@ def build_result(
         "standard_parameters": _entries(identification, slice(0, size)),
         "drive_parameters": _entries(identification, slice(size, None)),
         "consistency": _consistency(identification),
-        "identification": _metrics(identification.metrics()),
+        "identification": identification.metrics().to_dict(),
         "validation": [
             recording_metrics(e, "estimate") | {"band": _band(identification, e)}
             for e in identification.validation
@@ -87,7 +91,7 @@ def build_result(
         "wls": {
             "base_values": identification.wls.theta.tolist(),
             "base_std_errors": [_finite(error) for error in identification.wls.std_error],
-            "identification": _metrics(identification.metrics("wls")),
+            "identification": identification.metrics("wls").to_dict(),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
         "verdict": identification.verdict.to_dict(),
@@ -104,7 +108,82 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     Returns:
         The dictionary.
     """
-    return {"log": evaluation.recording.log.path, **_metrics(evaluation.metrics[name])}
+    return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What an identification wrote: a result.json, and the URDF and sidecar beside it.
+
+    Attributes:
+        path: The result.json.
+        content: What it holds.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        return (
+            f"<Result of {self.content['robot']}: {self.content['structure']['base']} base "
+            f"parameters by {self.content['settings']['estimator']['name']}, verdict "
+            f"{self.verdict['status']}>"
+        )
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether the identified URDF was written: it is if the parameters are possible."""
+        return "urdf" in self.content["outputs"]
+
+    @cached_property
+    def identified(self) -> tuple[RobotModel, Array]:
+        """The robot of the identified URDF with its sidecar, and its standard parameters."""
+        if not self.has_urdf:
+            raise DataError(
+                f"{self.path.name} has no URDF, for its parameters are not physically consistent; "
+                "identify with the 'consistent' estimator"
+            )
+        outputs, folder = self.content["outputs"], self.path.parent
+        return load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
+
+    @property
+    def robot(self) -> RobotModel:
+        """The robot as identified."""
+        return self.identified[0]
+
+    @property
+    def parameters(self) -> Array:
+        """Its standard parameters, shape (p,), SI units, in ``robot.layout.names`` order."""
+        return self.identified[1]
+
+    @property
+    def verdict(self) -> Mapping[str, Any]:
+        """How far to trust it: "status", "reasons" and "per_joint"."""
+        verdict: Mapping[str, Any] = self.content["verdict"]
+        return verdict
+
+    @property
+    def metrics(self) -> dict[str, Mapping[str, Any]]:
+        """Metrics by joint: of the "fitted" rows, and of each log kept apart, by its file."""
+        kept = {entry["log"]: entry["per_joint"] for entry in self.content["validation"]}
+        return {"fitted": self.content["identification"]["per_joint"], **kept}
+
+
+def load_result(path: str | Path) -> Result:
+    """Load what an identification wrote.
+
+    Args:
+        path: A result.json, or its folder; the URDF beside it is read when it is asked for.
+
+    Returns:
+        The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and all of its content.
+
+    Raises:
+        DataError: If it is missing, no JSON, or of another schema.
+    """
+    source = Path(path)
+    source = source / "result.json" if source.is_dir() else source
+    return Result(source, read_result(source))
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
@@ -256,25 +335,6 @@ def _consistency(identification: Identification) -> dict[str, Any]:
 
 def _smallest(J: Array) -> float:
     return float(np.linalg.eigvalsh(J)[0])
-
-
-def _metrics(metrics: Metrics) -> dict[str, Any]:
-    return {
-        "per_joint": {
-            joint: {
-                "rmse": m.rmse,
-                "unit": m.unit,
-                "relative_error_pct": m.relative_error_pct,
-                "r2": m.r2,
-                "rows": m.rows,
-                "urdf_relative_error_pct": m.baselines["urdf"],
-                "gravity_only_relative_error_pct": m.baselines["gravity_only"],
-                "better_than_constant": m.better_than_constant,
-            }
-            for joint, m in metrics.per_joint.items()
-        },
-        "pooled_rmse": metrics.pooled_rmse,
-    }
 
 
 def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from robotid._typing import Array
 from robotid.identification.metrics import Metrics, TorqueSums
 from robotid.identification.survey import LogPiece, SurveyedLog
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.signals import SignalSettings, turns_note
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import turns_note
 from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
 from robotid.workers.plan import WorkPlan

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from robotid.findings import Finding
 from robotid.identification.pipeline import Identification
+from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 
@@ -121,7 +122,7 @@ def consistency_findings(identification: Identification) -> list[Finding]:
     findings = []
     check, details = identification.mass_matrix, identification.estimate.details
     if not check.is_positive:
-        is_consistent = identification.estimator.name in ("consistent", "log_cholesky")
+        is_consistent = isinstance(identification.estimator, ConsistentSettings)
         advice = "raise [estimator] margin" if is_consistent else "use the 'consistent' estimator"
         message = (
             f"the mass matrix is not positive definite at {100 * (1 - check.positive_share):.3g} % "
@@ -178,7 +179,7 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
     more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
     advice = (
         "they were weighted down"
-        if identification.estimator.robust != "none"
+        if identification.estimator.is_robust
         else "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
     )
     message = (
@@ -192,6 +193,8 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
 def _asked(identification: Identification) -> str:
     """Return in words what the user asks of the parameters, empty if nothing."""
     settings = identification.estimator
+    if not isinstance(settings, BoundedSettings):
+        return ""
     asked = {key: value for key, value in settings.constraints.items() if value}
     if settings.margin > _WIDE:
         asked["margin"] = settings.margin
@@ -217,9 +220,9 @@ def _speaks_against(identification: Identification) -> str:
 
 def _stated(identification: Identification) -> set[str]:
     """Return the bounds that the user states; those of the links' geometry may well bind."""
-    stated = identification.estimator.constraints
+    stated = identification.estimator.bounds
     return {
         "total_mass all",
-        *(f"mass {link}" for link in stated.get("mass", ())),
-        *(f"centre_of_mass {link}" for link in stated.get("com", ())),
+        *(f"mass {link}" for link in stated.mass),
+        *(f"centre_of_mass {link}" for link in stated.com),
     }

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +47,25 @@ class Metrics:
 
     per_joint: Mapping[str, JointMetrics]
     pooled_rmse: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as result.json has them."""
+        return {
+            "per_joint": {
+                joint: {
+                    "rmse": m.rmse,
+                    "unit": m.unit,
+                    "relative_error_pct": m.relative_error_pct,
+                    "r2": m.r2,
+                    "rows": m.rows,
+                    "urdf_relative_error_pct": m.baselines["urdf"],
+                    "gravity_only_relative_error_pct": m.baselines["gravity_only"],
+                    "better_than_constant": m.better_than_constant,
+                }
+                for joint, m in self.per_joint.items()
+            },
+            "pooled_rmse": self.pooled_rmse,
+        }
 
 
 @dataclass(frozen=True, eq=False)

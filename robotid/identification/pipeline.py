@@ -13,16 +13,15 @@ from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, pool
+from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.prior import spread_of
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import (
-    ESTIMATORS,
+    BoundedSettings,
     EstimatorSettings,
-    Known,
-    consistent_fit,
-    make_estimator,
+    RecursiveSettings,
 )
 from robotid.identification.standard_errors import (
     Redraws,
@@ -38,7 +37,7 @@ from robotid.identification.summary import (
 from robotid.identification.survey import hold_log
 from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors
 from robotid.regressor.reduction import join
@@ -48,7 +47,6 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
 __all__ = [
-    "ESTIMATORS",
     "EstimatorSettings",
     "Identification",
     "conclude",
@@ -157,7 +155,7 @@ class Identification:
             share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
         )
         kept = self.model.layout.owned_by(self.estimate.details.get("pinned", ()))
-        masses = self.estimator.constraints.get("mass", {}).items()
+        masses = self.estimator.bounds.masses.items()
         known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
         kept = kept | np.isin(self.model.layout.names, known)
         return tuple(np.where(kept, "prior", names).tolist())
@@ -328,8 +326,8 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     model, mapping = recordings.model, recordings.mapping
     prior = model.standard_parameters()
     reductions, grown = recordings.reduce(), 1.0
-    if choice.robust != "none":
-        robust = reweigh(recordings, reductions, choice.robust, prior)
+    if choice.is_robust:
+        robust = reweigh(recordings, reductions, choice.loss, prior)
         recordings, reductions = robust.recordings, robust.reductions
         grown = robust.loss_of_efficiency**2
     reduction = join(reductions)
@@ -338,7 +336,7 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     spread = spread_of(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Known(prior, spread, share, rough.sigma, stretches)
-    known = model.layout.owned_by(choice.constraints.get("pinned", ()))
+    known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
     return _Ground(recordings, factors, before, rough, determination, grown)
@@ -368,12 +366,19 @@ def _measured(
             mapping.K,
             estimate.sigma if estimate.names == mapping.names else sigma,
             is_filter=weighing == "by age",
-            redraws=None if fit is None else Redraws(fit, choice.draws, np.random.default_rng(0)),
+            redraws=_redraws(choice, fit),
         )
     if ground.grown != 1.0:
         estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
         wls = replace(wls, covariance=ground.grown * wls.covariance)
     return estimate, wls, errors
+
+
+def _redraws(choice: EstimatorSettings, fit: Consistent | None) -> Redraws | None:
+    """Return the fits to redrawn data that tell the standard errors where bounds bind."""
+    if fit is None or not isinstance(choice, BoundedSettings):
+        return None
+    return Redraws(fit, choice.draws, np.random.default_rng(0))
 
 
 def _run(
@@ -390,7 +395,7 @@ def _run(
     if estimator.reads == "factors":
         return estimator.fit(factors), estimator.in_cone, estimator.weighing
     estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
-    if not choice.physical:
+    if not (isinstance(choice, RecursiveSettings) and choice.physical):
         return estimate, None, estimator.weighing
     if estimator.weighing == "by step":
         estimate = with_wls_errors(estimate, wls)

@@ -2,7 +2,7 @@
 
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import sure_rows
 from robotid.regressor.problem import Problem

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robotid._html import code, number, percent, table, text
 
@@ -12,9 +13,12 @@ if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
 __all__ = [
+    "cell",
+    "error_lines",
     "identification_html",
     "identification_line",
     "identification_text",
+    "verdict_lines",
 ]
 
 
@@ -42,19 +46,68 @@ def identification_text(found: Identification) -> str:
     Returns:
         Lines.
     """
-    verdict, lines = found.verdict, [identification_line(found)[1:-1]]
-    lines += [f"  - {reason}" for reason in verdict.reasons]
-    for caption, metrics in _tables(found):
-        lines.append(caption)
-        width = max(len(joint) for joint in metrics.per_joint)
-        for joint, m in metrics.per_joint.items():
-            error = percent(m.relative_error_pct).html
-            urdf = percent(m.baselines["urdf"]).html
-            rmse = f"{m.rmse:.3g} {m.unit}"
-            lines.append(f"  {joint:{width}} {error:>6} %  {rmse:12} URDF {urdf:>6} %")
+    lines = [identification_line(found)[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
+    for caption, ours, wls in _tables(found):
+        lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
     if found.report:
         lines.append(f"report: {found.report}")
     return "\n".join(lines)
+
+
+def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None) -> list[str]:
+    """Return the errors of each joint as lines of text.
+
+    Args:
+        metrics: Metrics, as in result.json.
+        wls: Those of weighted least squares, or none.
+
+    Returns:
+        A line of headers, and one per joint.
+    """
+    others = {} if wls is None else wls["per_joint"]
+    width = max(len(joint) for joint in metrics["per_joint"])
+    lines = [f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %"]
+    for joint, m in metrics["per_joint"].items():
+        error, urdf, gravity = (
+            m[f"{of}relative_error_pct"] for of in ("", "urdf_", "gravity_only_")
+        )
+        cells = [cell(others.get(joint, {}).get("relative_error_pct")), cell(urdf)]
+        rmse = f"{m['rmse']:.3g} {m['unit']}"
+        flag = "" if m["better_than_constant"] else "  worse than a constant"
+        lines.append(
+            f"  {joint:{width}}  {cell(error)}   {rmse:10}{' '.join(cells)}  {cell(gravity, 9)}"
+            f"{flag}"
+        )
+    return lines
+
+
+def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
+    """Return a verdict with its reasons as lines of text.
+
+    Args:
+        verdict: Status, reasons and joints, as in result.json.
+
+    Returns:
+        The status, the reasons, and the joints of each status.
+    """
+    lines = [f"verdict: {verdict['status']}", *(f"  - {reason}" for reason in verdict["reasons"])]
+    by_status: dict[str, list[str]] = {}
+    for name, joint in verdict["per_joint"].items():
+        by_status.setdefault(joint["status"], []).append(name)
+    return lines + [f"  {status}: {', '.join(names)}" for status, names in by_status.items()]
+
+
+def cell(value: float | None, width: int = 7) -> str:
+    """Return a percentage, or a dash, as wide as its column.
+
+    Args:
+        value: The percentage, or None.
+        width: Width of the column.
+
+    Returns:
+        Text of that width.
+    """
+    return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
 
 
 def identification_html(found: Identification) -> str:
@@ -67,7 +120,7 @@ def identification_html(found: Identification) -> str:
         HTML without scripts or styles.
     """
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
-    tables = "".join(_errors(caption, metrics) for caption, metrics in _tables(found))
+    tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))
     link = (
         f'<a href="{escape(found.report)}">{escape(found.report)}</a>'
         if found.report
@@ -80,9 +133,13 @@ def identification_html(found: Identification) -> str:
     )
 
 
-def _tables(found: Identification) -> list[tuple[str, Metrics]]:
-    kept = [(f"{e.recording.name}: not fitted", e.metrics["estimate"]) for e in found.validation]
-    return [*kept, ("fitted rows", found.metrics())]
+def _tables(found: Identification) -> list[tuple[str, Metrics, Metrics]]:
+    """Return the metrics of each kept and of the fitted recordings, and those of WLS."""
+    kept = [
+        (f"{e.recording.name}: not fitted", e.metrics["estimate"], e.metrics["wls"])
+        for e in found.validation
+    ]
+    return [*kept, ("fitted rows", found.metrics(), found.metrics("wls"))]
 
 
 def _errors(caption: str, metrics: Metrics) -> str:

@@ -20,7 +20,8 @@ from robotid.identification.rows import base_problem, row_mask
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
 from robotid.logs.read import LogLayout
-from robotid.logs.signals import SignalSettings, decide, unwrap, velocity_lag
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import decide, unwrap, velocity_lag
 from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches, too_short
 from robotid.logs.table import Place, RowReader, Table, prefixes
 from robotid.logs.time_stamps import blocks_of, map_stamps, median_step

@@ -15,7 +15,8 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
-from robotid.logs.table import LogSource, Table, choose, prefixes
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Table, choose, prefixes
 
 __all__ = ["open_hdf5", "open_mat", "open_npz", "write_hdf5", "write_mat", "write_npz"]
 

@@ -17,7 +17,8 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.findings import listed
 from robotid.logs.data import repeated, suggestion
-from robotid.logs.table import LogSource, Table, choose
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Table, choose
 
 __all__ = ["open_bag"]
 

@@ -33,7 +33,8 @@ def open_csv(path: Path) -> Table:
         DataError: If there is no header, a cell is no number, or a row has another length.
     """
     names, separator = _csv_header(path)
-    return Table(names, partial(_read_csv, path), rows=_CsvRows(path, names, separator))
+    rows = _CsvRows(path, names, separator)
+    return Table(names, rows.read_all, rows=rows)
 
 
 def write_csv(table: Mapping[str, Array], path: Path) -> None:
@@ -100,16 +101,71 @@ class _CsvRows(RowReader):
         self, lines: Sequence[str], wanted: Sequence[str], place: Place, start: int, stop: int
     ) -> dict[str, Array]:
         """Return rows start to stop of some lines."""
+        rows = self._whole(lines, place.line)
+        return self._numbers(islice(rows, start, stop), wanted)
+
+    def read_all(self, wanted: Sequence[str]) -> dict[str, Array]:
+        """Return whole columns.
+
+        Args:
+            wanted: Their names.
+
+        Returns:
+            The columns by name, shape (N,).
+
+        Raises:
+            DataError: If a cell is no number, or a row has another length.
+        """
+        with _open_csv(self.path) as file:
+            file.readline()
+            rows = self._whole(file)
+            first = list(islice(rows, 1))
+            if not first:
+                raise DataError(f"{self.path.name} has a header but no rows; record at least 2")
+            return self._numbers(chain(first, rows), wanted)
+
+    def _numbers(self, rows: Iterable[str], wanted: Sequence[str]) -> dict[str, Array]:
         columns = [self.names.index(name) for name in wanted]
-        count, where = len(self.names), self.path.name
-        rows = _whole_rows(lines, count, self.separator, where, place.line)
+        how: dict[str, Any] = {"comments": None, "quotechar": '"', "ndmin": 2}
         try:
-            values = np.loadtxt(islice(rows, start, stop), usecols=columns, **_how(self.separator))
-        except DataError:
+            values = np.loadtxt(rows, delimiter=self.separator, usecols=columns, **how)
+        except (DataError, UnicodeDecodeError):
             raise
         except ValueError as error:
-            raise _bad_cell(self.path, self.names, columns, self.separator) from error
+            raise self._bad_cell(columns) from error
         return dict(zip(wanted, values.T, strict=True))
+
+    def _whole(self, lines: Iterable[str], first: int = 2) -> Iterator[str]:
+        """Yield the lines that are not blank, and refuse those with too few or too many cells."""
+        count, separator = len(self.names), self.separator
+        for number, line in enumerate(lines, start=first):
+            if line.isspace():
+                continue
+            if line.count(separator) != count - 1:  # unless a separator stands in quotes
+                found = len(next(csv.reader([line], delimiter=separator)))
+                if found != count:
+                    raise DataError(
+                        f"{self.path.name}: line {number} has {found} cells, the header has "
+                        f"{count}; correct it"
+                    )
+            yield line
+
+    def _bad_cell(self, columns: list[int]) -> DataError:
+        """Return the error that names the first cell that is not a number."""
+        where = self.path.name
+        with _open_csv(self.path) as file:
+            file.readline()
+            for row, line in enumerate(self._whole(file)):
+                cells = next(csv.reader([line], delimiter=self.separator))
+                for i in columns:
+                    if not _is_number(cells[i]):
+                        found = repr(cells[i]) if cells[i].strip() else "empty"
+                        hint = "; write decimals with a point" if "," in cells[i] else ""
+                        return DataError(
+                            f"{where}: {self.names[i]} is {found} at row {row}, wanted a "
+                            f"number{hint}; remove the row or correct the recording"
+                        )
+        return DataError(f"{where} holds a cell that is not a plain decimal number")
 
 
 @contextmanager
@@ -126,11 +182,6 @@ def _not_utf8(path: Path, error: UnicodeDecodeError) -> DataError:
     return DataError(f"{path.name} is not UTF-8 text: {error}; save it as UTF-8")
 
 
-def _how(separator: str) -> dict[str, Any]:
-    """Return how NumPy reads the cells."""
-    return {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
-
-
 def _csv_header(path: Path) -> tuple[list[str], str]:
     """Return the column names of a CSV file and what separates them."""
     with _open_csv(path) as file:
@@ -143,58 +194,6 @@ def _csv_header(path: Path) -> tuple[list[str], str]:
     if all(_is_number(name) for name in names):
         raise DataError(f"{path.name} has no header; its first line must name the columns")
     return names, separator
-
-
-def _read_csv(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    """Return the wanted columns of a CSV file."""
-    names, separator = _csv_header(path)
-    columns = [names.index(name) for name in wanted]
-    with _open_csv(path) as file:
-        file.readline()
-        rows = _whole_rows(file, len(names), separator, path.name)
-        first = list(islice(rows, 1))
-        if not first:
-            raise DataError(f"{path.name} has a header but no rows; record at least 2")
-        try:
-            values = np.loadtxt(chain(first, rows), usecols=columns, **_how(separator))
-        except (DataError, UnicodeDecodeError):
-            raise
-        except ValueError as error:
-            raise _bad_cell(path, names, columns, separator) from error
-    return dict(zip(wanted, values.T, strict=True))
-
-
-def _whole_rows(
-    lines: Iterable[str], count: int, separator: str, where: str, first: int = 2
-) -> Iterator[str]:
-    """Yield the lines that are not blank, and refuse those with too few or too many cells."""
-    for number, line in enumerate(lines, start=first):
-        if line.isspace():
-            continue
-        if line.count(separator) != count - 1:  # unless a separator stands in quotes
-            found = len(next(csv.reader([line], delimiter=separator)))
-            if found != count:
-                raise DataError(
-                    f"{where}: line {number} has {found} cells, the header has {count}; correct it"
-                )
-        yield line
-
-
-def _bad_cell(path: Path, names: list[str], columns: list[int], separator: str) -> DataError:
-    """Return the error that names the first cell that is not a number."""
-    with _open_csv(path) as file:
-        file.readline()
-        for row, line in enumerate(_whole_rows(file, len(names), separator, path.name)):
-            cells = next(csv.reader([line], delimiter=separator))
-            for i in columns:
-                if not _is_number(cells[i]):
-                    found = repr(cells[i]) if cells[i].strip() else "empty"
-                    hint = "; write decimals with a point" if "," in cells[i] else ""
-                    return DataError(
-                        f"{path.name}: {names[i]} is {found} at row {row}, wanted a number{hint}; "
-                        "remove the row or correct the recording"
-                    )
-    return DataError(f"{path.name} holds a cell that is not a plain decimal number")
 
 
 def _is_number(text: str) -> bool:

@@ -45,11 +45,19 @@ class Log:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        where = _where(self.path)
+        where = self.name
         _settle(self, where, {"q": self.q, "dq": self.v, "ddq": self.a, "tau": self.tau})
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
         require_increasing(self.t, where)
+
+    @property
+    def name(self) -> str:
+        """Name of its file, "log" if it has none."""
+        return Path(self.path).name or "log"
+
+    def __repr__(self) -> str:
+        return f"<Log {Path(self.path).name or 'in memory'}: {_extent(self.t, self.joints)}>"
 
     def window(self, start: float | None = None, end: float | None = None) -> "Log":
         """Return the rows from start to end, both included.
@@ -69,7 +77,7 @@ class Log:
         rows = np.flatnonzero((self.t >= first) & (self.t <= last))
         if len(rows) < 2:
             raise DataError(
-                f"{_where(self.path)}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
+                f"{self.name}: {len(rows)} rows lie between {first:g} s and {last:g} s; "
                 f"the log spans {self.t[0]:g} s to {self.t[-1]:g} s. Choose start and end inside it"
             )
         kept = slice(rows[0], rows[-1] + 1)
@@ -93,7 +101,7 @@ class Log:
         for name in joints:
             if name not in self.joints:
                 raise DataError(
-                    f"joint {name!r} is not in {_where(self.path)}; joints: {listed(self.joints)}"
+                    f"joint {name!r} is not in {self.name}; joints: {listed(self.joints)}"
                     f"{suggestion(name, self.joints)}"
                 )
         kept = [self.joints.index(name) for name in joints]
@@ -156,6 +164,10 @@ class Trajectory:
             object.__setattr__(self, "direction", direction)
         if self.rate is not None and not 0 < self.rate < np.inf:
             raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
+
+    def __repr__(self) -> str:
+        stretches = len(np.unique(self.segment))
+        return f"<Trajectory: {_extent(self.t, self.joints, self.rate)}, in {stretches} stretches>"
 
     @property
     def squares(self) -> Array:
@@ -302,6 +314,10 @@ def _stamp(t: float) -> str:
     return f"{t:.3f}" if round(t, 3) == t else f"{t:.13g}"
 
 
-def _where(path: str) -> str:
-    """Return what a log is called in errors."""
-    return Path(path).name or "log"
+def _extent(t: Array, joints: Sequence[str], rate: float | None = None) -> str:
+    """Return in words which joints are recorded, how long and how often."""
+    often = 1.0 / float(np.median(np.diff(t))) if rate is None and len(t) > 1 else rate or np.nan
+    return (
+        f"{len(t)} samples of {len(joints)} joints ({', '.join(joints)}) over "
+        f"{t[-1] - t[0] if len(t) else 0.0:.6g} s at {often:.4g} Hz"
+    )

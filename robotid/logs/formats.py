@@ -11,7 +11,8 @@ from robotid.logs.arrays import open_hdf5, open_mat, open_npz, write_hdf5, write
 from robotid.logs.bags import open_bag
 from robotid.logs.csv_files import open_csv, write_csv
 from robotid.logs.parquet_files import open_parquet, write_parquet
-from robotid.logs.table import LogSource, Table
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Table
 
 __all__ = ["open_table", "write_columns"]
 

@@ -16,8 +16,9 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log, repeated, require_finite, require_increasing, suggestion
 from robotid.logs.formats import open_table, write_columns
-from robotid.logs.table import LogSource, Table, prefixes
-from robotid.logs.units import PER_SECOND, LogUnits, check_units
+from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
+from robotid.logs.table import Table, prefixes
+from robotid.logs.units import check_units
 
 __all__ = ["LogLayout", "lay_out", "read_log", "write_log"]
 

@@ -1,66 +1,130 @@
-"""How a log becomes a trajectory: the settings, checked."""
+"""How logs are read and become trajectories: the settings, checked."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
+from robotid._settings import NOT_NEGATIVE, POSITIVE, Range, Settings, setting
 from robotid.exceptions import SettingsError
 
-__all__ = ["SignalSettings"]
+__all__ = ["PER_SECOND", "LogSource", "LogUnits", "SignalSettings"]
+
+#: Divisors that turn a time unit into seconds.
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_MEASURED = ("auto", "measured", "differentiated")
+_DELAY = Range("seconds between -1 and 1", lambda x: abs(x) <= 1)
+
+
+def _load_cutoff(value: float | bool) -> float | None:
+    if value is True:
+        raise SettingsError("cutoff is true, wanted a frequency [Hz], or false for no filter")
+    return None if value is False else value
 
 
 @dataclass(frozen=True)
-class SignalSettings:
-    """How a log becomes a trajectory.
+class SignalSettings(Settings):
+    """How a log becomes a trajectory."""
 
-    Attributes:
-        rate: Rate of the uniform grid [Hz]; None takes the log's median rate (and, without a
-            filter, the rows as they are).
-        cutoff: Cut-off of the zero-phase Butterworth filter [Hz]; None for no filter.
-        order: Order of the filter, which runs once forward and once backward.
-        velocity: "measured", "differentiated" (from the position), or "auto": measured if the log
-            has it and it lags the position by less than 20 ms.
-        acceleration: "measured", "differentiated" (from the velocity used), or "auto": measured if
-            the log has it and its velocity is used.
-        trim: Time cut at each end of each uninterrupted stretch [s].
-        min_velocity: Joint speed below which its rows are left out while Coulomb friction is
-            identified [rad/s or m/s], and within which a drive may stick; 0 keeps all rows.
-        friction_band: Speed from which Coulomb friction has its full size [rad/s or m/s]: it
-            changes linearly between that speed and its negative; 0: at once, as Coulomb has it.
-        max_gap: A longer step between two rows is a gap [s]; None: 2.5 median steps, or a quarter
-            of the filter's period if that is longer.
-        torque_delay: How late the log has the torque against the position [s]; it is moved back.
-        velocity_delay: The same of the measured velocity [s].
-    """
+    rate: float | None = setting(
+        None,
+        "rate of the uniform grid [Hz]; if not stated, the log's median rate (and, without a "
+        "filter, the rows as they are)",
+        within=POSITIVE,
+    )
+    cutoff: float | None = setting(
+        8.0,
+        "cut-off of the zero-phase Butterworth filter [Hz]; false (None in Python) for no filter",
+        within=POSITIVE,
+        reads=(int, float, bool),
+        load=_load_cutoff,
+        dump=lambda value: False if value is None else value,
+    )
+    order: int = setting(
+        4,
+        "order of the filter, which runs once forward and once backward",
+        within=Range("1 to 10", lambda x: 1 <= x <= 10),
+    )
+    velocity: str = setting(
+        "auto",
+        "measured, differentiated (from the position), or auto: measured if the log has it and it "
+        "lags the position by less than 20 ms",
+        among=_MEASURED,
+    )
+    acceleration: str = setting(
+        "auto",
+        "measured, differentiated (from the velocity used), or auto: measured if the log has it "
+        "and its velocity is used",
+        among=_MEASURED,
+    )
+    trim: float = setting(
+        0.2, "time cut at each end of each uninterrupted stretch [s]", within=NOT_NEGATIVE
+    )
+    min_velocity: float = setting(
+        0.02,
+        "joint speed below which its rows are left out while Coulomb friction is identified "
+        "[rad/s or m/s], and within which a drive may stick; 0 keeps all rows",
+        within=NOT_NEGATIVE,
+    )
+    friction_band: float = setting(
+        0.0,
+        "speed from which Coulomb friction has its full size [rad/s or m/s]: it changes linearly "
+        "between that speed and its negative; 0: at once, as Coulomb has it",
+        within=NOT_NEGATIVE,
+    )
+    max_gap: float | None = setting(
+        None,
+        "a longer step between two rows is a gap [s]; if not stated, 2.5 median steps, or a "
+        "quarter of the filter's period if that is longer",
+        within=POSITIVE,
+    )
+    torque_delay: float = setting(
+        0.0,
+        "how late the log has the torque against the position [s]; it is moved back",
+        within=_DELAY,
+    )
+    velocity_delay: float = setting(0.0, "the same of the measured velocity [s]", within=_DELAY)
 
-    rate: float | None = None
-    cutoff: float | None = 8.0
-    order: int = 4
-    velocity: str = "auto"
-    acceleration: str = "auto"
-    trim: float = 0.2
-    min_velocity: float = 0.02
-    friction_band: float = 0.0
-    max_gap: float | None = None
-    torque_delay: float = 0.0
-    velocity_delay: float = 0.0
+
+@dataclass(frozen=True)
+class LogUnits(Settings):
+    """Units of a log file; None means SI, and is refused if the numbers look otherwise."""
+
+    _table: ClassVar[str] = "units"
+
+    time: str | None = setting(
+        None, "unit of the time stamps; velocities stay per second", among=tuple(PER_SECOND)
+    )
+    angle: str | None = setting(
+        None, "unit of q, dq and ddq of joints that turn", among=("rad", "deg")
+    )
+
+
+@dataclass(frozen=True)
+class LogSource(Settings):
+    """Where in a log file the signals are; the defaults fit files that leave no choice."""
+
+    _table: ClassVar[str] = "log"
+
+    topic: str | None = setting(
+        None,
+        "the topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; not needed if "
+        "there is only one",
+    )
+    joints: Mapping[str, str] = setting({}, "name in the file by joint, where they differ")
+    effort: str = setting(
+        "torque",
+        "what effort is: a torque [N m or N], or a current [A], which takes a gain",
+        among=("torque", "current"),
+    )
+    stamp: str = setting(
+        "header",
+        "the clock of a bag's rows: header, the stamp in the message, or log, the time when it "
+        "was recorded",
+        among=("header", "log"),
+    )
 
     def __post_init__(self) -> None:
-        for name in ("velocity", "acceleration"):
-            value = getattr(self, name)
-            if value not in ("auto", "measured", "differentiated"):
-                raise SettingsError(
-                    f"{name} is {value!r}, wanted 'auto', 'measured' or 'differentiated'"
-                )
-        for name in ("rate", "cutoff", "max_gap"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise SettingsError(f"{name} is {value}, wanted a positive number")
-        for name in ("trim", "min_velocity", "friction_band"):
-            value = getattr(self, name)
-            if not value >= 0:
-                raise SettingsError(f"{name} is {value}, wanted 0 or a positive number")
-        for name in ("torque_delay", "velocity_delay"):
-            value = getattr(self, name)
-            if not abs(value) <= 1:
-                raise SettingsError(f"{name} is {value}, wanted seconds between -1 and 1")
-        if not 1 <= self.order <= 10:
-            raise SettingsError(f"order is {self.order}, wanted 1 to 10")
+        super().__post_init__()
+        for joint, name in self.joints.items():
+            if not isinstance(name, str):
+                raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")

@@ -18,7 +18,6 @@ from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import Stretch, process_stretches, too_short
 
 __all__ = [
-    "SignalSettings",
     "decide",
     "process",
     "resolve",

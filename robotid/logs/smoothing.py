@@ -14,7 +14,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
 
-__all__ = ["SPLINE", "Stretch", "filter_reach", "process_stretches", "too_short"]
+__all__ = ["SPLINE", "Stretch", "filter_reach", "low_pass", "process_stretches", "too_short"]
 
 #: Rows after which nothing is left of an end of a cubic spline: it fades by half or more per row.
 SPLINE = 64
@@ -117,6 +117,27 @@ def filter_reach(settings: SignalSettings) -> float:
     return late + 2.0 * _FORGOTTEN * float(max(digital, analog)) + _LONGEST / cutoff
 
 
+def low_pass(values: Array, rate: float, settings: SignalSettings) -> Array:
+    """Return values after the zero-phase Butterworth filter.
+
+    Args:
+        values: Values over time, shape (N, ...).
+        rate: Rows per second.
+        settings: The settings.
+
+    Returns:
+        The filtered values, or the same without a cut-off; same shape.
+    """
+    if settings.cutoff is None or len(values) < 2:
+        return values
+    from scipy.signal import butter, sosfiltfilt
+
+    sos = butter(settings.order, settings.cutoff, fs=rate, output="sos")
+    pad = min(len(values) - 1, int(2 * rate / settings.cutoff))  # two periods
+    filtered: Array = sosfiltfilt(sos, values.T, axis=-1, padlen=pad).T
+    return filtered
+
+
 def too_short(where: str, stretches: int, settings: SignalSettings) -> DataError:
     """Return the error of a log without a stretch that is long enough.
 
@@ -162,13 +183,13 @@ def _process_part(
         channels["a"] = log.a
     late = {"tau": settings.torque_delay, "v": settings.velocity_delay}
     smooth = {
-        name: _filter(_resample(t - late.get(name, 0.0), x[rows], times), grid, settings)
+        name: low_pass(_resample(t - late.get(name, 0.0), x[rows], times), grid.rate, settings)
         for name, x in channels.items()
     }
     v = smooth["v"] if "v" in smooth else np.gradient(smooth["q"], times, axis=0)
     a = smooth["a"] if "a" in smooth else np.gradient(v, times, axis=0)
     # through the torque's filter before any row is left out
-    direction = _filter(_acting(times, v @ speeds.T, settings), grid, settings)
+    direction = low_pass(_acting(times, v @ speeds.T, settings), grid.rate, settings)
     inside = (times >= grid.start + settings.trim) & (times <= grid.last - settings.trim)
     if grid.keep_every > 1:
         inside &= (numbers - grid.number_of(grid.start + settings.trim)) % grid.keep_every == 0
@@ -249,15 +270,3 @@ def _resample(t: Array, values: Array, grid: Array) -> Array:
     # of a channel moved in time nothing is known beyond its own ends
     resampled: Array = CubicSpline(t, values, axis=0)(np.clip(grid, t[0], t[-1]))
     return resampled
-
-
-def _filter(values: Array, grid: _Grid, settings: SignalSettings) -> Array:
-    """Return the values after a zero-phase Butterworth filter."""
-    if settings.cutoff is None:
-        return values
-    from scipy.signal import butter, sosfiltfilt
-
-    sos = butter(settings.order, settings.cutoff, fs=grid.rate, output="sos")
-    pad = min(len(values) - 1, int(2 * grid.rate / settings.cutoff))  # two periods
-    filtered: Array = sosfiltfilt(sos, values.T, axis=1, padlen=pad).T
-    return filtered

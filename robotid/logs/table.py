@@ -1,14 +1,14 @@
-"""Where in a log file the signals are, and what each file format gives: named columns."""
+"""What each file format gives: named columns, read whole or row by row."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError
 from robotid.findings import listed
 
-__all__ = ["LogSource", "Place", "RowReader", "Table", "choose", "prefixes"]
+__all__ = ["Place", "RowReader", "Table", "choose", "prefixes"]
 
 _PREFIXES = {
     "q": ("q_", "position_"),
@@ -17,34 +17,6 @@ _PREFIXES = {
     "tau": ("tau_", "effort_", "torque_"),
     "current": ("current_", "i_"),
 }
-
-
-@dataclass(frozen=True)
-class LogSource:
-    """Where in a log file the signals are; the defaults fit files that leave no choice.
-
-    Attributes:
-        topic: The topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; None if
-            there is only one.
-        joints: Name in the file by joint, where they differ.
-        effort: What effort is: "torque" [N m or N], or "current" [A], which takes a gain.
-        stamp: The clock of a bag's rows: "header", the stamp in the message, or "log", the time
-            when it was recorded.
-    """
-
-    topic: str | None = None
-    joints: Mapping[str, str] = field(default_factory=dict)
-    effort: str = "torque"
-    stamp: str = "header"
-
-    def __post_init__(self) -> None:
-        for name, known in (("effort", ["torque", "current"]), ("stamp", ["header", "log"])):
-            value = getattr(self, name)
-            if value not in known:
-                raise SettingsError(f"log: {name} is {value!r}, wanted one of {listed(known)}")
-        for joint, name in self.joints.items():
-            if not isinstance(name, str):
-                raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
 
 
 @dataclass(frozen=True)

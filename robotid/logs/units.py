@@ -1,21 +1,18 @@
 """Units of a log: stated, or suspected and refused; never guessed."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, SettingsError
-from robotid.findings import listed
+from robotid.exceptions import DataError
 from robotid.logs.data import Log
+from robotid.logs.settings import PER_SECOND, LogUnits
 
-__all__ = ["PER_SECOND", "LogUnits", "check_reach", "check_units"]
+__all__ = ["check_reach", "check_units"]
 
-#: Divisors that turn a time unit into seconds.
-PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _DEGREES = 180 / np.pi  # degrees in a radian
 _SLOWEST = 0.1  # [s] a longer median step is taken for another unit
@@ -24,25 +21,6 @@ _STRETCH = 0.1  # [s] motion is compared over stretches this long: noise and jit
 _GAP = 5  # a step longer than this many median steps is a gap
 _ALIKE = 0.9  # correlation from which two signals are one but for a factor
 _NEAR = 0.1  # relative tolerance on that factor
-
-
-@dataclass(frozen=True)
-class LogUnits:
-    """Units of a log file; None means SI, and is refused if the numbers look otherwise.
-
-    Attributes:
-        time: Unit of the time stamps: "s", "ms", "us" or "ns". Velocities stay per second.
-        angle: Unit of q, dq and ddq of joints that turn: "rad" or "deg".
-    """
-
-    time: str | None = None
-    angle: str | None = None
-
-    def __post_init__(self) -> None:
-        for name, known in (("time", list(PER_SECOND)), ("angle", ["rad", "deg"])):
-            value = getattr(self, name)
-            if value is not None and value not in known:
-                raise SettingsError(f"units: {name} is {value!r}, wanted one of {listed(known)}")
 
 
 def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> None:
@@ -59,7 +37,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     Raises:
         DataError: If time, angle or the sign of the velocity is suspect.
     """
-    where = Path(log.path).name or "log"
+    where = log.name
     turns = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
     if units.time is None:

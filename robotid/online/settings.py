@@ -2,49 +2,52 @@
 
 from dataclasses import dataclass
 
+from robotid._settings import NOT_NEGATIVE, POSITIVE, Settings, setting
 from robotid._typing import Array
-from robotid.exceptions import SettingsError
 
 __all__ = ["Change", "OnlineSettings", "Reading"]
 
 
 @dataclass(frozen=True)
-class OnlineSettings:
-    """How an online identification runs.
+class OnlineSettings(Settings):
+    """How an online identification runs."""
 
-    Attributes:
-        rate: Rate of the samples, about [Hz].
-        cutoff: Cut-off of the causal filter [Hz].
-        order: Order of the filter, even.
-        min_velocity: Speed below which a joint's row is left out while Coulomb friction is
-            identified [rad/s or m/s].
-        warmup: Time of motion that scales the drive terms before the first estimate [s].
-        walk: Random walk of the parameters, as a share of their prior spread per square root of a
-            second [s^-1/2].
-        noise_memory: Time over which the noise level of each joint is averaged [s].
-        threshold: Evidence at which a change is flagged; see ``ChangeDetector``.
-        drift: Squared innovation, in variances, that is no evidence of a change [-].
-        model_error: Share of each joint's torque that the model may miss without a change [-].
-    """
-
-    rate: float = 200.0
-    cutoff: float = 8.0
-    order: int = 4
-    min_velocity: float = 0.02
-    warmup: float = 1.0
-    walk: float = 1e-4
-    noise_memory: float = 5.0
-    threshold: float = 40.0
-    drift: float = 4.0
-    model_error: float = 0.05
-
-    def __post_init__(self) -> None:
-        for key in ("rate", "cutoff", "warmup", "noise_memory", "threshold", "drift"):
-            if not getattr(self, key) > 0:
-                raise SettingsError(f"{key} is {getattr(self, key)}, wanted a positive number")
-        for key in ("min_velocity", "walk", "model_error"):
-            if not getattr(self, key) >= 0:
-                raise SettingsError(f"{key} is {getattr(self, key)}, wanted 0 or more")
+    rate: float = setting(200.0, "rate of the samples, about [Hz]", within=POSITIVE)
+    cutoff: float = setting(8.0, "cut-off of the causal filter [Hz]", within=POSITIVE)
+    order: int = setting(4, "order of the filter, even")
+    min_velocity: float = setting(
+        0.02,
+        "speed below which a joint's row is left out while Coulomb friction is identified "
+        "[rad/s or m/s]",
+        within=NOT_NEGATIVE,
+    )
+    warmup: float = setting(
+        1.0,
+        "time of motion that scales the drive terms before the first estimate [s]",
+        within=POSITIVE,
+    )
+    walk: float = setting(
+        1e-4,
+        "random walk of the parameters, as a share of their prior spread per square root of a "
+        "second [s^-1/2]",
+        within=NOT_NEGATIVE,
+    )
+    noise_memory: float = setting(
+        5.0, "time over which the noise level of each joint is averaged [s]", within=POSITIVE
+    )
+    threshold: float = setting(
+        40.0, "evidence at which a change is flagged; see ``ChangeDetector``", within=POSITIVE
+    )
+    drift: float = setting(
+        4.0,
+        "squared innovation, in variances, that is no evidence of a change [-]",
+        within=POSITIVE,
+    )
+    model_error: float = setting(
+        0.05,
+        "share of each joint's torque that the model may miss without a change [-]",
+        within=NOT_NEGATIVE,
+    )
 
 
 @dataclass(frozen=True, eq=False)

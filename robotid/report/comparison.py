@@ -9,7 +9,7 @@ from typing import Any
 from robotid._files import write_text
 from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
-from robotid.export.result import read_result
+from robotid.export.result import load_result
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -36,7 +36,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
     """
     if len(paths) < 2:
         raise DataError(f"compare takes at least two results, found {len(paths)}")
-    results = [read_result(path) for path in paths]
+    results = [load_result(path).content for path in paths]
     for path, result in zip(paths[1:], results[1:], strict=True):
         _require_same_mapping(str(paths[0]), results[0], str(path), result)
     common, remarks = _common_recordings(results)

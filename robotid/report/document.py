@@ -11,7 +11,7 @@ from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.report.diagnosis import (
     drive_figures,
     information_section,
@@ -37,18 +37,6 @@ _POINTS = 120_000  # points of all lines together: about 2 MB
 _LONGEST = 2000  # points of one line
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 _SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
-_ESTIMATORS = {
-    "ols": "ordinary least squares (ols)",
-    "wls": "weighted least squares, rows weighted by the noise of their joint (wls)",
-    "tls": "total least squares, which allows for noise of the regressor, too (tls)",
-    "rls": "recursive least squares, sample by sample (rls)",
-    "kalman": "a Kalman filter over the samples (kalman)",
-    "prx": "steps along the gradient PRX, sample by sample (prx)",
-    "gradient": "normalised gradient steps, sample by sample (gradient)",
-    "consistent": "weighted least squares that keeps every body physically possible and leaves "
-    "the URDF's value where the data say nothing (consistent)",
-    "log_cholesky": "the consistent fit without a cone, in log-Cholesky parameters (log_cholesky)",
-}
 
 
 def write_report(
@@ -100,7 +88,7 @@ def _summary(found: Identification) -> str:
     said = (
         f"{len(found.base)} base parameters of {len(found.model.joints)} joints were fitted to "
         f"{_names(fitted)} ({samples} samples after filtering, {rows} torque rows used) by "
-        f"{_ESTIMATORS[found.estimator.name]}. "
+        f"{found.estimator.words} ({found.estimator.name}). "
         + (f"Kept apart for validation: {_names(kept)}. " if kept else "No log was kept apart. ")
         + f"Signals: {'; or '.join(chains)}."
     )

@@ -10,7 +10,6 @@ from robotid._files import file_sha256
 from robotid._html import Cell, code, number, percent, table, text
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import Identification
-from robotid.identification.settings import KEYS
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 
@@ -223,9 +222,9 @@ def settings_tables(found: Identification) -> str:
     """
     model = found.model
     gravity = ", ".join(f"{g:g}" for g in np.asarray(model.pin_model.gravity.linear).tolist())
-    pairs = {"estimator": found.estimator.name}
-    for key in KEYS[found.estimator.name]:
-        pairs[key.replace("_", " ")] = str(getattr(found.estimator, key))
+    settings = found.estimator.to_dict()
+    pairs = {"estimator": settings.pop("name")}
+    pairs |= {key.replace("_", " "): str(value) for key, value in settings.items()}
     pairs["solver"] = f"{found.estimate.message} ({found.estimate.n_iter} iterations)"
     pairs["drive terms"] = ", ".join(model.layout.terms) or "none"
     pairs["gravity [m/s²]"] = gravity

@@ -50,6 +50,12 @@ class RobotModel:
     locked: Mapping[str, float]
     mimic: str
 
+    def __repr__(self) -> str:
+        return (
+            f"<RobotModel {self.name}: {len(self.joints)} joints, {', '.join(self.joints)}; "
+            f"{len(self.layout.names)} standard parameters>"
+        )
+
     @classmethod
     def from_urdf(
         cls,

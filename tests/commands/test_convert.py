@@ -14,7 +14,7 @@ from robotid.commands.job import job_from_settings
 from robotid.exceptions import DataError
 from robotid.logs.data import Log
 from robotid.logs.read import read_log
-from robotid.logs.table import LogSource
+from robotid.logs.settings import LogSource
 from robotid.robot.examples import example_urdf
 
 JOINTS = ("shoulder", "elbow")

@@ -2,9 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from robotid.commands.job import job_from_settings, read_job
+from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
-from robotid.logs.table import LogSource
+from robotid.logs.settings import LogSource
+from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 
 FULL = """
@@ -87,11 +89,11 @@ def test_every_key_of_a_job_arrives(tmp_path):
 
 def test_settings_written_into_a_result_are_the_same_job(tmp_path):
     job = read_job(write(tmp_path, FULL))
-    again = job_from_settings(job.to_settings(), "result.json", Path())
+    again = job_from_settings(job.to_dict(), "result.json", Path())
     assert again == job
     off = read_job(write(tmp_path, FULL.replace("cutoff = 8.0", "cutoff = false")))
     assert off.signals.cutoff is None
-    assert job_from_settings(off.to_settings(), "result.json", Path()) == off
+    assert job_from_settings(off.to_dict(), "result.json", Path()) == off
 
 
 def test_paths_may_name_environment_variables(tmp_path, monkeypatch):
@@ -139,3 +141,9 @@ def test_a_wrong_job_names_what_is_wrong(tmp_path, old, new, message):
 def test_a_missing_job_file_is_named(tmp_path):
     with pytest.raises(SettingsError, match=r"there is no job file '.*none.toml'"):
         read_job(tmp_path / "none.toml")
+
+
+def test_gravity_and_drive_terms_default_to_those_of_the_model():
+    job = Job(urdf=Path("robot.urdf"))
+    assert job.gravity == GRAVITY
+    assert job.terms == DRIVE_TERMS

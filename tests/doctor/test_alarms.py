@@ -6,7 +6,7 @@ from helpers.corruptions import NOISE, clean_log, late, robot, table_of
 
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import another_robot, simulate

@@ -11,6 +11,7 @@ from robotid.doctor.channels import (
     check_clipping,
     check_noise,
     check_spikes,
+    check_velocity_delay,
     check_velocity_scale,
 )
 from robotid.logs.data import Log
@@ -95,3 +96,13 @@ def test_the_noise_of_a_channel_is_its_standard_deviation():
     assert levels["run.csv: tau"]["a"] == pytest.approx(0.05, rel=0.05)
     assert levels["run.csv: tau"]["b"] == pytest.approx(0.05, rel=0.05)
     assert levels["run.csv: q"]["a"] < 1e-6
+
+
+@pytest.mark.parametrize("stated", [0.0, 0.01, -0.02])
+def test_the_delay_of_a_velocity_is_told_beyond_what_is_stated(stated):
+    log = log_of_two()
+    late = np.column_stack([np.interp(log.t - 0.03, log.t, v) for v in log.v.T])
+    (found,) = check_velocity_delay(replace(log, v=late), stated)
+    assert found.evidence["delay"] == pytest.approx(0.03 - stated, abs=1e-3)
+    assert "state [signals] velocity_delay = 0.0300" in found.message
+    assert list(check_velocity_delay(log)) == []

@@ -12,12 +12,12 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands.doctor import examine
 from robotid.commands.job import Job, LogEntry, read_job
-from robotid.doctor.diagnosis import alarming, diagnose, findings_to_dict
+from robotid.doctor.diagnosis import alarming, check_logs, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import another_robot, simulate
@@ -239,6 +239,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
     assert result["verdict"]["status"] == "poor"
     assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
     assert "torque_sign" in [warning["code"] for warning in result["warnings"]]
+    words = ["identify", URDF, wrong_sign, *words[2:], "--estimator", "wls"]
     assert main([*words, "--ignore", "torque_sign"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert not any("opposite sign" in reason for reason in result["verdict"]["reasons"])
@@ -289,3 +290,11 @@ def test_a_clean_log_of_a_small_arm_at_30_hertz_raises_no_alarm(name):
     log = simulate(model, pi, motion, rate=30.0, duration=20.0, rng=rng, noise=NOISE)
     found = diagnose(model, [log], [], SignalSettings())
     assert [f.code for f in found if f.severity != "note"] == []
+
+
+def test_check_logs_asks_the_doctor_with_the_default_signals(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng)
+    log = replace(log, tau=log.tau[:, [1, 0, 2, 3, 4, 5]])
+    found = check_logs(ur5, [log], validation=[log])
+    assert found == diagnose(ur5, [log], [log], SignalSettings())
+    assert "torque_order" in {finding.code for finding in found}

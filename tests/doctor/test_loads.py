@@ -10,7 +10,7 @@ from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.hypotheses import explanations
 from robotid.doctor.loads import load_model
 from robotid.doctor.sample import smooth_motion, take_probe
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 

@@ -11,7 +11,7 @@ from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log
-from robotid.logs.units import LogUnits
+from robotid.logs.settings import LogUnits
 from robotid.robot.examples import example_urdf
 
 HELD = "wrist_3_joint"

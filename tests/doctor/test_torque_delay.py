@@ -9,7 +9,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.doctor import torque_delay
 from robotid.doctor.sample import smooth_motion
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel
 
 SIGNALS = SignalSettings()

@@ -12,7 +12,8 @@ from robotid.exceptions import RankDeficientError
 from robotid.export.result import build_result
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings, process, resolve
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process, resolve
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.tables import open_section

@@ -18,7 +18,8 @@ from robotid.estimators import (
 )
 from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.problem import Problem
 from robotid.regressor.torque import build_problem, joint_torque_regressor, mass_regressor

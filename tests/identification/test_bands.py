@@ -6,7 +6,7 @@ from robotid.export.result import build_result
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 
 NOISE = np.array([2.0, 2.0, 1.0, 0.3, 0.3, 0.1])

@@ -6,7 +6,7 @@ from robotid.identification.evaluation import evaluate_logs, pool, predict, shar
 from robotid.identification.rows import row_mask
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -18,7 +18,7 @@ from robotid.identification.evaluation import evaluate_logs
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 
 HELD = 1024  # rows in memory, so that pieces have 256
 

@@ -9,7 +9,7 @@ from robotid.exceptions import DataError, NotConvergedError, RankDeficientError,
 from robotid.identification import pipeline
 from robotid.identification.pipeline import EstimatorSettings, identify
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.mass_matrix import MassMatrixCheck
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

@@ -3,7 +3,8 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.prior import prior_spread, spread_of
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.parameters import pseudo_inertia
 

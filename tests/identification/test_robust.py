@@ -13,7 +13,7 @@ from robotid.identification.rows import base_problem
 from robotid.identification.settings import EstimatorSettings
 from robotid.identification.survey import survey_log
 from robotid.logs.read import lay_out, write_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 
 NOISE = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])

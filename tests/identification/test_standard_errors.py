@@ -15,7 +15,7 @@ from robotid.identification.standard_errors import (
     scatter,
     with_wls_errors,
 )
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress, merge
 from robotid.regressor.problem import Problem
 from robotid.robot.examples import example_urdf

@@ -17,8 +17,7 @@ from robotid.identification.survey import ReducedPiece, hold_log, survey_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import lay_out, read_log, write_log
-from robotid.logs.signals import SignalSettings
-from robotid.logs.units import LogUnits
+from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.reduction import join
 from robotid.regressor.torque import joint_torque_regressor

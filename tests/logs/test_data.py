@@ -8,7 +8,8 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log, Trajectory
-from robotid.logs.units import LogUnits, check_units
+from robotid.logs.settings import LogUnits
+from robotid.logs.units import check_units
 
 JOINTS = ("shoulder", "elbow")
 
@@ -354,3 +355,15 @@ def test_full_turns_and_gaps_do_not_hide_degrees():
     with pytest.raises(DataError, match=r"dq_shoulder is 57\.3 times"):
         check_units(gappy, LogUnits())
     check_units(replace(gappy, v=log.v[rows]), LogUnits())
+
+
+def test_a_log_and_a_trajectory_are_one_line():
+    t = np.arange(201) * 0.01
+    x = np.zeros((201, 2))
+    log = Log(t=t, q=x, tau=x, joints=("a", "b"), path="folder/run.csv")
+    assert repr(log) == "<Log run.csv: 201 samples of 2 joints (a, b) over 2 s at 100 Hz>"
+    segment = np.repeat([0, 1], [100, 101])
+    motion = Trajectory(t=t, q=x, v=x, a=x, tau=x, joints=("a", "b"), rate=50.0, segment=segment)
+    assert repr(motion) == (
+        "<Trajectory: 201 samples of 2 joints (a, b) over 2 s at 50 Hz, in 2 stretches>"
+    )

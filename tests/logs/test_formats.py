@@ -25,7 +25,7 @@ from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import read_log, write_log
-from robotid.logs.table import LogSource
+from robotid.logs.settings import LogSource
 
 JOINTS = ("shoulder", "elbow")
 STATE = "sensor_msgs/msg/JointState"

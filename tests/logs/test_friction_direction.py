@@ -15,7 +15,8 @@ from robotid.identification.settings import EstimatorSettings
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_directions, friction_speeds
 from robotid.regressor.torque import build_problem, joint_torque_regressor

@@ -16,7 +16,7 @@ import pytest
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
-from robotid.logs.units import LogUnits
+from robotid.logs.settings import LogUnits
 
 JOINTS = ("shoulder", "elbow")
 FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[3] / "shared" / "data")

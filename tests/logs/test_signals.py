@@ -3,7 +3,8 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings, process, resolve, unwrap, velocity_lag
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process, resolve, unwrap, velocity_lag
 
 
 def sine_log(t, frequency=0.5, lag=0.0, **options):
@@ -166,7 +167,7 @@ def test_full_turns_are_taken_out_of_free_joints_only():
 
 
 BAD = {
-    "velocity": (dict(velocity="filtered"), "velocity is 'filtered', wanted 'auto'"),
+    "velocity": (dict(velocity="filtered"), "velocity is 'filtered', wanted one of auto"),
     "cutoff": (dict(cutoff=-1.0), "cutoff is -1.0, wanted a positive number"),
     "rate": (dict(rate=0.0), "rate is 0.0, wanted a positive number"),
     "trim": (dict(trim=-0.1), "trim is -0.1, wanted 0 or a positive number"),

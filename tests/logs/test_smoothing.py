@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings, process, resolve
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process, resolve
 from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches
 
 RATE = 200.0  # [Hz]

@@ -7,7 +7,8 @@ from robotid.exceptions import DataError
 from robotid.logs.data import Log
 from robotid.logs.formats import write_columns
 from robotid.logs.read import read_log
-from robotid.logs.units import LogUnits, check_units
+from robotid.logs.settings import LogUnits
+from robotid.logs.units import check_units
 
 T = np.arange(400) * 0.01
 Q = np.column_stack([0.8 * np.sin(2 * T), 0.3 * np.cos(3 * T)])

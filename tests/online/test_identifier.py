@@ -33,6 +33,14 @@ def test_a_load_picked_up_at_ten_seconds_is_flagged_and_weighed(picked_up):
         identifier.payload(1)
 
 
+def test_a_change_starts_from_what_was_known_before_it(panda, picked_up):
+    log, identifier = picked_up
+    (change,) = identifier.changes
+    before = run(OnlineIdentifier(panda), log, 0, int(np.searchsorted(log.t, change.onset))).reading
+    # a state of every tenth of a second is kept; what the load bends is six standard errors
+    assert np.abs((change.theta - before.theta) / before.std_error).max() < 1.0
+
+
 def test_the_new_parameters_are_followed(panda, picked_up):
     _, identifier = picked_up
     pi = truth(panda)
@@ -124,5 +132,5 @@ def test_before_the_robot_has_moved_there_is_no_estimate(ur5):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(SettingsError, match="threshold is 0"):
         OnlineSettings(threshold=0)
-    with pytest.raises(SettingsError, match="walk is -1, wanted 0 or more"):
+    with pytest.raises(SettingsError, match="walk is -1, wanted 0 or a positive number"):
         OnlineSettings(walk=-1)

@@ -6,7 +6,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import DataError
 from robotid.identification.survey import hold_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.reduction import Reduction, join, join_stretches
 from robotid.regressor.torque import build_problem

@@ -12,7 +12,7 @@ from robotid.findings import Finding
 from robotid.identification.information import information
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.document import write_report
 from robotid.report.plots import stretches, thin

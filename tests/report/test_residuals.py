@@ -6,7 +6,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import evaluate_logs
 from robotid.identification.survey import hold_log
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
 
 

@@ -13,7 +13,8 @@ from robotid.export.urdf import write_urdf
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
-from robotid.logs.signals import SignalSettings, process
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
 from robotid.regressor import prediction
 from robotid.regressor.prediction import predict
 from robotid.regressor.rows import COMPILED, TrajectoryRows
@@ -84,7 +85,7 @@ def test_a_new_term_is_cubed_speed_in_every_joint_that_its_drive_turns_with(monk
     settings = {"urdf": str(path), "model": {"friction": "viscous+coulomb+cubic"}}
     job = job_from_settings(settings, "job.toml", path.parent)
     assert set(job.terms) == {*DRIVE_TERMS, "cubic"}
-    assert job.to_settings()["model"]["friction"] == "viscous+coulomb+cubic"
+    assert job.to_dict()["model"]["friction"] == "viscous+coulomb+cubic"
 
 
 def test_compiled_instant_and_plain_rows_are_one(model, rng):

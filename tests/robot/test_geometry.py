@@ -5,7 +5,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.robot.geometry import (
     body_points,
     box_half_spaces,

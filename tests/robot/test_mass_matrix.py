@@ -8,7 +8,7 @@ from robotid.export.result import build_result
 from robotid.identification.findings import consistency_findings
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import check_mass_matrix, joint_mass_matrices

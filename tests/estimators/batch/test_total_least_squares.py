@@ -6,7 +6,7 @@ from robotid.estimators import TLS, WLS
 from robotid.estimators.batch.total_least_squares import mixed_tls
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.pipeline import EstimatorSettings, identify
-from robotid.logs.signals import SignalSettings
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress
 from robotid.regressor.problem import Problem
 

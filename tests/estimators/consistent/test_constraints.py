@@ -9,9 +9,9 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
-from robotid.identification.constraint_settings import ConstraintSettings
+from robotid.identification.fitting import make_constraints
 from robotid.identification.pipeline import identify
-from robotid.identification.settings import EstimatorSettings
+from robotid.identification.settings import ConstraintSettings, EstimatorSettings
 from robotid.regressor.factors import compress
 
 
@@ -99,7 +99,7 @@ def test_a_centre_of_mass_stays_in_its_box(case):
     free = centre(fit.fit(factors), 2)
     corners = [free - 0.2, free - [0.02, -0.1, -0.1]]  # x at least 2 cm less
     settings = ConstraintSettings(com={"forearm_link": [list(c) for c in corners]})
-    estimate = replace(fit, constraints=settings.to_constraints({})).fit(factors)
+    estimate = replace(fit, constraints=make_constraints(settings, {})).fit(factors)
     found = centre(estimate, 2)
     assert (corners[0] - 1e-6 <= found).all()
     assert (found <= corners[1] + 1e-6).all()

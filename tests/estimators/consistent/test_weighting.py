@@ -141,7 +141,9 @@ def test_one_stretch_is_too_few(case):
 
 
 def test_an_unknown_way_is_refused():
-    with pytest.raises(SettingsError, match="prior_weight is 'best', wanted a positive number or"):
+    with pytest.raises(
+        SettingsError, match="prior_weight is 'best', wanted a positive, finite number or one of"
+    ):
         EstimatorSettings(prior_weight="best")
 
 

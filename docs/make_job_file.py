@@ -1,0 +1,164 @@
+"""Write docs/job_file.md from the fields of the settings: ``python docs/make_job_file.py``."""
+
+import math
+from dataclasses import MISSING, fields
+from pathlib import Path
+
+from robotid.commands.job import Job, LogEntry
+from robotid.identification.settings import ESTIMATORS, ConstraintSettings
+from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.robot.drives import TERMS, friction_models
+
+PAGE = Path(__file__).with_name("job_file.md")
+START = """# Job file
+
+A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
+the default below. A misspelt key is an error that names the nearest right one. Paths are relative to the job file, and
+`$NAME` in them is filled in from the environment. This page is written by `python docs/make_job_file.py` from the settings
+in the code; `result.json` holds the same keys under `settings`.
+
+<!-- example -->
+```toml
+urdf = "robot.urdf"
+joints = ["joint_1", "joint_2"]
+locked = { finger = 0.02 }
+
+[signals]
+cutoff = 8.0
+min_velocity = 0.02
+
+[log]
+topic = "/joint_states"
+joints = { joint_1 = "M1" }
+effort = "current"
+
+[torque]
+gains = { joint_1 = 14.87, joint_2 = 11.3 }
+
+[[coupling]]
+name = "motor_2"
+ratios = { joint_1 = 1.0, joint_2 = 1.0 }
+
+[estimator]
+name = "consistent"
+robust = "tukey"
+
+[estimator.constraints]
+mass = { forearm = [1.0, 3.0], wrist = 0.8 }
+com = { forearm = [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.4]] }
+pinned = ["base"]
+
+[[identification]]
+log = "first.csv"
+start = 0.5
+end = 30.0
+
+[[validation]]
+log = "second.csv"
+```
+"""
+TABLES = {
+    "signals": SignalSettings,
+    "log": LogSource,
+    "units": LogUnits,
+    "estimator.constraints": ConstraintSettings,
+    "[identification]": LogEntry,
+}
+
+
+def page():
+    """Return the text of the page."""
+    own = {
+        key.at or field.name: (field, key)
+        for field, key in keys(Job)
+        if (key.at or field.name)
+        not in {*TABLES, "model", "estimator", "identification", "validation"}
+    }
+    tables = {}
+    for at, (field, key) in own.items():
+        table, _, name = at.rpartition(".")
+        tables.setdefault(table, []).append(row(name, field, key))
+    parts = [START, "## Keys at the top\n", *listing(tables.pop(""))]
+    for name, kind in TABLES.items():
+        title = "[[identification]]` and `[[validation]]" if name[0] == "[" else f"[{name}]"
+        parts += [f"\n## `{title}`\n", f"{kind.__doc__.splitlines()[0]}\n"]
+        parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
+        if name == "signals":
+            parts += ["\n## `[model]`\n", "Which drive terms are identified.\n", *drive_terms()]
+        if name == "units":
+            for other, rows in tables.items():
+                parts += [f"\n## `[{other}]`\n", *listing(rows)]
+            parts += ["\n## `[estimator]`\n", *estimators()]
+    return "\n".join(parts) + "\n"
+
+
+def keys(kind):
+    """Yield each field of a table with what it says of itself."""
+    return [(field, field.metadata["key"]) for field in fields(kind)]
+
+
+def estimators():
+    """Return the lines on the estimators: what they are, and who has which setting."""
+    yield "| `name` | estimator |\n|---|---|"
+    for name, kind in ESTIMATORS.items():
+        default = ", the default" if name == "consistent" else ""
+        yield f"| `{name}`{default} | {dict(kind.keys())['name'].text} |"
+    yield "\nEach has settings of its own; one of another estimator is refused.\n"
+    yield "| key | default | of | meaning |\n|---|---|---|---|"
+    said = {}
+    for name, kind in ESTIMATORS.items():
+        for field, key in keys(kind)[1:]:
+            if field.name != "constraints":
+                entry = (field.name, default_of(field), meaning(key))
+                said.setdefault(entry, []).append(f"`{name}`")
+    for (name, default, words), owners in said.items():
+        yield f"| `{name}` | {default} | {', '.join(owners)} | {words} |"
+
+
+def drive_terms():
+    """Return the lines on the terms of the drives."""
+    models = ", ".join(friction_models())
+    rows = [f'| `friction` | `"viscous+coulomb"` | Terms of the friction: {models} |']
+    for name, term in TERMS.items():
+        if not term.is_friction:
+            units = ", or ".join(term.units)
+            default = str(term.is_default).lower()
+            rows.append(f"| `{name}` | `{default}` | Whether it is identified [{units}] |")
+    return listing(rows)
+
+
+def listing(rows):
+    """Return the lines of a table of keys."""
+    return ["| key | default | meaning |\n|---|---|---|", *rows]
+
+
+def row(name, field, key):
+    """Return the line of a key."""
+    return f"| `{name}` | {default_of(field)} | {meaning(key)} |"
+
+
+def meaning(key):
+    """Return what a key is, and the range of its numbers."""
+    words = (key.words[:1].upper() + key.words[1:]).replace("<dynamics>", "`<dynamics>`")
+    return words if key.within is None else f"{words} ({key.within.words})"
+
+
+def default_of(field):
+    """Return a default as TOML has it."""
+    if field.default is MISSING and field.default_factory is MISSING:
+        return "required"
+    value = field.default_factory() if field.default is MISSING else field.default
+    if value is None:
+        return "not stated"
+    if isinstance(value, float) and not math.isclose(value, round(value, 6), rel_tol=1e-12):
+        return f"`{value!r}`"
+    words = {True: "true", False: "false"} if isinstance(value, bool) else {}
+    if isinstance(value, str):
+        return f'`"{value}"`'
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
+    return f"`{words.get(value, value)}`" if not isinstance(value, dict) else "`{}`"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,287 @@
+"""Settings declared once: a field of a table says what it is, what it may be and how it is written.
+
+The keys of a job file, the checks of their values, the flags' help, the page of the job file and
+the settings in result.json all come from these fields.
+"""
+
+import difflib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields
+from inspect import isfunction
+from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
+
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
+
+__all__ = ["NOT_NEGATIVE", "POSITIVE", "Key", "Range", "Settings", "check_keys", "setting"]
+
+
+@dataclass(frozen=True)
+class Range:
+    """Which values a setting may have.
+
+    Attributes:
+        words: The range in words, as an error names it.
+        holds: Returns whether a value is in it.
+    """
+
+    words: str
+    holds: Callable[[Any], bool]
+
+
+POSITIVE = Range("a positive number", lambda x: x > 0)
+NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
+
+
+@dataclass(frozen=True)
+class Key:
+    """What a field says of itself.
+
+    Attributes:
+        text: What the setting is, with its unit.
+        among: The words that it may be.
+        within: The range of its numbers.
+        at: Where a job file has it, tables and key with dots between; the field's name if empty.
+        reads: What a job file holds there: types, a table of keys, [a table], or a function that
+            returns it; what the annotation says if None.
+        load: Makes the value from what a job file holds.
+        dump: Makes what result.json holds from the value.
+    """
+
+    text: str
+    among: Sequence[str] = ()
+    within: Range | None = None
+    at: str = ""
+    reads: Any = None
+    load: Callable[[Any], Any] | None = None
+    dump: Callable[[Any], Any] | None = None
+
+    @property
+    def words(self) -> str:
+        """What the setting is, with the words that it may be if they do not occur in that."""
+        is_told = all(word in self.text for word in self.among)
+        return self.text if is_told else f"{self.text}: {', '.join(self.among)}"
+
+
+def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
+    """Declare a setting, as a field of a ``Settings``.
+
+    Args:
+        default: Its value if none is stated, or a function that returns it.
+        text: What it is, with its unit.
+        about: The other attributes of ``Key``.
+
+    Returns:
+        The field.
+    """
+    metadata = {"key": Key(text, **about)}
+    if isinstance(default, dict) or callable(default):
+        factory = default.copy if isinstance(default, dict) else default
+        return field(default_factory=factory, metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A table of settings; its fields are checked as it is made."""
+
+    _table: ClassVar[str] = ""  # named by errors
+
+    def __init_subclass__(cls) -> None:
+        own = {name: f.metadata["key"] for name, f in vars(cls).items() if isinstance(f, Field)}
+        lines = [
+            f"    {name}: {key.words[:1].upper()}{key.words[1:]}." for name, key in own.items()
+        ]
+        cls.__doc__ = "\n".join([f"{cls.__doc__}\n\nAttributes:", *lines])
+
+    def __post_init__(self) -> None:
+        for name, key in self.keys():
+            *table, last = (key.at or name).split(".")
+            where = ".".join(table) or self._table
+            prefix = f"{where}: " if where else ""
+            _check_value(getattr(self, name), key, f"{prefix}{last}")
+
+    @classmethod
+    def keys(cls) -> Iterator[tuple[str, Key]]:
+        """Yield the name of each field, and what it says of itself."""
+        for f in fields(cls):
+            yield f.name, f.metadata["key"]
+
+    @classmethod
+    def schema(cls) -> dict[str, Any]:
+        """Return the keys that a job file may have here: a type or types, a table, or [a table]."""
+        found: dict[str, Any] = {}
+        for f in fields(cls):
+            key = f.metadata["key"]
+            *tables, last = (key.at or f.name).split(".")
+            inside = found
+            for table in tables:
+                inside = inside.setdefault(table, {})
+            inside[last] = _read_type(f.type if key.reads is None else key.reads)
+        return found
+
+    @classmethod
+    def paths(cls) -> dict[str, Key]:
+        """Return what each key says of itself, those of tables inside with a dot between."""
+        found: dict[str, Key] = {}
+        for f in fields(cls):
+            key = f.metadata["key"]
+            at = key.at or f.name
+            inside = f.type.paths() if _is_table(f.type) else {"": key}
+            found |= {f"{at}.{last}".strip("."): inner for last, inner in inside.items()}
+        return found
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Self:
+        """Return the settings that a table of a job file states.
+
+        Args:
+            table: The table, of keys and types of the ``schema``.
+
+        Returns:
+            The settings.
+
+        Raises:
+            SettingsError: If a value is not usable.
+        """
+        given = {}
+        for f in fields(cls):
+            key, inside = f.metadata["key"], table
+            *tables, last = (key.at or f.name).split(".")
+            for name in tables:
+                inside = inside.get(name, {})
+            if last in inside:
+                given[f.name] = _load(inside[last], f, last)
+        return cls(**given)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as plain values, in the shape of the job file; none is left out."""
+        found: dict[str, Any] = {}
+        for name, key in self.keys():
+            value = getattr(self, name)
+            *tables, last = (key.at or name).split(".")
+            inside = found
+            for table in tables:
+                inside = inside.setdefault(table, {})
+            plain = _plain(value) if key.dump is None else key.dump(value)
+            if plain is not None:
+                inside[last] = plain
+        return found
+
+
+def check_keys(
+    table: Mapping[str, Any], schema: Mapping[str, Any], where: str, section: str = ""
+) -> None:
+    """Refuse keys that are not in the schema and values of another type.
+
+    Args:
+        table: What was given.
+        schema: The known keys, as of ``Settings.schema``.
+        where: Name of its source, for errors.
+        section: Table that it is in, with a dot at its end, for errors.
+
+    Raises:
+        SettingsError: If a key is unknown or missing, or its value has another type.
+    """
+    for key, value in table.items():
+        at = f"{where}: {section}{key}"
+        if key not in schema:
+            near = difflib.get_close_matches(key, schema, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else "."
+            raise SettingsError(f"{at} is not a known key{hint} Known: {sorted(schema)}")
+        wanted = schema[key]
+        if isinstance(wanted, dict):
+            if not isinstance(value, Mapping):
+                raise SettingsError(f"{at} is {value!r}, wanted a table [{section}{key}]")
+            check_keys(value, wanted, where, f"{section}{key}.")
+        elif isinstance(wanted, list):
+            _check_array(value, wanted[0], where, f"{section}{key}")
+        elif not isinstance(value, wanted) or (isinstance(value, bool) and bool not in wanted):
+            raise SettingsError(f"{at} is {value!r}, wanted {_type_name(wanted)}")
+
+
+def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str) -> None:
+    if not isinstance(value, list) or not all(isinstance(item, Mapping) for item in value):
+        raise SettingsError(f"{where}: {name} is {value!r}, wanted tables written as [[{name}]]")
+    for item in value:
+        check_keys(item, schema, where, f"{name}.")
+        for required in ("log", "name", "ratios"):
+            if required in schema and required not in item:
+                raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
+
+
+def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
+    if value is None:
+        return
+    words = f"one of {listed(key.among)}" if key.among else ""
+    if key.within is not None:
+        words = f"{key.within.words} or {words}" if words else key.within.words
+    is_right = not words
+    if isinstance(value, str):
+        is_right = is_right or value in key.among
+    elif key.within is not None:
+        is_right, words = key.within.holds(value), key.within.words
+    if not is_right:
+        shown = repr(value) if isinstance(value, str) else value
+        raise SettingsError(f"{name} is {shown}, wanted {words}")
+
+
+_NUMBER = (int, float)
+_WORDS = {str: "text", bool: "true or false", list: "a list", dict: "a table"}
+_ALSO = {bool: "false", str: "text", list: "a list"}
+
+
+def _type_name(kinds: tuple[type, ...]) -> str:
+    if float not in kinds:
+        return "a whole number" if int in kinds else _WORDS[kinds[0]]
+    return " or ".join(["a number", *(_ALSO[kind] for kind in kinds if kind in _ALSO)])
+
+
+def _is_table(kind: Any) -> TypeGuard[type[Settings]]:  # noqa: ANN401
+    return isinstance(kind, type) and issubclass(kind, Settings)
+
+
+def _read_type(kind: Any) -> Any:  # noqa: ANN401
+    """Return what a job file holds where a field is annotated so."""
+    if isinstance(kind, dict | list | tuple):
+        return kind
+    if isfunction(kind):
+        return kind()
+    if _is_table(kind):
+        return kind.schema()
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is tuple:
+        return [inner[0].schema()] if _is_table(inner[0]) else (list,)
+    if origin is not None and issubclass(origin, Mapping):
+        return (dict,)
+    if origin is not None and issubclass(origin, Sequence):
+        return (list,)
+    if inner:
+        return tuple(t for one in inner if one is not type(None) for t in _read_type(one))
+    return _NUMBER if kind is float else (kind,)
+
+
+def _load(value: Any, about: Field[Any], name: str) -> Any:  # noqa: ANN401
+    key, kind = about.metadata["key"], about.type
+    if key.load is not None:
+        return key.load(value)
+    if _is_table(kind):
+        return kind.from_dict(value)
+    if isinstance(value, list):
+        inner = get_args(kind)[0]
+        return tuple(inner.from_dict(item) if _is_table(inner) else item for item in value)
+    if isinstance(value, Mapping) and get_args(kind) == (str, float):
+        for entry, number in value.items():
+            if isinstance(number, bool) or not isinstance(number, _NUMBER):
+                raise SettingsError(f"{name}.{entry} is {number!r}, wanted a number")
+        return {entry: float(number) for entry, number in value.items()}
+    return value
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    """Return a value as TOML and JSON have it."""
+    if isinstance(value, Settings):
+        return value.to_dict()
+    if isinstance(value, Mapping):
+        return dict(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value

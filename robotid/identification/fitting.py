@@ -1,0 +1,182 @@
+"""The estimator that settings describe, made for a robot and what is known of it before."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import (
+    OLS,
+    PRX,
+    RLS,
+    TLS,
+    WLS,
+    BatchEstimator,
+    Consistent,
+    Constraints,
+    Kalman,
+    LogCholesky,
+    NormalisedGradient,
+    RecursiveEstimator,
+)
+from robotid.estimators.consistent.weighting import choose_weight
+from robotid.exceptions import SettingsError
+from robotid.identification.settings import (
+    BoundedSettings,
+    ConsistentSettings,
+    ConstraintSettings,
+    EstimatorSettings,
+    GradientSettings,
+    KalmanSettings,
+    LogCholeskySettings,
+    OLSSettings,
+    PRXSettings,
+    RLSSettings,
+    TLSSettings,
+    WLSSettings,
+)
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.factors import Factors, gather
+from robotid.robot.bodies import held_parameters
+from robotid.robot.geometry import geometry_half_spaces
+from robotid.robot.model import RobotModel
+
+__all__ = ["Known", "consistent_fit", "make_constraints", "make_estimator"]
+
+_FOLDS = 6  # held out in turn by prior_weight = "cv"
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known before the data.
+
+    Attributes:
+        pi: Standard parameters of the URDF, shape (p,).
+        spread: How far they may plausibly be wrong, shape (p,).
+        share: Share of the rows that count as independent [-].
+        sigma: Noise level of each joint, shape (n,) [N m or N].
+        stretches: Factors of the stretches of the fitted logs, to choose a weight with.
+    """
+
+    pi: Array
+    spread: Array
+    share: float
+    sigma: Array
+    stretches: tuple[Factors, ...] = ()
+
+
+def make_estimator(
+    settings: EstimatorSettings, model: RobotModel, mapping: BaseMapping, prior: Known
+) -> BatchEstimator | RecursiveEstimator[Any]:
+    """Return the estimator that settings describe.
+
+    Args:
+        settings: The settings.
+        model: The robot.
+        mapping: Standard to base parameters.
+        prior: What is known before the data.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        SettingsError: If constraints contradict each other or do not fit the robot.
+    """
+    share, sigma, beta = prior.share, prior.sigma, mapping.to_base(prior.pi)
+    KS = mapping.K * prior.spread
+    C = KS @ KS.T  # (b, b), of the base parameters before the data
+    match settings:
+        case OLSSettings():
+            return OLS(independent_share=share)
+        case WLSSettings():
+            return WLS(independent_share=share)
+        case TLSSettings():
+            return TLS(settings.regressor_noise, independent_share=share)
+        case LogCholeskySettings():
+            fit = consistent_fit(settings, model, mapping, prior)
+            rng = np.random.default_rng(settings.seed)
+            return LogCholesky(fit, starts=settings.starts, rng=rng)
+        case ConsistentSettings():
+            return consistent_fit(settings, model, mapping, prior)
+        case RLSSettings():
+            # without forgetting nothing of the prior enters: batch least squares
+            std = np.sqrt(np.diag(C)) if settings.forgetting < 1 else None
+            return RLS(sigma, settings.forgetting, beta, std, share)
+        case KalmanSettings():
+            gate = None if settings.gate is False else float(settings.gate)
+            return Kalman(sigma, beta, C, settings.walk, gate, share)
+        case PRXSettings() | GradientSettings():
+            is_shuffled = settings.seed >= 0
+            order = np.random.default_rng(settings.seed) if is_shuffled else None
+            passes, average = settings.passes, settings.average
+            if isinstance(settings, GradientSettings):
+                size = settings.step_size
+                return NormalisedGradient(
+                    sigma, beta, step_size=size, average=average, passes=passes, rng=order
+                )
+            step, metric = settings.step, settings.metric
+            return PRX(
+                sigma, beta, step=step, metric=metric, average=average, passes=passes, rng=order
+            )
+    raise SettingsError(f"{settings!r} describes no estimator; take EstimatorSettings(name)")
+
+
+def consistent_fit(
+    settings: BoundedSettings, model: RobotModel, mapping: BaseMapping, prior: Known
+) -> Consistent:
+    """Return the physically consistent estimator, which also projects.
+
+    Args:
+        settings: The settings.
+        model: The robot.
+        mapping: Standard to base parameters.
+        prior: What is known before the data.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        SettingsError: If constraints contradict each other or do not fit the robot.
+    """
+    geometry = geometry_half_spaces(model, settings.bounds.com_within)
+    weight = settings.prior_weight
+    fit = Consistent(
+        layout=model.layout,
+        K=mapping.K,
+        prior=prior.pi,
+        prior_std=prior.spread,
+        held=held_parameters(model),
+        margin=settings.margin,
+        prior_weight=1.0 if isinstance(weight, str) else weight,
+        independent_share=prior.share,
+        metric=settings.prior,
+        constraints=make_constraints(settings.bounds, geometry),
+        solver=settings.solver,
+        check=settings.check,
+    )
+    folds = gather(prior.stretches, _FOLDS)
+    if not isinstance(weight, str) or (weight == "auto" and len(folds) < 2):
+        return fit
+    choice = choose_weight(fit, folds, "cv" if weight == "auto" else weight)
+    return replace(fit, prior_weight=choice.weight, choice=choice)
+
+
+def make_constraints(
+    bounds: ConstraintSettings, geometry: Mapping[str, tuple[Array, Array]]
+) -> Constraints:
+    """Return the constraints as the estimator takes them.
+
+    Args:
+        bounds: The constraints as a job states them.
+        geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
+            the body; boxes stated in ``com`` go before them.
+
+    Returns:
+        The constraints.
+    """
+    com = dict(geometry)
+    for name, (low, high) in bounds.boxes.items():
+        com[name] = (np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, np.negative(low)]))
+    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned))
