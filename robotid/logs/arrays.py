@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -49,9 +50,7 @@ class Hdf5Format(WritableFormat):
     """HDF5 files, compressed when written; only the columns that are read are loaded."""
 
     def open(self, path: Path, source: LogSource) -> Table:
-        with _open_hdf5(path) as file:
-            entries = _datasets(file, path, is_matlab=False)
-        return _table_of_arrays(path.name, entries, source)
+        return _table_of_arrays(path.name, _datasets(path, is_matlab=False), source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         with _h5py("writing HDF5").File(path, "w") as file:
@@ -65,11 +64,7 @@ class MatFormat(WritableFormat):
     def open(self, path: Path, source: LogSource) -> Table:
         with path.open("rb") as file:
             is_hdf5 = file.read(len(_MAT73)) == _MAT73
-        if is_hdf5:
-            with _open_hdf5(path) as file:
-                entries = _datasets(file, path, is_matlab=True)
-        else:
-            entries = _mat_variables(path)
+        entries = _datasets(path, is_matlab=True) if is_hdf5 else _mat_variables(path)
         return _table_of_arrays(path.name, entries, source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
@@ -112,30 +107,24 @@ def _table_of_arrays(where: str, entries: Mapping[str, _Entry], source: LogSourc
     for name, path in inside.items():
         if entries[path].is_number:
             columns |= _columns_of(where, name, path, entries[path].shape, joints)
-
-    def read(wanted: Sequence[str]) -> dict[str, Array]:
-        return _read(where, entries, {name: columns[name] for name in wanted})
-
-    return Table(list(columns), read)
+    return Table(list(columns), partial(_read, where, entries, columns))
 
 
 def _group(where: str, paths: Sequence[str], topic: str | None) -> str:
     """Return what the paths of the group start with: "" or a name with a slash behind it."""
-    parents = {path: path.rpartition("/") for path in paths}
-    groups = sorted({head + slash for head, slash, _ in parents.values()})
+    parents = [path.rpartition("/") for path in paths]
     if topic is not None:
         group = topic.strip("/") + "/" if topic.strip("/") else ""
         if not any(path.startswith(group) for path in paths):
-            known = [name.rstrip("/") or "/" for name in groups]
+            known = sorted({head or "/" for head, _, _ in parents})
             raise DataError(
                 f"{where} has no group {topic!r}; groups found: "
                 f"{listed(known)}{suggestion(topic, known)}"
             )
         return group
-    timed = {head + slash for head, slash, tail in parents.values() if tail in _CLOCKS}
-    if not timed:
+    names = sorted({head or "/" for head, _, tail in parents if tail in _CLOCKS})
+    if not names:
         return ""
-    names = sorted(name.rstrip("/") or "/" for name in timed)
     chosen = choose(where, names, "groups with a time", f"entries found: {listed(paths)}")
     return "" if chosen == "/" else chosen + "/"
 
@@ -169,12 +158,16 @@ def _columns_of(
 
 
 def _read(
-    where: str, entries: Mapping[str, _Entry], columns: Mapping[str, _Column]
+    where: str,
+    entries: Mapping[str, _Entry],
+    columns: Mapping[str, _Column],
+    wanted: Sequence[str],
 ) -> dict[str, Array]:
     """Return columns; each array is loaded once, and all must be of one length."""
-    loaded = {path: np.asarray(entries[path].load()) for path in {p for p, _ in columns.values()}}
+    chosen = {name: columns[name] for name in wanted}
+    loaded = {path: np.asarray(entries[path].load()) for path in {p for p, _ in chosen.values()}}
     table: dict[str, Array] = {}
-    for name, (path, index) in columns.items():
+    for name, (path, index) in chosen.items():
         values = loaded[path]
         if index is None or values.size == max(values.shape):
             values = values.ravel()
@@ -214,8 +207,8 @@ def _open_hdf5(path: Path) -> Iterator[Any]:
         yield file
 
 
-def _datasets(file: Any, path: Path, *, is_matlab: bool) -> dict[str, _Entry]:  # noqa: ANN401
-    """Return the datasets of an open file by path; MATLAB's own bookkeeping is left out."""
+def _datasets(path: Path, *, is_matlab: bool) -> dict[str, _Entry]:
+    """Return the datasets of a file by path; MATLAB's own bookkeeping is left out."""
     entries: dict[str, _Entry] = {}
 
     def visit(name: str, item: Any) -> None:  # noqa: ANN401
@@ -229,7 +222,8 @@ def _datasets(file: Any, path: Path, *, is_matlab: bool) -> dict[str, _Entry]:  
             lambda: _load_dataset(path, name, is_matlab=is_matlab),
         )
 
-    file.visititems(visit)
+    with _open_hdf5(path) as file:
+        file.visititems(visit)
     return entries
 
 

@@ -62,8 +62,7 @@ class _ParquetRows(RowReader):
 
     def scan(self, name: str) -> Iterator[tuple[Array, Place]]:
         row = 0
-        with _open(self.path, _BUFFER) as file:
-            _check_types(file, [name], self.path.name)
+        with _open(self.path, [name], _BUFFER) as file:
             for group in range(file.num_row_groups):  # one by one: read ones stay in memory
                 for batch in self._batches(file, name, [group]):
                     yield _to_numpy(batch.column(0)), Place(row)
@@ -71,8 +70,7 @@ class _ParquetRows(RowReader):
 
     def read(self, wanted: Sequence[str], first: int, stop: int, near: Place) -> dict[str, Array]:
         values = {name: np.empty(stop - first) for name in wanted}
-        with _open(self.path, _BUFFER) as file:
-            _check_types(file, wanted, self.path.name)
+        with _open(self.path, wanted, _BUFFER) as file:
             sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
             edges = np.cumsum([0, *sizes])
             groups = np.flatnonzero((edges[:-1] < stop) & (edges[1:] > first)).tolist()
@@ -96,29 +94,24 @@ class _ParquetRows(RowReader):
 
 
 @contextmanager
-def _open(path: Path, buffer: int = 0) -> Iterator[Any]:
+def _open(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator[Any]:
+    """Open a Parquet file; columns that are wanted must hold numbers."""
     pa = load_pyarrow("reading Parquet")
     with (
         told(path, "Parquet", (pa.ArrowInvalid, OSError)),
         pa.parquet.ParquetFile(path, buffer_size=buffer) as file,
     ):
+        for name in wanted:
+            kind = file.schema_arrow.field(name).type
+            if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+                raise DataError(f"{path.name}: {name} holds {kind}, wanted numbers; convert it")
         yield file
 
 
 def _read(path: Path, wanted: Sequence[str]) -> dict[str, Array]:
-    with _open(path) as file:
-        _check_types(file, wanted, path.name)
+    with _open(path, wanted) as file:
         table = file.read(columns=list(wanted))
     return {name: _to_numpy(table.column(name)) for name in wanted}
-
-
-def _check_types(file: Any, wanted: Sequence[str], where: str) -> None:  # noqa: ANN401
-    """Refuse columns that do not hold numbers."""
-    types = load_pyarrow("reading Parquet").types
-    for name in wanted:
-        kind = file.schema_arrow.field(name).type
-        if not (types.is_integer(kind) or types.is_floating(kind)):
-            raise DataError(f"{where}: {name} holds {kind}, wanted numbers; convert it")
 
 
 def _to_numpy(column: Any) -> Array:  # noqa: ANN401

@@ -33,20 +33,14 @@ class Motion(Protocol):
 class FourierTrajectory(Motion):
     """A periodic motion q(t) = q0 + sum_k s_k sin(k w t) + c_k cos(k w t), w = 2 pi / period.
 
-    Attributes:
-        q0: Mean position, shape (n,) [rad or m].
-        sine: Coefficients s_k, shape (h, n) [rad or m].
-        cosine: Coefficients c_k, shape (h, n) [rad or m].
-        period: Period [s].
-
     References:
         Swevers et al. (1997), Optimal robot excitation and identification.
     """
 
-    q0: Array
-    sine: Array
-    cosine: Array
-    period: float
+    q0: Array  # mean position, shape (n,) [rad or m]
+    sine: Array  # coefficients s_k, shape (h, n) [rad or m]
+    cosine: Array  # coefficients c_k, shape (h, n) [rad or m]
+    period: float  # [s]
 
     def __post_init__(self) -> None:
         if self.sine.shape != self.cosine.shape or self.sine.shape[1:] != self.q0.shape:

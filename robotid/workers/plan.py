@@ -26,18 +26,12 @@ class WorkPlan:
     """How work on pieces is done; it never changes a result.
 
     As a context manager, it keeps its workers for more work until the context ends.
-
-    Attributes:
-        workers: Worker processes; None for one per core where the work is long.
-        scheduler: Address of a Dask scheduler, whose workers are used instead.
-        resume: Whether an interrupted run goes on from its checkpoint.
-        progress: Called with the work, samples done, samples in all and their name.
     """
 
-    workers: int | None = 1
-    scheduler: str | None = None
-    resume: bool = False
-    progress: ProgressCallback | None = None
+    workers: int | None = 1  # worker processes; None for one per core where the work is long
+    scheduler: str | None = None  # address of a Dask scheduler, whose workers are used instead
+    resume: bool = False  # whether an interrupted run goes on from its checkpoint
+    progress: ProgressCallback | None = None  # gets the work, samples done, in all, their name
     _kept: Backend | None = field(default=None, init=False, repr=False)
     _keeps: bool = field(default=False, init=False, repr=False)
 
