@@ -16,16 +16,8 @@ import numpy as np
 from robotid._files import folder_beside
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
-from robotid.export.xml_splice import (
-    Document,
-    Edit,
-    apply,
-    insert,
-    parse,
-    remove,
-    replace,
-    set_attributes,
-)
+from robotid.export import xml_splice
+from robotid.export.xml_splice import Document, Edit
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
 from robotid.robot.drives import TERMS
@@ -71,11 +63,11 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     _check_target(source, goal)
     original, places = source.read_bytes(), link_places(model)
     written = _link_parameters(model, pi)
-    document = parse(original, source.name)
+    document = xml_splice.parse(original, source.name)
     edits = _inertial_edits(document, written, places)
     if dynamics:
         edits += _dynamics_edits(document, model, pi)
-    content = apply(document, edits)
+    content = xml_splice.apply(document, edits)
     sidecar = goal.with_name(f"{goal.stem}.drive.json")
     readers = ["robotid", "yourdfpy"] if _suits_yourdfpy(source) else ["robotid"]
     facts = {
@@ -258,11 +250,11 @@ def _inertial_edits(
     for link in document.root.find_all("link"):
         name, inertials = link.attributes.get("name", ""), link.find_all("inertial")
         if name in removed:
-            edits += [remove(document, inertial) for inertial in inertials]
+            edits += [xml_splice.remove(document, inertial) for inertial in inertials]
         elif name in written and inertials:
-            edits.append(replace(document, inertials[0], _inertial(written[name])))
+            edits.append(xml_splice.replace(document, inertials[0], _inertial(written[name])))
         elif name in written:
-            edits.append(insert(document, link, _inertial(written[name])))
+            edits.append(xml_splice.insert(document, link, _inertial(written[name])))
     return edits
 
 
@@ -301,10 +293,10 @@ def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Ed
         names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
         new = {names[key]: _text(values[key]) for key in names if key in values}
         if new and found:
-            edits += set_attributes(document, found[0], new)
+            edits += xml_splice.set_attributes(document, found[0], new)
         elif new:
             words = " ".join(f'{key}="{value}"' for key, value in new.items())
-            edits.append(insert(document, joint, [f"<dynamics {words}/>"]))
+            edits.append(xml_splice.insert(document, joint, [f"<dynamics {words}/>"]))
     return edits
 
 

@@ -12,17 +12,7 @@ from xml.parsers import expat
 
 from robotid.exceptions import ModelError
 
-__all__ = [
-    "Document",
-    "Edit",
-    "Element",
-    "apply",
-    "insert",
-    "parse",
-    "remove",
-    "replace",
-    "set_attributes",
-]
+__all__ = ["Document", "Edit", "apply", "insert", "parse", "remove", "replace", "set_attributes"]
 
 # the tag at the start of an element; an attribute's value may hold ">"
 _TAG = re.compile(rb"<[^\s/>]+(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")

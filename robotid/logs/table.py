@@ -141,11 +141,10 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
     """
     if len(found) == 1:
         return found[0]
+    names = sorted(found)
     raise DataError(
-        f"{where} holds {len(found)} {noun}: {listed(sorted(found))}; {listing}. State one: topic "
-        "= "
-        f'"{sorted(found)[0]}" (job file table [log], CLI --topic, Python '
-        "source=LogSource(topic=...))"
+        f"{where} holds {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
+        f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
     )
 
 

@@ -65,18 +65,13 @@ class ProgramMotion(Motion):
     The coefficients a1 = 6 / T^5, a2 = -15 / T^4, a3 = 10 / T^3 take q from q0 to q0 + A and leave
     no velocity and no acceleration at either end. Before 0 and after T the robot rests.
 
-    Attributes:
-        amplitude: A, the way each joint goes, shape (n,), or (R, n) for R motions [rad or m].
-        duration: T, one for all or one per motion, shape () or (R,) [s].
-        start: q0, of the shape of the amplitude or that of one motion [rad or m]; 0 if left out.
-
     References:
         Tzvetkova, (28).
     """
 
-    amplitude: Array
-    duration: float | Array
-    start: float | Array = 0.0
+    amplitude: Array  # A, the way each joint goes, shape (n,), or (R, n) for R motions [rad or m]
+    duration: float | Array  # T, one for all or one per motion, shape () or (R,) [s]
+    start: float | Array = 0.0  # q0, of the amplitude's shape or that of one motion [rad or m]
 
     def __post_init__(self) -> None:
         A, T = np.asarray(self.amplitude, dtype=float), np.asarray(self.duration, dtype=float)

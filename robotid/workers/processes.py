@@ -26,13 +26,7 @@ from robotid.workers.pieces import Outcome, Work, Workload, run_task
 if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
 
-__all__ = [
-    "Backend",
-    "ProcessBackend",
-    "SerialBackend",
-    "named",
-    "require_workers",
-]
+__all__ = ["Backend", "ProcessBackend", "SerialBackend", "named", "require_workers"]
 
 _log = logging.getLogger(__name__)
 
