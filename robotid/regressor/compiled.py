@@ -54,13 +54,10 @@ def work_per_sample(model: "RobotModel") -> int:
 
 
 def why_not(model: "RobotModel") -> str | None:
-    """Return why the compiled path cannot take a robot, or None if it can.
+    """Return in words why the compiled path cannot take a robot, or None if it can.
 
     Args:
         model: The robot.
-
-    Returns:
-        The reason, in words.
     """
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
@@ -168,9 +165,6 @@ def flatten(model: "RobotModel") -> Tree:
 
     Args:
         model: The robot; ``why_not`` must return None for it.
-
-    Returns:
-        The arrays.
     """
     pin_model, G = model.pin_model, model.velocity_map
     bodies = pin_model.njoints

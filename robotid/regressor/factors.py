@@ -52,13 +52,10 @@ class Factors:
         return dense
 
     def select(self, columns: Array) -> "Factors":
-        """Return the factors of fewer columns.
+        """Return the factors of the same rows with fewer columns.
 
         Args:
             columns: Indices of the columns kept, shape (b,).
-
-        Returns:
-            Factors over the same rows.
         """
         columns = np.asarray(columns, dtype=int)
         triangles, kept = [], []
@@ -70,16 +67,13 @@ class Factors:
         return Factors(tuple(triangles), tuple(kept), self.rows, names)
 
     def weighted(self, sigma: Array) -> Array:
-        """Return one factor of all joints, the rows of joint j divided by sigma_j.
+        """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
 
         From the fingers to the base, each factor is folded into the smallest one that has all its
         columns: a joint's are among those of the joint that carries it.
 
         Args:
             sigma: Noise level per joint, shape (n,) [N m or N], positive.
-
-        Returns:
-            Triangular factor of the stacked [W_j tau_j] / sigma_j, shape (c + 1, c + 1).
         """
         c = len(self.names)
         folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
@@ -95,13 +89,10 @@ class Factors:
         return everything.R
 
     def residual_squares(self, theta: Array) -> Array:
-        """Return the sum of squared residuals |tau_j - W_j theta|^2 of each joint.
+        """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2].
 
         Args:
             theta: Parameters, shape (c,).
-
-        Returns:
-            Sums, shape (n,) [(N m)^2 or N^2].
         """
         residuals = [
             R[:, -1] - R[:, :-1] @ theta[own]
@@ -114,13 +105,10 @@ class Factors:
         return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])
 
     def information(self, weights: Array) -> Array:
-        """Return sum_j weight_j W_j^T W_j.
+        """Return sum_j weight_j W_j^T W_j, shape (c, c).
 
         Args:
             weights: Weight per joint, shape (n,).
-
-        Returns:
-            The sum, shape (c, c).
         """
         total = np.zeros((len(self.names), len(self.names)))
         for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
@@ -128,13 +116,10 @@ class Factors:
         return total
 
     def leverages(self, covariance: Array) -> Array:
-        """Return the trace of W_j C W_j^T for each joint.
+        """Return the trace of W_j C W_j^T for each joint, shape (n,).
 
         Args:
             covariance: C, shape (c, c).
-
-        Returns:
-            Traces, shape (n,).
         """
         pairs = [
             (R[:, :-1], covariance[np.ix_(own, own)])
@@ -168,9 +153,6 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         threads: Number of threads, at least 1; None: one per core where the problem's rows come
             faster that way, otherwise one.
 
-    Returns:
-        The factors.
-
     Raises:
         DataError: If a row is not finite.
 
@@ -194,9 +176,6 @@ def compress_stretches(
         length: Samples per stretch, at least 1; the last stretch of each log may have fewer.
         threads: As of ``compress``.
 
-    Returns:
-        The factors of each stretch, in order; merged they are those of the whole problem.
-
     Raises:
         DataError: If a row is not finite, or the problem comes in blocks only.
     """
@@ -216,13 +195,10 @@ def compress_stretches(
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
-    """Return the factors of all rows of several logs.
+    """Return the factors of all rows of several logs, as if they had been folded in one pass.
 
     Args:
         factors: At least one; all with the same columns and joints.
-
-    Returns:
-        Factors as if the rows had been folded in one pass.
 
     Raises:
         DataError: If there is none, or their columns or joints differ.
@@ -255,9 +231,6 @@ def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
     Args:
         stretches: Factors of stretches, in order.
         count: Number wanted, at least 1.
-
-    Returns:
-        At most so many factors of about as many stretches each, in order.
     """
     edges = np.linspace(0, len(stretches), min(count, len(stretches)) + 1).round().astype(int)
     return tuple(merge(stretches[i:j]) for i, j in pairwise(edges))

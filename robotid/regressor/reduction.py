@@ -39,9 +39,6 @@ class Reduction:
             trajectory: The trajectory.
             threads: As of ``compress``.
 
-        Returns:
-            The reduction.
-
         Raises:
             DataError: If a row is not finite.
         """
@@ -60,13 +57,10 @@ class Reduction:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
-        """Return the reduction that arrays hold; see ``to_arrays``.
+        """Return the reduction that arrays hold, to the same bits; see ``to_arrays``.
 
         Args:
             arrays: The arrays by name.
-
-        Returns:
-            The reduction, to the same bits.
         """
         rows, joints = arrays["rows"], range(len(arrays["rows"]))
         factors = Factors(
@@ -85,9 +79,6 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
 
     Args:
         reductions: At least one; all with the same columns and joints.
-
-    Returns:
-        The reduction.
 
     Raises:
         DataError: If there is none, or their columns or joints differ.

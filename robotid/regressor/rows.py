@@ -162,9 +162,6 @@ def trajectory_rows(
         weight: Weight of each row, shape (N, n_rows); None: all 1.
         compiled: As of ``choose_engine``.
 
-    Returns:
-        The rows.
-
     Raises:
         DataError: If joints or shapes do not fit the model.
         MissingDependencyError: If ``compiled`` is True and the extra "fast" is not installed.

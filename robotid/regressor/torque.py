@@ -64,16 +64,13 @@ def joint_torque_regressor(
 
 
 def mass_regressor(model: RobotModel, q: Array) -> Array:
-    """Return the regressor of the mass matrix: D(q, pi) = mass_regressor @ pi, drives included.
+    """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
 
-    Its column j is W(q, 0, e_j) - W(q, 0, 0), in which gravity and offsets cancel.
+    Drives included, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
 
     Args:
         model: The robot.
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-
-    Returns:
-        Regressors, shape (N, n_rows, n_rows, p).
 
     Raises:
         DataError: If q does not fit the model.
@@ -121,15 +118,12 @@ class InstantRegressor:
         ]
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the regressor of one instant.
+        """Return the regressor of one instant, shape (n, c), as of ``joint_torque_regressor``.
 
         Args:
             q: Joint coordinates, shape (n,) [rad, m].
             v: Velocities, shape (n,) [rad/s, m/s].
             a: Accelerations, shape (n,) [rad/s^2, m/s^2].
-
-        Returns:
-            Regressor, shape (n, c); the same as that of ``joint_torque_regressor``.
         """
         model, layout, Y = self._model, self._model.layout, self._Y
         x = q if self._is_plain else model.configurations(q[None])[0]
@@ -149,13 +143,10 @@ class InstantRegressor:
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
-        """Return the regressor of the mass matrix; see ``mass_regressor``.
+        """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``.
 
         Args:
             q: Joint coordinates, shape (n,) [rad, m].
-
-        Returns:
-            Regressor, shape (n, n, c).
         """
         still, unit = np.zeros(len(q)), np.eye(len(q))
         at_rest = self(q, still, still)
@@ -170,7 +161,7 @@ def build_problem(
     with_mass: bool = False,
     compiled: bool | None = None,
 ) -> Problem:
-    """Return the identification problem W pi = tau of a trajectory.
+    """Return the problem W pi = tau of a trajectory: a stream of row blocks with p columns.
 
     Its blocks come from Pinocchio. Its rows joint by joint, which the factors are made of, come
     from Pinocchio too, or from the compiled path, equal to 1e-12;
@@ -183,9 +174,6 @@ def build_problem(
         with_mass: Whether each sample also carries the regressor of its mass matrix.
         compiled: Whether to use the compiled path where it supports the robot; None: where it is
             installed and the trajectory is long enough to pay its start.
-
-    Returns:
-        A stream of row blocks with p columns.
 
     Raises:
         DataError: If joints or shapes do not fit the model.
@@ -216,7 +204,7 @@ def build_problem(
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Return the regressor at random states, which shows what any motion can excite.
+    """Return the regressor at random states, shape (N n_rows, p): what any motion can excite.
 
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
     gravity and inertia weigh alike on a finger and on a crane.
@@ -225,9 +213,6 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         model: The robot.
         samples: Number N of states.
         rng: Source of the random states.
-
-    Returns:
-        Regressors, shape (N n_rows, p).
     """
     n = len(model.joints)
     rate = np.sqrt(9.81 / model.length)  # [1/s]

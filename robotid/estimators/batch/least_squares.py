@@ -103,7 +103,6 @@ class Solution:
     Attributes:
         theta: Parameters, shape (c,).
         covariance: (W^T S^-1 W)^+, shape (c, c).
-        open_directions: Shape (c, c - rank), orthonormal in the scaled columns.
         rank: Number of directions that the data determine.
         condition: Condition number over them, columns scaled to unit norm.
         undetermined: Names of the parameters that the data leave open.
@@ -111,7 +110,6 @@ class Solution:
 
     theta: Array
     covariance: Array
-    open_directions: Array
     rank: int
     condition: float
     undetermined: tuple[str, ...]
@@ -124,9 +122,6 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
         factors: The factors.
         sigma: Noise level per joint, shape (n,) [N m or N].
         prior: Parameters kept where the data say nothing, shape (c,); None: refuse such data.
-
-    Returns:
-        The solution.
 
     Raises:
         RankDeficientError: If the data leave parameters open and there is no prior.
@@ -148,7 +143,7 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     step = V @ ((U[:, :rank].T @ (d - A @ start)) / s[:rank])
     basis = V / s[:rank] / scale[:, None]
     condition = float(s[0] / s[rank - 1]) if rank else float("inf")
-    return Solution(start + step / scale, basis @ basis.T, V0, rank, condition, undetermined)
+    return Solution(start + step / scale, basis @ basis.T, rank, condition, undetermined)
 
 
 def _effective_parameters(factors: Factors, solution: Solution, sigma: Array | None) -> Array:

@@ -89,14 +89,11 @@ class TLS(BatchEstimator):
 
 
 def mixed_tls(rows: Array, noise: Array) -> Array:
-    """Return the parameters that mixed total least squares finds.
+    """Return the parameters, shape (c,), that mixed total least squares finds.
 
     Args:
         rows: Rows [W tau] in units of the torque's noise, or their factor, shape (k, c + 1).
         noise: Noise of each column in the same units, shape (c,); 0 of columns without.
-
-    Returns:
-        Parameters, shape (c,).
 
     Raises:
         DataError: If no single solution is smallest.

@@ -28,14 +28,11 @@ class Subspace:
 
     @classmethod
     def of(cls, E: Array, e: Array) -> "Subspace":
-        """Return the points with E x = e; a direction that E fixes twice counts once.
+        """Return the points with E x = e, or the nearest to it if they contradict each other.
 
         Args:
             E: Coefficients, shape (k, p).
             e: Right-hand side, shape (k,).
-
-        Returns:
-            The subspace; the least point nearest to E x = e if they contradict each other.
         """
         p = E.shape[1]
         if not len(E):
@@ -84,24 +81,18 @@ class Cone:
         return np.vstack([self.G, self.S]), np.concatenate([self.h, self.s])
 
     def matrices(self, x: Array) -> Array:
-        """Return the matrices S_i(x).
+        """Return the matrices S_i(x), shape (m, 4, 4).
 
         Args:
             x: A point, shape (p,).
-
-        Returns:
-            Matrices, shape (m, 4, 4).
         """
         return unsvec(self.S @ x + self.s)
 
     def slack(self, x: Array) -> Array:
-        """Return how far each linear row and each matrix is from its bound; negative beyond it.
+        """Return values of rows, then smallest eigenvalues, shape (k + m,); negative beyond bounds.
 
         Args:
             x: A point, shape (p,).
-
-        Returns:
-            Values of the rows, then smallest eigenvalues, shape (k + m,).
         """
         eigenvalues = np.linalg.eigvalsh(self.matrices(x))[:, 0]
         return np.concatenate([self.G @ x + self.h, eigenvalues])
@@ -111,20 +102,14 @@ class Cone:
 
         Args:
             x: A point, shape (p,).
-
-        Returns:
-            Whether no bound is passed.
         """
         return bool((self.slack(x) >= 0).all())
 
     def restrict(self, space: Subspace) -> "Cone":
-        """Return the cone in the coordinates y of a subspace.
+        """Return the cone in coordinates y of a subspace: the points y whose x lies in this one.
 
         Args:
             space: The subspace.
-
-        Returns:
-            The points y whose x lies in this one.
         """
         return Cone(
             self.G @ space.basis,
@@ -167,13 +152,10 @@ class Cone:
 
 
 def svec(S: Array) -> Array:
-    """Return the upper triangle of symmetric matrices by columns, off-diagonals times sqrt 2.
+    """Return upper triangles by columns, shape (..., k (k + 1) / 2), off-diagonals times sqrt 2.
 
     Args:
         S: Symmetric matrices, shape (..., k, k).
-
-    Returns:
-        Vectors with the same inner product, shape (..., k (k + 1) / 2).
     """
     k = S.shape[-1]
     weight = np.where(np.eye(k, dtype=bool), 1.0, np.sqrt(2.0))
@@ -183,13 +165,10 @@ def svec(S: Array) -> Array:
 
 
 def unsvec(vector: Array) -> Array:
-    """Return the 4 x 4 matrices of stacked vectors; the inverse of ``svec``.
+    """Return the matrices, shape (m, 4, 4), of stacked vectors; the inverse of ``svec``.
 
     Args:
         vector: Vectors of 10 entries, one after the other, shape (10 m,).
-
-    Returns:
-        Symmetric matrices, shape (m, 4, 4).
     """
     columns, rows = np.tril_indices(_SIZE)
     entries = vector.reshape(-1, _ENTRIES) / np.where(rows == columns, 1.0, np.sqrt(2.0))

@@ -82,7 +82,7 @@ def consistency_cone(
     shrink: Array,
     margin: float,
 ) -> Cone:
-    """Return the cone of possible parameters x = pi / scale.
+    """Return the cone of possible parameters x = pi / scale; pinned bodies have no part in it.
 
     Args:
         constraints: Bounds beside physical consistency.
@@ -91,9 +91,6 @@ def consistency_cone(
         held: Known share of each body, shape (10 bodies,).
         shrink: Matrices T^-1/2 that make pseudo-inertias free of units, shape (bodies, 4, 4).
         margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body beside its held share [-].
-
-    Returns:
-        The cone; pinned bodies have no part in it.
     """
     p = len(layout.names)
     signs = np.flatnonzero(layout.is_nonnegative())

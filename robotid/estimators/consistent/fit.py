@@ -152,9 +152,6 @@ class Consistent(BatchEstimator):
             estimate: Base parameters, as a recursive estimator has them at any moment. Those of
                 infinite variance count as unknown.
 
-        Returns:
-            The estimate over the p standard parameters.
-
         Raises:
             DataError: If no base parameter has a finite variance, or C is not positive definite.
             NotConvergedError: If the cone solver does not solve it.
@@ -180,39 +177,30 @@ class Consistent(BatchEstimator):
         )
 
     def noise(self, factors: Factors, sigma: Array | None = None) -> Array:
-        """Return the noise level of each joint, by the fit without the inequalities.
+        """Return the noise levels, shape (n,) [N m or N], by the fit without the inequalities.
 
         Args:
             factors: The factors, of base parameters.
             sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
-
-        Returns:
-            Noise levels, shape (n,) [N m or N]; see ``Programme.noise``.
         """
         start = self._wls(factors).sigma if sigma is None else sigma
         return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
-        """Return the rows [R d] with |R K pi - d|^2 the weighted squares of the residual.
+        """Return rows [R d], shape (b + 1, b + 1), |R K pi - d|^2 the weighted squared residual.
 
         Args:
             factors: The factors, of base parameters.
             sigma: Noise level per joint, shape (n,) [N m or N].
-
-        Returns:
-            Upper triangular factor, shape (b + 1, b + 1), free of units.
         """
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
     def objective(self, rows: Array, pi: Array) -> float:
-        """Return what the fit minimises.
+        """Return what the fit minimises; see ``Programme.objective``.
 
         Args:
             rows: Information, shape (k, b + 1).
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            The weighted squares of the residual plus the weighted penalty [-].
         """
         return self.programme.objective(rows, pi, self.prior_weight)
 
@@ -255,16 +243,13 @@ class Consistent(BatchEstimator):
         return spread
 
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the base parameters that the data do not determine by themselves.
+        """Return the names of the base parameters that the data do not determine by themselves.
 
         See ``determine``; whatever metric and weight the prior has.
 
         Args:
             rows: Information, shape (k, b + 1), as of ``rows``.
             base_names: Names of the base parameters.
-
-        Returns:
-            Their names.
         """
         known = self.layout.owned_by(self.constraints.pinned)
         before = base_spread(self.K, self.prior_std, known)

@@ -111,14 +111,11 @@ class LogCholesky(BatchEstimator):
         return z, value, _STEPS, False
 
     def derivatives(self, rows: Array, z: Array) -> tuple[Array, Array]:
-        """Return gradient and Hessian of the objective with respect to the coordinates.
+        """Return gradient, shape (p,), and Hessian, shape (p, p), of the objective by coordinates.
 
         Args:
             rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
-
-        Returns:
-            Gradient, shape (p,), and Hessian, shape (p, p).
         """
         fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
         pi, J = self._parameters(z)
@@ -182,15 +179,12 @@ class LogCholesky(BatchEstimator):
 
 
 def from_log_cholesky(z: Array) -> Array:
-    """Return the matrices U U^T of log-Cholesky parameters.
+    """Return the matrices U U^T, shape (n, 4, 4), of log-Cholesky parameters.
 
     U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2], [0, 0, exp d3, t3], [0, 0, 0, 1]].
 
     Args:
         z: alpha d1 d2 d3 s12 s23 s13 t1 t2 t3 of each matrix, shape (n, 10).
-
-    Returns:
-        Positive definite matrices, shape (n, 4, 4).
 
     References:
         Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
@@ -201,13 +195,10 @@ def from_log_cholesky(z: Array) -> Array:
 
 
 def to_log_cholesky(J: Array) -> Array:
-    """Return the log-Cholesky parameters of matrices; the inverse of ``from_log_cholesky``.
+    """Return the parameters, shape (n, 10); the inverse of ``from_log_cholesky``.
 
     Args:
         J: Positive definite matrices, shape (n, 4, 4).
-
-    Returns:
-        Parameters, shape (n, 10).
     """
     U = np.linalg.cholesky(J[:, ::-1, ::-1])[:, ::-1, ::-1]  # upper: J = U U^T
     alpha = np.log(U[:, 3, 3])
@@ -218,13 +209,10 @@ def to_log_cholesky(J: Array) -> Array:
 
 
 def log_cholesky_jacobian(z: Array) -> Array:
-    """Return the derivatives of U U^T with respect to the parameters.
+    """Return the derivatives of U U^T by the parameters, shape (n, 10, 4, 4).
 
     Args:
         z: Parameters, shape (n, 10).
-
-    Returns:
-        Derivatives, shape (n, 10, 4, 4).
     """
     half = _slopes(z) @ _factor(z).transpose(0, 2, 1)[:, None]
     slopes: Array = half + half.transpose(0, 1, 3, 2)
@@ -232,14 +220,11 @@ def log_cholesky_jacobian(z: Array) -> Array:
 
 
 def log_cholesky_curvature(z: Array, G: Array) -> Array:
-    """Return the second derivatives of tr(G U U^T) with respect to the parameters.
+    """Return the second derivatives of tr(G U U^T) by the parameters, shape (n, 10, 10).
 
     Args:
         z: Parameters, shape (n, 10).
         G: Symmetric matrices, shape (n, 4, 4).
-
-    Returns:
-        Hessians, shape (n, 10, 10).
     """
     dU, U = _slopes(z), _factor(z)
     H = 2.0 * np.einsum("nkai,nab,nlbi->nkl", dU, G, dU, optimize=True)

@@ -61,35 +61,26 @@ class Penalty(ABC):
 
     @abstractmethod
     def value(self, pi: Array) -> float:
-        """Return the penalty.
+        """Return the penalty, at least 0; infinite where the metric is not defined.
 
         Args:
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            At least 0; infinite where the metric is not defined.
         """
 
     @abstractmethod
     def gradient(self, pi: Array) -> Array:
-        """Return its gradient.
+        """Return its gradient, shape (p,).
 
         Args:
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            Gradient, shape (p,).
         """
 
     @abstractmethod
     def hessian(self, pi: Array) -> Array:
-        """Return its second derivative.
+        """Return its second derivative, shape (p, p), positive definite.
 
         Args:
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            Hessian, shape (p, p), positive definite.
         """
 
 
@@ -197,9 +188,6 @@ def make_penalty(
         prior_std: How far they may plausibly be wrong, shape (p,).
         held: Known share of each body, shape (10 bodies,).
 
-    Returns:
-        The penalty.
-
     References:
         Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
         approach, (24), (32).
@@ -217,13 +205,10 @@ def make_penalty(
 
 
 def pull_back_metric(J: Array) -> Array:
-    """Return the affine-invariant metric in coordinates pi: g_kl = tr(J^-1 B_k J^-1 B_l).
+    """Return the affine-invariant metrics g_kl = tr(J^-1 B_k J^-1 B_l), shape (n, 10, 10).
 
     Args:
         J: Pseudo-inertias, shape (n, 4, 4), positive definite.
-
-    Returns:
-        Metrics, shape (n, 10, 10).
 
     References:
         Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
@@ -235,14 +220,11 @@ def pull_back_metric(J: Array) -> Array:
 
 
 def body_units(spread: Array) -> Array:
-    """Return T^-1/2 per body, which makes its pseudo-inertia free of units.
+    """Return T^-1/2, which makes pseudo-inertias free of units: diagonal, shape (bodies, 4, 4).
 
     Args:
         spread: How far the inertial parameters may lie from their prior, shape (10 bodies,): mass
             m and radius r of a body's size are those of m and m r.
-
-    Returns:
-        Diagonal matrices, shape (bodies, 4, 4).
     """
     by_body = spread.reshape(-1, 10)
     mass, radius = by_body[:, 0], by_body[:, 1] / by_body[:, 0]

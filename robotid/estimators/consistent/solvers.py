@@ -69,9 +69,6 @@ def least_squares(
         is_exact: Whether to solve for the corrections, too. If not, Clarabel solves it to 1e-3 of
             the unit of A x, in half the time; of weighted rows that is a standard deviation.
 
-    Returns:
-        The solution.
-
     Raises:
         MissingDependencyError: If the solver is not installed.
         NotConvergedError: If it does not solve the problem, or finds that no point meets the

@@ -36,9 +36,6 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
 
         Args:
             c: Number of parameters.
-
-        Returns:
-            The state.
         """
 
     @abstractmethod
@@ -48,9 +45,6 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
         Args:
             state: The state before.
             sample: One instant; rows of weight 0 are skipped.
-
-        Returns:
-            The state after.
 
         Raises:
             DataError: If the sample is not finite or of another shape; the state stays valid.
@@ -63,9 +57,6 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
         Args:
             state: The state.
             names: Names of the c parameters.
-
-        Returns:
-            The estimate.
         """
 
 
@@ -80,9 +71,6 @@ class Filter(RecursiveEstimator[StateT]):
 
         Args:
             state: The state.
-
-        Returns:
-            The number.
         """
 
     def fit(self, data: Problem) -> Estimate:
@@ -103,9 +91,6 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
         samples: The samples, in the order of the updates.
         state: The state before.
 
-    Returns:
-        The state after.
-
     Raises:
         DataError: If a sample is not finite or of another shape.
     """
@@ -115,15 +100,12 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
 
 
 def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
-    """Return the rows [Y tau] of a sample in units of their noise, those of weight 0 left out.
+    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j], shape (k, c + 1), but those of weight 0.
 
     Args:
         sample: One instant.
         sigma: Noise level of each joint, shape (n,) [N m or N].
         c: Number of parameters.
-
-    Returns:
-        Rows sqrt(weight_j) / sigma_j [Y_j tau_j], shape (k, c + 1), k <= n.
 
     Raises:
         DataError: If the sample is not finite or of another shape.
@@ -162,14 +144,11 @@ def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
 
 
 def load_state(path: str | Path, kind: type[StateT]) -> StateT:
-    """Read a state back.
+    """Read a state back; updates from it give the same bits as an unbroken run.
 
     Args:
         path: The file.
         kind: Class of the state, as ``RLSState``.
-
-    Returns:
-        The state; updates from it give the same bits as an unbroken run.
 
     Raises:
         DataError: If the file is missing, no NPZ, or holds another kind of state.

@@ -233,16 +233,13 @@ class NormalisedGradient(Descent):
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:
-    """Return the root mean square of each column, rows in units of their noise.
+    """Return the root mean square of columns, shape (c,), positive, rows in units of their noise.
 
     Scaled by it, all columns have the same norm. A column without data keeps 1.
 
     Args:
         problem: The rows.
         sigma: Noise level of each joint, shape (n,) [N m or N].
-
-    Returns:
-        Scaled parameters per parameter, shape (c,), positive.
 
     Raises:
         DataError: If a row is not finite.
