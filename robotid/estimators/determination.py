@@ -132,7 +132,7 @@ class Determination:
         return "; ".join(said + [str(group) for group in self.merged if not group.combinations])
 
     def refusal(self, error: RankDeficientError) -> RankDeficientError:
-        """Return the refusal in words of this criterion; as it was if only rounding leaves them open.
+        """Return the refusal in words of this criterion; as it was if only rounding is open.
 
         Args:
             error: What least squares said, by its own numerical rank.

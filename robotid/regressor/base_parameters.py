@@ -92,8 +92,7 @@ class BaseMapping:
         """
         if pi.shape != (self.K.shape[1],):
             raise DataError(f"pi has shape {pi.shape}, wanted ({self.K.shape[1]},)")
-        beta: Array = self.K @ pi
-        return beta
+        return self.K @ pi
 
     def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
         """Return the standard parameters nearest to a prior that have these base parameters.

@@ -160,8 +160,7 @@ def svec(S: Array) -> Array:
     k = S.shape[-1]
     weight = np.where(np.eye(k, dtype=bool), 1.0, np.sqrt(2.0))
     columns, rows = np.tril_indices(k)  # (j, i) with i <= j
-    values: Array = (S * weight)[..., rows, columns]
-    return values
+    return (S * weight)[..., rows, columns]
 
 
 def unsvec(vector: Array) -> Array:

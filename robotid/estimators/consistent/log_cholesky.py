@@ -190,8 +190,7 @@ def from_log_cholesky(z: Array) -> Array:
         Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
     """
     U = _factor(z)
-    J: Array = U @ U.transpose(0, 2, 1)
-    return J
+    return U @ U.transpose(0, 2, 1)
 
 
 def to_log_cholesky(J: Array) -> Array:
@@ -248,8 +247,7 @@ def _factor(z: Array) -> Array:
     U[:, 3, 3] = 1.0
     for k, (i, j) in enumerate(_UPPER):
         U[:, i, j] = z[:, 4 + k]
-    scaled: Array = np.exp(z[:, 0])[:, None, None] * U
-    return scaled
+    return np.exp(z[:, 0])[:, None, None] * U
 
 
 def _slopes(z: Array) -> Array:
@@ -277,5 +275,4 @@ _TO_PI = np.linalg.inv(svec(pseudo_inertia_basis()))  # svec(J) @ _TO_PI = pi
 
 def _inertial(J: Array) -> Array:
     """Return the inertial parameters of symmetric matrices, shape (..., 10)."""
-    parameters: Array = svec(J) @ _TO_PI
-    return parameters
+    return svec(J) @ _TO_PI

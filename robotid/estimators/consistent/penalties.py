@@ -163,8 +163,7 @@ class _Entropic(Penalty):
         return pseudo_inertia(pi[: len(self.held)] - self.held)
 
     def _drives(self, pi: Array) -> Array:
-        drives: Array = (pi - self.prior)[len(self.held) :]
-        return drives
+        return (pi - self.prior)[len(self.held) :]
 
 
 def make_penalty(
@@ -229,8 +228,7 @@ def body_units(spread: Array) -> Array:
     by_body = spread.reshape(-1, 10)
     mass, radius = by_body[:, 0], by_body[:, 1] / by_body[:, 0]
     diagonal = np.column_stack([1 / radius] * 3 + [np.ones_like(mass)])
-    shrink: Array = np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
-    return shrink
+    return np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
 
 
 def _widened(J: Array, shrink: Array) -> Array:
@@ -239,8 +237,7 @@ def _widened(J: Array, shrink: Array) -> Array:
     floored = (vectors * np.maximum(values, _THINNEST)[:, None]) @ vectors.transpose(0, 2, 1)
     grow = np.linalg.inv(shrink)
     changed = values[:, 0] < _THINNEST
-    widened: Array = np.where(changed[:, None, None], grow @ floored @ grow, J)
-    return widened
+    return np.where(changed[:, None, None], grow @ floored @ grow, J)
 
 
 def _block_diagonal(inertial: Array, precision: Array) -> Array:

@@ -228,8 +228,7 @@ class NormalisedGradient(Descent):
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         gamma = self.step_size / (self.regularisation + np.vdot(Psi, Psi))
-        moved: Array = x - gamma * (e @ Psi)
-        return moved
+        return x - gamma * (e @ Psi)
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:

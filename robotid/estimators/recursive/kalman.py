@@ -177,8 +177,7 @@ class Kalman(Filter[KalmanState]):
         if self.gate is None:
             return np.ones(len(e), dtype=bool)
         bound = NormalDist().inv_cdf((1 + self.gate) / 2) ** 2
-        passes: Array = (e**2 <= bound * (variance + 1)) | (in_a_row >= _PATIENCE)
-        return passes
+        return (e**2 <= bound * (variance + 1)) | (in_a_row >= _PATIENCE)
 
 
 def _count(state: KalmanState, used: Array, kept: Array) -> tuple[Array, Array, Array]:

@@ -113,8 +113,7 @@ class PRX(Descent):
         centre = self.init(len(x)).x
         away = x - centre
         distance = float(np.linalg.norm(away))
-        projected: Array = x if distance <= radius else centre + away * (radius / distance)
-        return projected
+        return x if distance <= radius else centre + away * (radius / distance)
 
 
 def _exact(Psi: Array, e: Array, eta: Array) -> Array:
@@ -122,5 +121,4 @@ def _exact(Psi: Array, e: Array, eta: Array) -> Array:
     direction = eta @ Psi
     square = direction @ direction
     gamma = (e @ eta) / square if square > 0 else 0.0
-    step: Array = gamma * direction
-    return step
+    return gamma * direction
