@@ -76,14 +76,7 @@ class CompiledWriter:
     """Writes one block of rows after the other into the same memory: one thread, one writer."""
 
     def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
-        """Prepare the work space.
-
-        Args:
-            model: The robot; ``why_not`` must return None for it.
-            tree: The robot as arrays.
-            plan: What the rows consist of.
-            out: Block written to, shape (C, k); k a multiple of 64.
-        """
+        """Prepare to write to ``out``, shape (C, k), k a multiple of 64; see ``why_not`` before."""
         lanes = _lanes()
         bodies, depth = tree.rows.shape
         self._model, self._tree, self._out = model, tree, out

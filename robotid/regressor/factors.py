@@ -6,11 +6,12 @@ Factors of two logs merge into the factor of both.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg.lapack
@@ -21,6 +22,9 @@ from robotid.regressor.lapack import Triangle
 from robotid.regressor.problem import Problem, RowSource
 
 __all__ = ["Factors", "available_cores", "compress", "compress_stretches", "gather", "merge"]
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -187,11 +191,7 @@ def compress_stretches(
         for start in range(0, source.samples, length)
     ]
     is_parallel = all(source.is_parallel for source in problem.sources)
-    workers = (available_cores() if is_parallel else 1) if threads is None else threads
-    if min(workers, len(parts)) <= 1:
-        return tuple(_compress(part, 1) for part in parts)
-    with ThreadPoolExecutor(min(workers, len(parts))) as pool:
-        return tuple(pool.map(partial(_compress, threads=1), parts))
+    return tuple(_in_order(partial(_compress, threads=1), parts, is_parallel, threads))
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
@@ -287,10 +287,7 @@ def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem
 
 
 def _fold_sources(
-    triangles: Sequence[Triangle],
-    active: Sequence[Array],
-    problem: Problem,
-    threads: int | None,
+    triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem, threads: int | None
 ) -> None:
     """Fold the rows of each source into the factors, part by part."""
     c = len(problem.names)
@@ -299,20 +296,26 @@ def _fold_sources(
             np.searchsorted(columns, np.append(own, c))
             for columns, own in zip(active, source.columns, strict=True)
         ]
-        for part in _parts(source, threads):
+        starts = range(0, source.samples, _PART)
+        parts = _in_order(partial(_fold_part, source), starts, source.is_parallel, threads)
+        for part in parts:
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
 
 
-def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
-    """Yield the factors of each part of a source in order."""
-    starts = range(0, source.samples, _PART)
-    workers = (available_cores() if source.is_parallel else 1) if threads is None else threads
-    if min(workers, len(starts)) <= 1:
-        yield from (_fold_part(source, start) for start in starts)
+def _in_order(
+    work: Callable[[ItemT], ResultT],
+    items: Sequence[ItemT],
+    is_parallel: bool,
+    threads: int | None,
+) -> Iterator[ResultT]:
+    """Yield what work makes of each item in order, several at a time where that is faster."""
+    workers = (available_cores() if is_parallel else 1) if threads is None else threads
+    if min(workers, len(items)) <= 1:
+        yield from map(work, items)
         return
-    with ThreadPoolExecutor(min(workers, len(starts))) as pool:
-        yield from pool.map(partial(_fold_part, source), starts)
+    with ThreadPoolExecutor(min(workers, len(items))) as pool:
+        yield from pool.map(work, items)
 
 
 def _fold_part(source: RowSource, start: int) -> list[Array]:

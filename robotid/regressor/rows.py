@@ -53,21 +53,17 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
     """
     if compiled and not is_installed():
         raise MissingDependencyError("the compiled regressor", "numba", "fast")
-    engine = _engine(model, samples, compiled)
+    enough = -(-LONG_ENOUGH // work_per_sample(model))
+    engine = "Pinocchio"
+    if compiled is not False and not is_installed():
+        engine += " (robotid[fast] is not installed)"
+    elif compiled is None and samples < enough:
+        engine += f" (fewer than {enough} samples do not pay the start of the compiled path)"
+    elif compiled is not False:
+        reason = why_not(model)
+        engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
     return engine
-
-
-def _engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
-    if compiled is False:
-        return "Pinocchio"
-    if not is_installed():
-        return "Pinocchio (robotid[fast] is not installed)"
-    enough = -(-LONG_ENOUGH // work_per_sample(model))
-    if compiled is None and samples < enough:
-        return f"Pinocchio (fewer than {enough} samples do not pay the start of the compiled path)"
-    reason = why_not(model)
-    return COMPILED if reason is None else f"Pinocchio ({reason})"
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.batch.least_squares import WLS
+from robotid.estimators.batch import WLS
 from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import Subspace
 from robotid.estimators.consistent.constraints import (
@@ -102,7 +102,7 @@ class Consistent(BatchEstimator):
                 raise DataError(f"{name} has shape {getattr(self, name).shape}, wanted {shape}")
         if not (np.isfinite(self.prior_std) & (self.prior_std > 0)).all():
             raise DataError("prior_std must be positive and finite for every parameter")
-        if not np.isfinite(self.prior).all() or not np.isfinite(self._held).all():
+        if not np.isfinite(self.prior).all() or not np.isfinite(self.known_share).all():
             raise DataError("prior and held must be finite for every parameter")
         if not (self.margin > 0 and self.prior_weight > 0):
             raise DataError(
@@ -113,7 +113,7 @@ class Consistent(BatchEstimator):
                 f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
                 f"{self.solver!r}, wanted one of {list(SOLVERS)}"
             )
-        check_constraints(self.constraints, self.layout, self.prior, self._held)
+        check_constraints(self.constraints, self.layout, self.prior, self.known_share)
 
     @property
     def in_cone(self) -> "Consistent":
@@ -221,12 +221,11 @@ class Consistent(BatchEstimator):
     @cached_property
     def programme(self) -> Programme:
         """The convex programme, for any data and weight."""
-        size, scale = self.layout.n_inertial, self.prior_std
+        scale, held = self.prior_std, self.known_share
+        units = body_units(scale[: self.layout.n_inertial])
         E, e = equalities(self.constraints, self.layout, self.prior)
-        cone = consistency_cone(
-            self.constraints, self.layout, scale, self._held, body_units(scale[:size]), self.margin
-        )
-        penalty = make_penalty(self.metric, self.layout, self.prior, scale, self._held)
+        cone = consistency_cone(self.constraints, self.layout, scale, held, units, self.margin)
+        penalty = make_penalty(self.metric, self.layout, self.prior, scale, held)
         space = Subspace.of(E * scale, e)
         return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)
 
@@ -242,6 +241,11 @@ class Consistent(BatchEstimator):
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
+    @property
+    def known_share(self) -> Array:
+        """The share of each body that is held, shape (10 bodies,); 0 for nothing."""
+        return np.zeros(self.layout.n_inertial) if self.held is None else self.held
+
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the base parameters that the data do not determine by themselves.
 
@@ -255,10 +259,6 @@ class Consistent(BatchEstimator):
         before = base_spread(self.K, self.prior_std, known)
         return determine(base_names, rows[:, :-1], before).undetermined
 
-    @property
-    def _held(self) -> Array:
-        return np.zeros(self.layout.n_inertial) if self.held is None else self.held
-
     def _wls(self, factors: Factors) -> Estimate:
         """Return weighted least squares; directions that the data leave open keep the prior."""
         prior = self.K @ self.prior
@@ -267,16 +267,12 @@ class Consistent(BatchEstimator):
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""
         is_bound = self.programme.space.basis.shape[1] < len(pi)
-        chosen = (
-            {}
-            if self.choice is None
-            else {
-                "chosen_by": self.choice.how,
-                "curve": [list(pair) for pair in self.choice.curve],
-            }
-        )
+        prior: dict[str, Any] = {"metric": self.metric, "weight": self.prior_weight}
+        if self.choice is not None:
+            prior["chosen_by"] = self.choice.how
+            prior["curve"] = [list(pair) for pair in self.choice.curve]
         return {
-            "prior": {"metric": self.metric, "weight": self.prior_weight, **chosen},
+            "prior": prior,
             "solver": self.solver,
             "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
             "active": sorted(set(self.active(pi)[1])),

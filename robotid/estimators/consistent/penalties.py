@@ -5,6 +5,7 @@ Each penalty is about |delta / sigma|^2 near the prior, so that one weight means
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -47,17 +48,15 @@ class WeightChoice:
 
 
 class Penalty(ABC):
-    """A convex penalty on the distance from the prior."""
+    """A convex penalty on the distance from the prior.
 
-    @property
-    @abstractmethod
-    def centre(self) -> Array:
-        """Where it is 0, shape (p,)."""
+    Attributes:
+        is_quadratic: Whether its Hessian is the same everywhere.
+        centre: Where it is 0, shape (p,).
+    """
 
-    @property
-    @abstractmethod
-    def is_quadratic(self) -> bool:
-        """Whether its Hessian is the same everywhere."""
+    is_quadratic: ClassVar[bool]
+    centre: Array
 
     @abstractmethod
     def value(self, pi: Array) -> float:
@@ -86,29 +85,22 @@ class Penalty(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Quadratic(Penalty):
-    """(pi - prior)^T M (pi - prior).
+    """(pi - centre)^T M (pi - centre).
 
     Attributes:
-        prior: Prior values, shape (p,).
+        centre: Prior values, shape (p,).
         M: Metric, shape (p, p), positive definite.
     """
 
-    prior: Array
+    is_quadratic = True
+    centre: Array
     M: Array
 
-    @property
-    def centre(self) -> Array:
-        return self.prior
-
-    @property
-    def is_quadratic(self) -> bool:
-        return True
-
     def value(self, pi: Array) -> float:
-        return float((pi - self.prior) @ self.M @ (pi - self.prior))
+        return float((pi - self.centre) @ self.M @ (pi - self.centre))
 
     def gradient(self, pi: Array) -> Array:
-        slope: Array = 2.0 * self.M @ (pi - self.prior)
+        slope: Array = 2.0 * self.M @ (pi - self.centre)
         return slope
 
     def hessian(self, pi: Array) -> Array:
@@ -117,31 +109,24 @@ class Quadratic(Penalty):
 
 @dataclass(frozen=True, eq=False)
 class _Entropic(Penalty):
-    """2 sum_i d(J_i || P_i) of the bodies, and |(pi - prior) / std|^2 of the drives.
+    """2 sum_i d(J_i || P_i) of the bodies, and |(pi - centre) / std|^2 of the drives.
 
     d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det, half the
     Kullback-Leibler distance of two mass distributions seen as Gaussians, times 4.
 
     Attributes:
-        prior: Prior values, shape (p,).
+        centre: Prior values, shape (p,).
         precision: 1 / std^2 of the drives, shape (drives,).
         held: Known share of each body, shape (10 bodies,).
     """
 
-    prior: Array
+    is_quadratic = False
+    centre: Array
     precision: Array
     held: Array
 
-    @property
-    def centre(self) -> Array:
-        return self.prior
-
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
     def value(self, pi: Array) -> float:
-        J, P = self._rest(pi), self._rest(self.prior)
+        J, P = self._rest(pi), self._rest(self.centre)
         if np.linalg.eigvalsh(J)[:, 0].min() <= 0:
             return float("inf")
         ratio = np.linalg.solve(P, J)
@@ -150,7 +135,7 @@ class _Entropic(Penalty):
         return float(2.0 * divergence.sum() + self.precision @ self._drives(pi) ** 2)
 
     def gradient(self, pi: Array) -> Array:
-        J, P = self._rest(pi), self._rest(self.prior)
+        J, P = self._rest(pi), self._rest(self.centre)
         slope = np.linalg.inv(P) - np.linalg.inv(J)
         inertial = 2.0 * np.einsum("nij,kij->nk", slope, pseudo_inertia_basis()).reshape(-1)
         return np.concatenate([inertial, 2.0 * self.precision * self._drives(pi)])
@@ -163,7 +148,7 @@ class _Entropic(Penalty):
         return pseudo_inertia(pi[: len(self.held)] - self.held)
 
     def _drives(self, pi: Array) -> Array:
-        return (pi - self.prior)[len(self.held) :]
+        return (pi - self.centre)[len(self.held) :]
 
 
 def make_penalty(
@@ -210,8 +195,7 @@ def pull_back_metric(J: Array) -> Array:
         J: Pseudo-inertias, shape (n, 4, 4), positive definite.
 
     References:
-        Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
-        approach, (22).
+        Lee, Wensing, Park (2019), as of ``make_penalty``, (22).
     """
     slopes = np.linalg.solve(J[:, None], pseudo_inertia_basis()[None])  # (n, 10, 4, 4)
     metric: Array = np.einsum("nkij,nlji->nkl", slopes, slopes)

@@ -66,17 +66,13 @@ class Filter(RecursiveEstimator[StateT]):
     prior: Array | None
 
     @abstractmethod
-    def rows_of(self, state: StateT) -> int:
-        """Return the number of rows that a state rests on.
-
-        Args:
-            state: The state.
-        """
+    def _rows_of(self, state: StateT) -> int:
+        """Return the number of rows that a state rests on."""
 
     def fit(self, data: Problem) -> Estimate:
         c = len(data.names)
         state = fold(self, data.samples(), self.init(c))
-        require_rows(self.rows_of(state), c, data.n_joints)
+        require_rows(self._rows_of(state), c, data.n_joints)
         estimate = self.estimate(state, data.names)
         if estimate.rank < c and self.prior is None:
             raise RankDeficientError(estimate.rank, estimate.undetermined, c)

@@ -155,7 +155,7 @@ class Kalman(Filter[KalmanState]):
             f"gate, {int(state.rows.sum())} taken",
         )
 
-    def rows_of(self, state: KalmanState) -> int:
+    def _rows_of(self, state: KalmanState) -> int:
         return int(state.rows.sum())
 
     def _prior_spread(self) -> Array:

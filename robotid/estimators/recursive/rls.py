@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg.lapack import dtpqrt
 
 from robotid._typing import Array
-from robotid.estimators.batch.least_squares import solve_factor
+from robotid.estimators.batch import solve_factor
 from robotid.estimators.estimator import Estimate, Weighing
 from robotid.estimators.recursive.base import Filter, scaled_rows
 from robotid.exceptions import DataError
@@ -115,23 +115,13 @@ class RLS(Filter[RLSState]):
         freedom = max(state.rows - solution.rank, 1.0)
         scale = max(abs(float(state.R[c, c])) / np.sqrt(freedom), _TINY)
         covariance = scale**2 / self.independent_share * solution.covariance
-        is_open = np.isin(names, solution.undetermined)
-        covariance[is_open, is_open] = np.inf
-        return Estimate(
-            theta=solution.theta,
-            covariance=covariance,
-            names=names,
-            sigma=scale * self.sigma,
-            rank=solution.rank,
-            condition=solution.condition,
-            undetermined=solution.undetermined,
-            converged=True,
-            n_iter=state.steps,
-            message=f"{state.steps} samples folded in, forgetting {self.forgetting:g}; noise "
-            f"levels {scale:.3g} times those given",
+        message = (
+            f"{state.steps} samples folded in, forgetting {self.forgetting:g}; noise "
+            f"levels {scale:.3g} times those given"
         )
+        return solution.estimate(names, covariance, scale * self.sigma, state.steps, message)
 
-    def rows_of(self, state: RLSState) -> int:
+    def _rows_of(self, state: RLSState) -> int:
         # those that are forgotten have been seen all the same
         return int(state.rows) if self.forgetting == 1 else state.steps * len(self.sigma)
 
