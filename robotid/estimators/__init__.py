@@ -7,8 +7,7 @@ from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.estimator import BatchEstimator, Estimate, Estimator
 from robotid.estimators.recursive.base import RecursiveEstimator, fold, load_state, save_state
 from robotid.estimators.recursive.descent import PRX, DescentState, NormalisedGradient
-from robotid.estimators.recursive.kalman import Kalman, KalmanState
-from robotid.estimators.recursive.rls import RLS, RLSState
+from robotid.estimators.recursive.filters import RLS, Kalman, KalmanState, RLSState
 
 __all__ = [
     "OLS",

@@ -134,14 +134,9 @@ class CompiledWriter:
 
 @dataclass(frozen=True)
 class Tree:
-    """A robot as arrays over its bodies, the world first; see ``inertial_rows``.
+    """A robot as arrays over its bodies, the world first, as ``inertial_rows`` takes them.
 
     Attributes:
-        parents: Body that carries each body, shape (B,), int.
-        depths: Number of rows that each body loads, shape (B,), int.
-        slots: Which of a body's rows its own joint belongs to, shape (B,), int; -1: floating base.
-        leaders: Coordinate that moves each joint, shape (B,), int.
-        joints: Constants of each joint, shape (B, 41).
         rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 beyond.
     """
 

@@ -127,14 +127,10 @@ class InstantRegressor:
         """
         model, layout, Y = self._model, self._model.layout, self._Y
         x = q if self._is_plain else model.configurations(q[None])[0]
-        if self._map is None:
-            inertial = pin.computeJointTorqueRegressor(model.pin_model, self._data, x, v, a)
-        else:
-            G = self._map
-            inertial = G.T @ pin.computeJointTorqueRegressor(
-                model.pin_model, self._data, x, G @ v, G @ a
-            )
-        Y[:, : layout.n_inertial] = inertial
+        regressor, G = pin.computeJointTorqueRegressor, self._map
+        w, dw = (v, a) if G is None else (G @ v, G @ a)
+        inertial = regressor(model.pin_model, self._data, x, w, dw)
+        Y[:, : layout.n_inertial] = inertial if G is None else G.T @ inertial
         rows, motion = np.arange(len(v)), DriveMotion(v, a, np.sign(v))
         for term, place in self._terms:
             Y[rows, place] = term.column(motion)

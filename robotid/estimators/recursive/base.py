@@ -12,11 +12,11 @@ import numpy as np
 
 from robotid._files import written_whole
 from robotid._typing import Array
-from robotid.estimators.estimator import Estimate, Estimator, require_rows
-from robotid.exceptions import DataError, RankDeficientError
-from robotid.regressor.problem import Problem, Sample
+from robotid.estimators.estimator import Estimate, Estimator
+from robotid.exceptions import DataError
+from robotid.regressor.problem import Sample
 
-__all__ = ["Filter", "RecursiveEstimator", "fold", "load_state", "save_state", "scaled_rows"]
+__all__ = ["RecursiveEstimator", "fold", "load_state", "save_state", "scaled_rows"]
 
 StateT = TypeVar("StateT")
 
@@ -58,25 +58,6 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
             state: The state.
             names: Names of the c parameters.
         """
-
-
-class Filter(RecursiveEstimator[StateT]):
-    """A recursive estimator that visits the samples once, in the order of time."""
-
-    prior: Array | None
-
-    @abstractmethod
-    def _rows_of(self, state: StateT) -> int:
-        """Return the number of rows that a state rests on."""
-
-    def fit(self, data: Problem) -> Estimate:
-        c = len(data.names)
-        state = fold(self, data.samples(), self.init(c))
-        require_rows(self._rows_of(state), c, data.n_joints)
-        estimate = self.estimate(state, data.names)
-        if estimate.rank < c and self.prior is None:
-            raise RankDeficientError(estimate.rank, estimate.undetermined, c)
-        return estimate
 
 
 def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state: StateT) -> StateT:
