@@ -20,15 +20,7 @@ from robotid.regressor.columns import RowPlan, drive_values
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = [
-    "LONG_ENOUGH",
-    "CompiledWriter",
-    "Tree",
-    "flatten",
-    "is_installed",
-    "why_not",
-    "work_per_sample",
-]
+__all__ = ["LONG_ENOUGH", "Tree", "flatten", "is_installed", "why_not", "work_per_sample"]
 
 #: Work, samples times ``work_per_sample``, from which the compiled path pays its start of about
 #: half a second in every process (importing Numba, reading the compiled code). For seven joints in
@@ -94,16 +86,7 @@ class CompiledWriter:
     def load(
         self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks.
-
-        Args:
-            q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-            v: Velocities, shape (N, n_rows) [rad/s, m/s].
-            a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-            tau: Torques, shape (N, n_rows) [N m, N].
-            direction: Directions that friction follows, shape (N, c).
-            weights: Weights, shape (N, n_rows); None: all 1.
-        """
+        """Take the samples of the next blocks, as of ``TrajectoryRows``; weights None: all 1."""
         self._base = np.zeros((12, 0))
         if self._model.free_flyer:
             self._base = _base_state(self._model, q, v, a)
@@ -115,12 +98,7 @@ class CompiledWriter:
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:
-        """Write the rows of samples start to stop of those loaded.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one, at most k later.
-        """
+        """Write the rows of samples start to stop of those loaded, at most k."""
         lanes, tree, motion = _lanes(), self._tree, (self._q, self._v, self._a)
         lanes.inertial_rows(
             tree.parents, tree.depths, tree.slots, tree.leaders, tree.joints, self._places,

@@ -416,10 +416,7 @@ def _fold_sources(
 
 
 def _in_order(
-    work: Callable[[ItemT], ResultT],
-    items: Sequence[ItemT],
-    is_parallel: bool,
-    threads: int | None,
+    work: Callable[[ItemT], ResultT], items: Sequence[ItemT], is_parallel: bool, threads: int | None
 ) -> Iterator[ResultT]:
     """Yield what work makes of each item in order, several at a time where that is faster."""
     workers = (available_cores() if is_parallel else 1) if threads is None else threads

@@ -114,7 +114,12 @@ class TrajectoryRows(RowSource):
         plan = self._plan
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))
-        writer, motion = self._writer(out), self.trajectory
+        motion = self.trajectory
+        writer = (
+            CompiledWriter(self.model, self._tree, plan, out)
+            if self.engine == COMPILED
+            else _PinocchioWriter(self.model, plan, out)
+        )
         for first in range(start, stop, _LOADED * length):
             last = min(first + _LOADED * length, stop)
             part = slice(first, last)
@@ -140,11 +145,6 @@ class TrajectoryRows(RowSource):
     @cached_property
     def _is_weighted(self) -> bool:
         return bool((self.weights != 1.0).any())
-
-    def _writer(self, out: Array) -> "CompiledWriter | _PinocchioWriter":
-        if self.engine == COMPILED:
-            return CompiledWriter(self.model, self._tree, self._plan, out)
-        return _PinocchioWriter(self.model, self._plan, out)
 
 
 def trajectory_rows(
@@ -198,12 +198,12 @@ class _PinocchioWriter:
     def load(
         self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks; see ``CompiledWriter.load``."""
+        """Take the samples of the next blocks."""
         self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
         self._direction = direction
 
     def write(self, start: int, stop: int) -> None:
-        """Write the rows of samples start to stop; see ``CompiledWriter.write``."""
+        """Write the rows of samples start to stop of those loaded."""
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
         out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]

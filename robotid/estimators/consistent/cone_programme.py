@@ -6,9 +6,8 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.consistent.cones import Cone, Subspace
+from robotid.estimators.consistent.cones import Cone, ConeSolution, Subspace, least_squares, nearest
 from robotid.estimators.consistent.penalties import Penalty
-from robotid.estimators.consistent.solvers import ConeSolution, least_squares, nearest
 from robotid.exceptions import NotConvergedError
 from robotid.regressor.factors import Factors
 
@@ -133,9 +132,7 @@ class Programme:
         noise = rng.standard_normal((draws, len(R))) * np.sqrt(np.maximum(size, 0.0)) @ axes.T
         lowest = triangle[:, -1] - R @ at
         y, failures = nearest(
-            lowest + noise,
-            cone.restrict(Subspace(at, inverse)),
-            max_iterations=self.max_iterations,
+            lowest + noise, cone.restrict(Subspace(at, inverse)), max_iterations=self.max_iterations
         )
         return self.scale * (y @ prior.T), failures
 

@@ -14,13 +14,8 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.estimators.batch import WLS
 from robotid.estimators.consistent.cone_programme import Programme
-from robotid.estimators.consistent.cones import Subspace
-from robotid.estimators.consistent.constraints import (
-    Constraints,
-    check_constraints,
-    consistency_cone,
-    equalities,
-)
+from robotid.estimators.consistent.cones import SOLVERS, Subspace
+from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.penalties import (
     METRICS,
     Penalty,
@@ -28,7 +23,6 @@ from robotid.estimators.consistent.penalties import (
     body_units,
     make_penalty,
 )
-from robotid.estimators.consistent.solvers import SOLVERS
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError
@@ -113,7 +107,7 @@ class Consistent(BatchEstimator):
                 f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
                 f"{self.solver!r}, wanted one of {list(SOLVERS)}"
             )
-        check_constraints(self.constraints, self.layout, self.prior, self.known_share)
+        self.constraints.check(self.layout, self.prior, self.known_share)
 
     @property
     def in_cone(self) -> "Consistent":
@@ -223,8 +217,8 @@ class Consistent(BatchEstimator):
         """The convex programme, for any data and weight."""
         scale, held = self.prior_std, self.known_share
         units = body_units(scale[: self.layout.n_inertial])
-        E, e = equalities(self.constraints, self.layout, self.prior)
-        cone = consistency_cone(self.constraints, self.layout, scale, held, units, self.margin)
+        E, e = self.constraints.equalities(self.layout, self.prior)
+        cone = self.constraints.cone(self.layout, scale, held, units, self.margin)
         penalty = make_penalty(self.metric, self.layout, self.prior, scale, held)
         space = Subspace.of(E * scale, e)
         return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)

@@ -88,9 +88,7 @@ class Descent(RecursiveEstimator[DescentState]):
     eps2: float = 1e-12
 
     def __post_init__(self) -> None:
-        for name in ("passes", "eps1", "eps2"):
-            if not getattr(self, name) > 0:
-                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
+        self._require_positive("passes", "eps1", "eps2")
         self._check()
 
     @property
@@ -177,6 +175,11 @@ class Descent(RecursiveEstimator[DescentState]):
                 break
         return replace(estimator.estimate(state, data.names), converged=settled)
 
+    def _require_positive(self, *names: str) -> None:
+        for name in names:
+            if not getattr(self, name) > 0:
+                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
+
     @property
     def _unit(self) -> Array | float:
         return 1.0 if self.scale is None else self.scale
@@ -225,8 +228,7 @@ class NormalisedGradient(Descent):
     def _check(self) -> None:
         if not 0 < self.step_size < 2:
             raise DataError(f"step_size is {self.step_size}, wanted above 0 and below 2")
-        if not self.regularisation > 0:
-            raise DataError(f"regularisation is {self.regularisation}, wanted a positive number")
+        self._require_positive("regularisation")
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         gamma = self.step_size / (self.regularisation + np.vdot(Psi, Psi))
@@ -280,8 +282,8 @@ class PRX(Descent):
             raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
         if self.metric not in ("noise", "mass", "rows"):
             raise DataError(f"metric is {self.metric!r}, wanted 'noise', 'mass' or 'rows'")
-        if self.bounds is not None and not self.bounds > 0:
-            raise DataError(f"bounds is {self.bounds}, wanted a positive number")
+        if self.bounds is not None:
+            self._require_positive("bounds")
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         if self.needs_mass:
