@@ -51,7 +51,7 @@ class OLS(BatchEstimator):
 
     def _fit(self, factors: Factors) -> Estimate:
         solution = solve_factor(factors, np.ones(len(factors.rows)), self.prior)
-        sigma = _noise(factors, solution.theta, _effective_parameters(factors, solution, None))
+        sigma = _noise(factors, solution.theta, factors.leverages(solution.covariance))
         bread, meat = solution.covariance, factors.information(sigma**2)  # bread: (W^T W)^+
         covariance = bread @ meat @ bread / self.independent_share
         return solution.estimate(factors.names, covariance, sigma, 1, "solved by QR")
@@ -80,7 +80,7 @@ class WLS(BatchEstimator):
         sigma = OLS(prior=self.prior).fit(factors).sigma
         for iteration in range(1, _MAX_ITERATIONS + 1):
             solution = solve_factor(factors, sigma, self.prior)
-            spent = _effective_parameters(factors, solution, sigma)
+            spent = factors.leverages(solution.covariance) / sigma**2
             updated = _noise(factors, solution.theta, spent)
             change = np.max(np.abs(updated - sigma) / sigma)
             sigma = updated
@@ -246,14 +246,11 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     return Solution(start + step / scale, basis @ basis.T, rank, condition, undetermined)
 
 
-def _effective_parameters(factors: Factors, solution: Solution, sigma: Array | None) -> Array:
-    """Return how many parameters the rows of each joint determine: the trace of their leverage."""
-    leverages = factors.leverages(solution.covariance)
-    return leverages if sigma is None else leverages / sigma**2
-
-
 def _noise(factors: Factors, theta: Array, spent: Array) -> Array:
-    """Return the standard deviation of each joint's residual, never quite zero."""
+    """Return the standard deviation of each joint's residual, never quite zero.
+
+    As many of its rows are spent as parameters that they determine: the trace of their leverage.
+    """
     freedom = np.maximum(factors.rows - spent, 1.0)
     sigma = np.sqrt(factors.residual_squares(theta) / freedom)
     torque = np.sqrt(factors.torque_squares() / np.maximum(factors.rows, 1))

@@ -139,8 +139,7 @@ class Determination:
         """
         if not self.groups:
             return error
-        names = self.undetermined
-        return RankDeficientError(self.rank, names, len(self.names), self.in_words())
+        return RankDeficientError(self.rank, self.undetermined, len(self.names), self.in_words())
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return the groups as plain values, as result.json has them.

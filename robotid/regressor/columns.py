@@ -40,16 +40,15 @@ class RowPlan:
 
 
 def drive_values(layout: ParameterLayout, v: Array, a: Array, direction: Array) -> Array:
-    """Return what each drive parameter multiplies: a function of the speed w of its drive.
+    """Return what each drive parameter multiplies, shape (k, N), by the speed w of its drive.
+
+    Row j of the regressor holds them times ``layout.drive_loads[j]``.
 
     Args:
         layout: The standard parameters.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         direction: As of ``friction_directions``, shape (N, c).
-
-    Returns:
-        Values, shape (k, N); row j of the regressor holds them times ``layout.drive_loads[j]``.
     """
     R = layout.drive_ratios
     first = v.shape[1] - R.shape[1]

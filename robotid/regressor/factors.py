@@ -331,17 +331,14 @@ def join(reductions: Sequence[Reduction]) -> Reduction:
 
 
 def join_stretches(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
-    """Return the reductions of at most so many stretches of neighbouring pieces.
+    """Return the reductions of at most so many stretches of neighbouring pieces, in order.
 
-    They are joined as they come, so that no more are in memory.
+    They are joined as they come, so that no more are in memory; the last one may be shorter.
 
     Args:
         reductions: One per piece, in order.
         count: Number of pieces, at least 1.
         most: Largest number of stretches, at least 1.
-
-    Returns:
-        One per stretch, in order; the last stretch may be shorter.
 
     Raises:
         DataError: If their columns or joints differ.

@@ -219,7 +219,9 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
     if model.free_flyer:
         linear = np.array([model.length] * 3 + [1.0] * 3)
-        pose = np.column_stack([np.zeros((samples, 3)), _random_quaternions(samples, rng)])
+        quaternions = rng.standard_normal((samples, 4))
+        quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+        pose = np.column_stack([np.zeros((samples, 3)), quaternions])
         q = np.hstack([pose, q])
         v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
         a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
@@ -247,9 +249,3 @@ def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array)
     for Y, q_k, v_k, a_k in instants:
         Y_k = regressor(pin_model, data, q_k, v_k, a_k)
         Y[:] = Y_k if is_plain else G.T @ Y_k  # tau = G^T tau_pinocchio
-
-
-def _random_quaternions(samples: int, rng: np.random.Generator) -> Array:
-    quaternions = rng.standard_normal((samples, 4))
-    unit: Array = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return unit

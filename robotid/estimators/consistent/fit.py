@@ -1,8 +1,4 @@
-"""Physically consistent fit: a convex cone programme on the factors.
-
-Every body gets a positive definite pseudo-inertia, every drive armature and friction of the right
-sign; where the data say nothing the parameters stay near their prior.
-"""
+"""Physically consistent fit: a convex cone programme on the factors."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -36,7 +32,7 @@ _ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
 
 @dataclass(frozen=True, eq=False)
 class Consistent(BatchEstimator):
-    """Physically consistent estimate of the standard parameters.
+    """Physically consistent standard parameters, near their prior where the data say nothing.
 
     Minimises, over the standard parameters pi,
 

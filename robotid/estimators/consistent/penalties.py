@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+import scipy.linalg
 
 from robotid._typing import Array
 from robotid.robot.parameters import (
@@ -142,7 +143,8 @@ class _Entropic(Penalty):
 
     def hessian(self, pi: Array) -> Array:
         inertial = pull_back_metric(self._rest(pi))
-        return 2.0 * _block_diagonal(inertial, self.precision)
+        H: Array = 2.0 * scipy.linalg.block_diag(*inertial, np.diag(self.precision))
+        return H
 
     def _rest(self, pi: Array) -> Array:
         return pseudo_inertia(pi[: len(self.held)] - self.held)
@@ -185,7 +187,8 @@ def make_penalty(
     precision = prior_std[size:] ** -2.0
     if metric == "entropic":
         return _Entropic(repaired, precision, held)
-    return Quadratic(repaired, _block_diagonal(pull_back_metric(P), precision))
+    M = scipy.linalg.block_diag(*pull_back_metric(P), np.diag(precision))
+    return Quadratic(repaired, M)
 
 
 def pull_back_metric(J: Array) -> Array:
@@ -222,11 +225,3 @@ def _widened(J: Array, shrink: Array) -> Array:
     grow = np.linalg.inv(shrink)
     changed = values[:, 0] < _THINNEST
     return np.where(changed[:, None, None], grow @ floored @ grow, J)
-
-
-def _block_diagonal(inertial: Array, precision: Array) -> Array:
-    size = 10 * len(inertial)
-    M = np.diag(np.concatenate([np.zeros(size), precision]))
-    for i, block in enumerate(inertial):
-        M[10 * i : 10 * i + 10, 10 * i : 10 * i + 10] = block
-    return M
