@@ -25,7 +25,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import survey_logs
 from robotid.identification.recordings import Recordings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.reduction import join
+from robotid.regressor.factors import join
 from robotid.robot.examples import example_urdf
 from robotid.workers.plan import WorkPlan
 

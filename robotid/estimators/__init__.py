@@ -1,16 +1,13 @@
 """Estimators: Problem or Factors -> Estimate. No physics engine below this folder."""
 
-from robotid.estimators.batch.least_squares import OLS, WLS
-from robotid.estimators.batch.total_least_squares import TLS
+from robotid.estimators.batch import OLS, TLS, WLS
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.log_cholesky import LogCholesky
 from robotid.estimators.estimator import BatchEstimator, Estimate, Estimator
 from robotid.estimators.recursive.base import RecursiveEstimator, fold, load_state, save_state
-from robotid.estimators.recursive.descent import DescentState, NormalisedGradient
-from robotid.estimators.recursive.kalman import Kalman, KalmanState
-from robotid.estimators.recursive.prx import PRX
-from robotid.estimators.recursive.rls import RLS, RLSState
+from robotid.estimators.recursive.descent import PRX, DescentState, NormalisedGradient
+from robotid.estimators.recursive.filters import RLS, Kalman, KalmanState, RLSState
 
 __all__ = [
     "OLS",

@@ -132,18 +132,14 @@ class Determination:
         return "; ".join(said + [str(group) for group in self.merged if not group.combinations])
 
     def refusal(self, error: RankDeficientError) -> RankDeficientError:
-        """Return the refusal of data that leave directions open, in words of this criterion.
+        """Return the refusal in words of this criterion; as it was if only rounding is open.
 
         Args:
             error: What least squares said, by its own numerical rank.
-
-        Returns:
-            The refusal; as it was if only rounding leaves them open.
         """
         if not self.groups:
             return error
-        names = self.undetermined
-        return RankDeficientError(self.rank, names, len(self.names), self.in_words())
+        return RankDeficientError(self.rank, self.undetermined, len(self.names), self.in_words())
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return the groups as plain values, as result.json has them.
@@ -165,15 +161,12 @@ class Determination:
 
 
 def base_spread(K: Array, spread: Array, known: Sequence[bool] | Array = ()) -> Array:
-    """Return how far each base parameter may plausibly lie from its prior value.
+    """Return how far each base parameter may plausibly lie from its prior, shape (b,); 0 if known.
 
     Args:
         K: Map to the base parameters, shape (b, p).
         spread: Spread of each standard parameter, shape (p,), SI units.
         known: Whether each standard parameter is known, shape (p,); none if empty.
-
-    Returns:
-        Spreads, shape (b,), SI units; 0 where all terms are known.
     """
     free = spread * ~np.asarray(known, dtype=bool) if len(known) else spread
     size: Array = np.linalg.norm(K * free, axis=1)
@@ -193,9 +186,6 @@ def determine(names: Sequence[str], rows: Array, spread: Array) -> Determination
         rows: Information A, with A^T A the inverse of the covariance of the base parameters by
             the data alone at their noise level, shape (k, b), in inverse SI units.
         spread: Plausible spread of each before the data, shape (b,), SI units; 0 if known.
-
-    Returns:
-        The determination.
     """
     free = np.flatnonzero(spread > 0)
     weak, shrinkage = np.zeros((len(spread), 0)), np.zeros(len(spread))

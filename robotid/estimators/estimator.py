@@ -127,9 +127,6 @@ class Estimator(ABC):
         Args:
             data: A problem in base parameters; of a batch estimator also its factors.
 
-        Returns:
-            The estimate.
-
         Raises:
             DataError: If there are fewer rows than parameters, or a row cannot be used.
             RankDeficientError: If the data leave parameters open and there is no prior.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators.batch.least_squares import solve_factor
+from robotid.estimators.batch import solve_factor
 from robotid.identification.pipeline import Identification
 
 __all__ = ["Information", "information"]

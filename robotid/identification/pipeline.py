@@ -39,8 +39,7 @@ from robotid.identification.verdict import Doubt, Verdict, judge
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
-from robotid.regressor.factors import Factors
-from robotid.regressor.reduction import join
+from robotid.regressor.factors import Factors, join
 from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel

@@ -9,9 +9,8 @@ from robotid.identification.evaluation import Evaluation, evaluate_logs
 from robotid.identification.rows import base_problem, independent_share
 from robotid.identification.survey import ReducedPiece, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.factors import compress_stretches
+from robotid.regressor.factors import Reduction, compress_stretches, join_stretches
 from robotid.regressor.problem import Block, Problem, concatenate
-from robotid.regressor.reduction import Reduction, join_stretches
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan

@@ -12,8 +12,8 @@ from robotid.estimators import WLS
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.recordings import Recordings
+from robotid.regressor.factors import Reduction, join
 from robotid.regressor.prediction import predict
-from robotid.regressor.reduction import Reduction, join
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 

@@ -14,7 +14,7 @@ import scipy.special
 
 from robotid._typing import Array
 from robotid.estimators import Consistent, Estimate
-from robotid.estimators.batch.least_squares import solve_factor
+from robotid.estimators.batch import solve_factor
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors
 

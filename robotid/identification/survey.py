@@ -28,7 +28,7 @@ from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
 from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.reduction import Reduction
+from robotid.regressor.factors import Reduction
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.robot.model import RobotModel
 from robotid.workers.pieces import Piece

@@ -82,21 +82,17 @@ class BaseMapping:
         return kinds
 
     def to_base(self, pi: Array) -> Array:
-        """Return the base parameters beta = K pi.
+        """Return the base parameters beta = K pi, shape (b,).
 
         Args:
             pi: Standard parameters, shape (p,), SI units, in ``names`` order.
-
-        Returns:
-            Base parameters, shape (b,).
 
         Raises:
             DataError: If pi does not have p entries.
         """
         if pi.shape != (self.K.shape[1],):
             raise DataError(f"pi has shape {pi.shape}, wanted ({self.K.shape[1]},)")
-        beta: Array = self.K @ pi
-        return beta
+        return self.K @ pi
 
     def to_standard(self, beta: Array, prior: Array, spread: Array | None = None) -> Array:
         """Return the standard parameters nearest to a prior that have these base parameters.
@@ -122,13 +118,10 @@ class BaseMapping:
         return pi
 
     def gain(self, spread: Array | None = None) -> Array:
-        """Return G = S^2 K^T (K S^2 K^T)^-1, how a change of beta spreads over pi.
+        """Return G = S^2 K^T (K S^2 K^T)^-1, shape (p, b): how a change of beta spreads over pi.
 
         Args:
             spread: How far each standard parameter may lie from its prior, shape (p,); 1 if None.
-
-        Returns:
-            Gain, shape (p, b), with K G = 1.
         """
         s = np.ones(self.K.shape[1]) if spread is None else spread
         # K S = (Q R)^T, so that S (K S)^+ = S Q R^-T keeps all digits
@@ -137,13 +130,10 @@ class BaseMapping:
         return gain
 
     def reduce(self, problem: Problem) -> Problem:
-        """Return the problem in base parameters, W_b beta = tau.
+        """Return the problem in the b base parameters, W_b beta = tau.
 
         Args:
             problem: A problem over the standard parameters.
-
-        Returns:
-            The same rows with the b columns kept.
 
         Raises:
             DataError: If the columns of the problem are not those of this mapping.
@@ -178,9 +168,6 @@ def base_mapping(
             shape (p,); 1 if None. It changes which groups are formed, not how many. See
             ``ParameterLayout.preference``.
         rtol: Pivots below this share of the largest count as 0.
-
-    Returns:
-        The mapping.
 
     Raises:
         DataError: If a shape does not fit, W is not finite or all zero.
@@ -231,14 +218,11 @@ def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
 
 
 def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
-    """Return the base parameters that any motion of a robot can show.
+    """Return the base parameters that any motion of a robot can show, always the same for it.
 
     Args:
         model: The robot.
         inertial_only: Whether to leave the drive terms out.
-
-    Returns:
-        The mapping; always the same for the same robot.
     """
     columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
     samples = 2 * columns // model.n_rows + 20

@@ -40,16 +40,15 @@ class RowPlan:
 
 
 def drive_values(layout: ParameterLayout, v: Array, a: Array, direction: Array) -> Array:
-    """Return what each drive parameter multiplies: a function of the speed w of its drive.
+    """Return what each drive parameter multiplies, shape (k, N), by the speed w of its drive.
+
+    Row j of the regressor holds them times ``layout.drive_loads[j]``.
 
     Args:
         layout: The standard parameters.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         direction: As of ``friction_directions``, shape (N, c).
-
-    Returns:
-        Values, shape (k, N); row j of the regressor holds them times ``layout.drive_loads[j]``.
     """
     R = layout.drive_ratios
     first = v.shape[1] - R.shape[1]
@@ -76,15 +75,12 @@ def friction_speeds(layout: ParameterLayout) -> Array:
 
 
 def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
-    """Return which rows are sure: those where no drive with friction is too slow to tell its sign.
+    """Return where no drive with friction is too slow to tell its sign, shape (N, n_rows), bool.
 
     Args:
         layout: The standard parameters.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
         least: Speed from which the sign is sure [rad/s or m/s].
-
-    Returns:
-        Flags, shape (N, n_rows), bool.
     """
     ratios = friction_speeds(layout)
     first = v.shape[1] - ratios.shape[1]
@@ -95,15 +91,12 @@ def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
 
 
 def friction_directions(layout: ParameterLayout, v: Array, direction: Array | None) -> Array:
-    """Return the directions that friction follows: those given, or else the signs of the speeds.
+    """Return the directions that friction follows, shape (N, c): those given, or the speeds' signs.
 
     Args:
         layout: The standard parameters.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
         direction: Filtered signs of the speeds, shape (N, c), or None.
-
-    Returns:
-        Directions, shape (N, c) [-].
 
     Raises:
         DataError: If the shape of those given is another one.
@@ -122,14 +115,11 @@ def friction_directions(layout: ParameterLayout, v: Array, direction: Array | No
 
 
 def plan_rows(layout: ParameterLayout, columns: Sequence[Array]) -> RowPlan:
-    """Return the plan of a block of rows.
+    """Return the plan of a block of rows: each row's columns in that order, then its torque.
 
     Args:
         layout: The standard parameters.
         columns: Which of the p standard parameters each row has, n arrays.
-
-    Returns:
-        The plan: each row's columns in that order, then its torque.
     """
     loads, size = layout.drive_loads, layout.n_inertial
     base = len(columns) - len(loads)  # rows of a floating base, which no drive loads

@@ -20,15 +20,7 @@ from robotid.regressor.columns import RowPlan, drive_values
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = [
-    "LONG_ENOUGH",
-    "CompiledWriter",
-    "Tree",
-    "flatten",
-    "is_installed",
-    "why_not",
-    "work_per_sample",
-]
+__all__ = ["LONG_ENOUGH", "Tree", "flatten", "is_installed", "why_not", "work_per_sample"]
 
 #: Work, samples times ``work_per_sample``, from which the compiled path pays its start of about
 #: half a second in every process (importing Numba, reading the compiled code). For seven joints in
@@ -54,13 +46,10 @@ def work_per_sample(model: "RobotModel") -> int:
 
 
 def why_not(model: "RobotModel") -> str | None:
-    """Return why the compiled path cannot take a robot, or None if it can.
+    """Return in words why the compiled path cannot take a robot, or None if it can.
 
     Args:
         model: The robot.
-
-    Returns:
-        The reason, in words.
     """
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
@@ -79,14 +68,7 @@ class CompiledWriter:
     """Writes one block of rows after the other into the same memory: one thread, one writer."""
 
     def __init__(self, model: "RobotModel", tree: "Tree", plan: RowPlan, out: Array) -> None:
-        """Prepare the work space.
-
-        Args:
-            model: The robot; ``why_not`` must return None for it.
-            tree: The robot as arrays.
-            plan: What the rows consist of.
-            out: Block written to, shape (C, k); k a multiple of 64.
-        """
+        """Prepare to write to ``out``, shape (C, k), k a multiple of 64; see ``why_not`` before."""
         lanes = _lanes()
         bodies, depth = tree.rows.shape
         self._model, self._tree, self._out = model, tree, out
@@ -104,16 +86,7 @@ class CompiledWriter:
     def load(
         self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks.
-
-        Args:
-            q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-            v: Velocities, shape (N, n_rows) [rad/s, m/s].
-            a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-            tau: Torques, shape (N, n_rows) [N m, N].
-            direction: Directions that friction follows, shape (N, c).
-            weights: Weights, shape (N, n_rows); None: all 1.
-        """
+        """Take the samples of the next blocks, as of ``TrajectoryRows``; weights None: all 1."""
         self._base = np.zeros((12, 0))
         if self._model.free_flyer:
             self._base = _base_state(self._model, q, v, a)
@@ -125,12 +98,7 @@ class CompiledWriter:
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:
-        """Write the rows of samples start to stop of those loaded.
-
-        Args:
-            start: First sample.
-            stop: Sample after the last one, at most k later.
-        """
+        """Write the rows of samples start to stop of those loaded, at most k."""
         lanes, tree, motion = _lanes(), self._tree, (self._q, self._v, self._a)
         lanes.inertial_rows(
             tree.parents, tree.depths, tree.slots, tree.leaders, tree.joints, self._places,
@@ -144,14 +112,9 @@ class CompiledWriter:
 
 @dataclass(frozen=True)
 class Tree:
-    """A robot as arrays over its bodies, the world first; see ``inertial_rows``.
+    """A robot as arrays over its bodies, the world first, as ``inertial_rows`` takes them.
 
     Attributes:
-        parents: Body that carries each body, shape (B,), int.
-        depths: Number of rows that each body loads, shape (B,), int.
-        slots: Which of a body's rows its own joint belongs to, shape (B,), int; -1: floating base.
-        leaders: Coordinate that moves each joint, shape (B,), int.
-        joints: Constants of each joint, shape (B, 41).
         rows: Row of the regressor of each slot of each body, shape (B, D), int; -1 beyond.
     """
 
@@ -168,9 +131,6 @@ def flatten(model: "RobotModel") -> Tree:
 
     Args:
         model: The robot; ``why_not`` must return None for it.
-
-    Returns:
-        The arrays.
     """
     pin_model, G = model.pin_model, model.velocity_map
     bodies = pin_model.njoints

@@ -2,25 +2,41 @@
 
 All that least squares, weighted least squares and convex fits need of W and tau is the
 triangular factor R_j of each joint's rows, with R_j^T R_j = [W_j tau_j]^T [W_j tau_j].
-Factors of two logs merge into the factor of both.
+Factors of two logs merge into the factor of both. A reduction is what a stretch of a log comes
+down to: its factors, and what else is summed over its samples.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg.lapack
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.logs.data import Trajectory
 from robotid.regressor.lapack import Triangle
 from robotid.regressor.problem import Problem, RowSource
 
-__all__ = ["Factors", "available_cores", "compress", "compress_stretches", "gather", "merge"]
+__all__ = [
+    "Factors",
+    "Reduction",
+    "available_cores",
+    "compress",
+    "compress_stretches",
+    "gather",
+    "join",
+    "join_stretches",
+    "merge",
+]
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 _PART = 16384  # samples per part: long enough that merging costs nothing, short enough to share
 
@@ -52,13 +68,10 @@ class Factors:
         return dense
 
     def select(self, columns: Array) -> "Factors":
-        """Return the factors of fewer columns.
+        """Return the factors of the same rows with fewer columns.
 
         Args:
             columns: Indices of the columns kept, shape (b,).
-
-        Returns:
-            Factors over the same rows.
         """
         columns = np.asarray(columns, dtype=int)
         triangles, kept = [], []
@@ -70,16 +83,13 @@ class Factors:
         return Factors(tuple(triangles), tuple(kept), self.rows, names)
 
     def weighted(self, sigma: Array) -> Array:
-        """Return one factor of all joints, the rows of joint j divided by sigma_j.
+        """Return one factor, shape (c + 1, c + 1), of all joints' rows [W_j tau_j] / sigma_j.
 
         From the fingers to the base, each factor is folded into the smallest one that has all its
         columns: a joint's are among those of the joint that carries it.
 
         Args:
             sigma: Noise level per joint, shape (n,) [N m or N], positive.
-
-        Returns:
-            Triangular factor of the stacked [W_j tau_j] / sigma_j, shape (c + 1, c + 1).
         """
         c = len(self.names)
         folded, everything = [Triangle(len(own) + 1) for own in self.columns], Triangle(c + 1)
@@ -95,13 +105,10 @@ class Factors:
         return everything.R
 
     def residual_squares(self, theta: Array) -> Array:
-        """Return the sum of squared residuals |tau_j - W_j theta|^2 of each joint.
+        """Return |tau_j - W_j theta|^2 of each joint, shape (n,) [(N m)^2 or N^2].
 
         Args:
             theta: Parameters, shape (c,).
-
-        Returns:
-            Sums, shape (n,) [(N m)^2 or N^2].
         """
         residuals = [
             R[:, -1] - R[:, :-1] @ theta[own]
@@ -114,13 +121,10 @@ class Factors:
         return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])
 
     def information(self, weights: Array) -> Array:
-        """Return sum_j weight_j W_j^T W_j.
+        """Return sum_j weight_j W_j^T W_j, shape (c, c).
 
         Args:
             weights: Weight per joint, shape (n,).
-
-        Returns:
-            The sum, shape (c, c).
         """
         total = np.zeros((len(self.names), len(self.names)))
         for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
@@ -128,13 +132,10 @@ class Factors:
         return total
 
     def leverages(self, covariance: Array) -> Array:
-        """Return the trace of W_j C W_j^T for each joint.
+        """Return the trace of W_j C W_j^T for each joint, shape (n,).
 
         Args:
             covariance: C, shape (c, c).
-
-        Returns:
-            Traces, shape (n,).
         """
         pairs = [
             (R[:, :-1], covariance[np.ix_(own, own)])
@@ -156,6 +157,64 @@ class Factors:
         ]
 
 
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """What the rows of a piece, or of many, come down to.
+
+    Attributes:
+        factors: Their triangular factors.
+        squares: Sums of tau^2, v^2 and a^2 over all samples, used or not, shape (3, n_rows).
+        samples: Number of these samples.
+    """
+
+    factors: Factors
+    squares: Array
+    samples: int
+
+    @classmethod
+    def of(
+        cls, problem: Problem, trajectory: Trajectory, *, threads: int | None = None
+    ) -> "Reduction":
+        """Reduce the problem of one trajectory.
+
+        Args:
+            problem: The base problem of the trajectory, rows weighted.
+            trajectory: The trajectory.
+            threads: As of ``compress``.
+
+        Raises:
+            DataError: If a row is not finite.
+        """
+        return cls(compress(problem, threads=threads), trajectory.squares, len(trajectory.t))
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return the reduction as plain arrays by name, as for a checkpoint."""
+        return {
+            **{f"R_{j}": R for j, R in enumerate(self.factors.triangles)},
+            **{f"columns_{j}": own for j, own in enumerate(self.factors.columns)},
+            "rows": self.factors.rows,
+            "names": np.array(self.factors.names),
+            "squares": self.squares,
+            "samples": np.array(self.samples),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> "Reduction":
+        """Return the reduction that arrays hold, to the same bits; see ``to_arrays``.
+
+        Args:
+            arrays: The arrays by name.
+        """
+        rows, joints = arrays["rows"], range(len(arrays["rows"]))
+        factors = Factors(
+            tuple(np.asfortranarray(arrays[f"R_{j}"]) for j in joints),
+            tuple(arrays[f"columns_{j}"] for j in joints),
+            rows,
+            tuple(arrays["names"].tolist()),
+        )
+        return cls(factors, arrays["squares"], int(arrays["samples"]))
+
+
 def compress(problem: Problem, *, threads: int | None = None) -> Factors:
     """Fold a problem into its factors, block by block.
 
@@ -168,20 +227,22 @@ def compress(problem: Problem, *, threads: int | None = None) -> Factors:
         threads: Number of threads, at least 1; None: one per core where the problem's rows come
             faster that way, otherwise one.
 
-    Returns:
-        The factors.
-
     Raises:
         DataError: If a row is not finite.
 
     References:
         Demmel, Grigori, Hoemmen, Langou (2012), Communication-optimal parallel and sequential QR.
     """
+    columns = [np.flatnonzero(row) for row in problem.support]
+    triangles = [Triangle(len(own) + 1) for own in columns]
     if problem.sources:
-        return _compress(problem, threads)
-    triangles, active = _empty(problem)
-    rows = _fold_blocks(triangles, active, problem)
-    return _checked(triangles, active, rows, problem.names)
+        rows = _fold_sources(triangles, columns, problem.sources, threads)
+    else:
+        rows = _fold_blocks(triangles, columns, problem)
+    # what is not finite in a row is not finite in R
+    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
+        raise DataError("the problem holds a row that is not finite; check the trajectory")
+    return Factors(tuple(triangle.R for triangle in triangles), tuple(columns), rows, problem.names)
 
 
 def compress_stretches(
@@ -194,9 +255,6 @@ def compress_stretches(
         length: Samples per stretch, at least 1; the last stretch of each log may have fewer.
         threads: As of ``compress``.
 
-    Returns:
-        The factors of each stretch, in order; merged they are those of the whole problem.
-
     Raises:
         DataError: If a row is not finite, or the problem comes in blocks only.
     """
@@ -208,21 +266,14 @@ def compress_stretches(
         for start in range(0, source.samples, length)
     ]
     is_parallel = all(source.is_parallel for source in problem.sources)
-    workers = (available_cores() if is_parallel else 1) if threads is None else threads
-    if min(workers, len(parts)) <= 1:
-        return tuple(_compress(part, 1) for part in parts)
-    with ThreadPoolExecutor(min(workers, len(parts))) as pool:
-        return tuple(pool.map(partial(_compress, threads=1), parts))
+    return tuple(_in_order(partial(compress, threads=1), parts, is_parallel, threads))
 
 
 def merge(factors: Sequence[Factors]) -> Factors:
-    """Return the factors of all rows of several logs.
+    """Return the factors of all rows of several logs, as if they had been folded in one pass.
 
     Args:
         factors: At least one; all with the same columns and joints.
-
-    Returns:
-        Factors as if the rows had been folded in one pass.
 
     Raises:
         DataError: If there is none, or their columns or joints differ.
@@ -255,12 +306,51 @@ def gather(stretches: Sequence[Factors], count: int) -> tuple[Factors, ...]:
     Args:
         stretches: Factors of stretches, in order.
         count: Number wanted, at least 1.
-
-    Returns:
-        At most so many factors of about as many stretches each, in order.
     """
     edges = np.linspace(0, len(stretches), min(count, len(stretches)) + 1).round().astype(int)
     return tuple(merge(stretches[i:j]) for i, j in pairwise(edges))
+
+
+def join(reductions: Sequence[Reduction]) -> Reduction:
+    """Return what all the rows of several reductions come down to.
+
+    Neighbours are joined, then their neighbours, and so on: the order never depends on timing.
+
+    Args:
+        reductions: At least one; all with the same columns and joints.
+
+    Raises:
+        DataError: If there is none, or their columns or joints differ.
+    """
+    if not reductions:
+        raise DataError("no reduction was given; at least one log is needed")
+    level = list(reductions)
+    while len(level) > 1:
+        level = [_join_neighbours(level[k : k + 2]) for k in range(0, len(level), 2)]
+    return level[0]
+
+
+def join_stretches(reductions: Iterable[Reduction], count: int, most: int) -> list[Reduction]:
+    """Return the reductions of at most so many stretches of neighbouring pieces, in order.
+
+    They are joined as they come, so that no more are in memory; the last one may be shorter.
+
+    Args:
+        reductions: One per piece, in order.
+        count: Number of pieces, at least 1.
+        most: Largest number of stretches, at least 1.
+
+    Raises:
+        DataError: If their columns or joints differ.
+    """
+    length = -(-count // most)
+    stretches: list[Reduction] = []
+    for k, reduction in enumerate(reductions):
+        if k % length:
+            stretches[-1] = join([stretches[-1], reduction])
+        else:
+            stretches.append(reduction)
+    return stretches
 
 
 def available_cores() -> int:
@@ -270,32 +360,20 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _compress(problem: Problem, threads: int | None) -> Factors:
-    """Return the factors of the rows of a problem's sources."""
-    triangles, active = _empty(problem)
-    _fold_sources(triangles, active, problem, threads)
-    rows = np.sum([source.rows for source in problem.sources], axis=0)
-    return _checked(triangles, active, rows, problem.names)
+def _join_neighbours(reductions: Sequence[Reduction]) -> Reduction:
+    """Return what one or two reductions come down to."""
+    if len(reductions) == 1:
+        return reductions[0]
+    return Reduction(
+        merge([r.factors for r in reductions]),
+        np.sum([r.squares for r in reductions], axis=0),
+        sum(r.samples for r in reductions),
+    )
 
 
-def _empty(problem: Problem) -> tuple[list[Triangle], list[Array]]:
-    """Return empty factors and the columns, torque included, that each joint's rows have."""
-    c = len(problem.names)
-    active = [np.append(np.flatnonzero(row), c) for row in problem.support]
-    return [Triangle(len(columns)) for columns in active], active
-
-
-def _checked(
-    triangles: Sequence[Triangle], active: Sequence[Array], rows: Array, names: tuple[str, ...]
-) -> Factors:
-    # what is not finite in a row is not finite in R
-    if not all(np.isfinite(triangle.R).all() for triangle in triangles):
-        raise DataError("the problem holds a row that is not finite; check the trajectory")
-    own = tuple(columns[:-1] for columns in active)
-    return Factors(tuple(triangle.R for triangle in triangles), own, rows, names)
-
-
-def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem: Problem) -> Array:
+def _fold_blocks(
+    triangles: Sequence[Triangle], columns: Sequence[Array], problem: Problem
+) -> Array:
     """Fold whole blocks into the factors; return the number of rows per joint."""
     n = problem.n_joints
     rows = np.zeros(n, dtype=int)
@@ -303,10 +381,10 @@ def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem
         by_joint, torque = W.reshape(-1, n, W.shape[1]), tau.reshape(-1, n)
         root = np.sqrt(weight).reshape(-1, n)
         rows += (root > 0).sum(axis=0)
-        for j, columns in enumerate(active):
+        for j, own in enumerate(columns):
             used = np.flatnonzero(root[:, j] != 0)  # not a number counts as used: it shows in R
-            scaled = np.empty((len(used), len(columns)), order="F")
-            scaled[:, :-1] = by_joint[used, j][:, columns[:-1]]
+            scaled = np.empty((len(used), len(own) + 1), order="F")
+            scaled[:, :-1] = by_joint[used, j][:, own]
             scaled[:, -1] = torque[used, j]
             scaled *= root[used, j, None]
             triangles[j].fold(scaled)
@@ -315,31 +393,35 @@ def _fold_blocks(triangles: Sequence[Triangle], active: Sequence[Array], problem
 
 def _fold_sources(
     triangles: Sequence[Triangle],
-    active: Sequence[Array],
-    problem: Problem,
+    columns: Sequence[Array],
+    sources: Sequence[RowSource],
     threads: int | None,
-) -> None:
-    """Fold the rows of each source into the factors, part by part."""
-    c = len(problem.names)
-    for source in problem.sources:
+) -> Array:
+    """Fold each source into the factors, part by part; return the number of rows per joint."""
+    for source in sources:
         places = [
-            np.searchsorted(columns, np.append(own, c))
-            for columns, own in zip(active, source.columns, strict=True)
+            np.append(np.searchsorted(wanted, own), len(wanted))
+            for wanted, own in zip(columns, source.columns, strict=True)
         ]
-        for part in _parts(source, threads):
+        starts = range(0, source.samples, _PART)
+        parts = _in_order(partial(_fold_part, source), starts, source.is_parallel, threads)
+        for part in parts:
             for triangle, place, R_j in zip(triangles, places, part, strict=True):
                 triangle.fold_triangle(R_j, place)
+    rows: Array = np.sum([source.rows for source in sources], axis=0)
+    return rows
 
 
-def _parts(source: RowSource, threads: int | None) -> Iterator[list[Array]]:
-    """Yield the factors of each part of a source in order."""
-    starts = range(0, source.samples, _PART)
-    workers = (available_cores() if source.is_parallel else 1) if threads is None else threads
-    if min(workers, len(starts)) <= 1:
-        yield from (_fold_part(source, start) for start in starts)
+def _in_order(
+    work: Callable[[ItemT], ResultT], items: Sequence[ItemT], is_parallel: bool, threads: int | None
+) -> Iterator[ResultT]:
+    """Yield what work makes of each item in order, several at a time where that is faster."""
+    workers = (available_cores() if is_parallel else 1) if threads is None else threads
+    if min(workers, len(items)) <= 1:
+        yield from map(work, items)
         return
-    with ThreadPoolExecutor(min(workers, len(starts))) as pool:
-        yield from pool.map(partial(_fold_part, source), starts)
+    with ThreadPoolExecutor(min(workers, len(items))) as pool:
+        yield from pool.map(work, items)
 
 
 def _fold_part(source: RowSource, start: int) -> list[Array]:

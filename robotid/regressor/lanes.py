@@ -29,14 +29,11 @@ _ROUND = 6755399441055744.0  # 1.5 2^52: adding and subtracting it rounds to the
 
 
 def state_size(bodies: int, depth: int) -> int:
-    """Return the size of the work space.
+    """Return the number of entries of the work space.
 
     Args:
         bodies: Number of bodies, the world included.
         depth: Largest number of rows that one body loads.
-
-    Returns:
-        Number of entries.
     """
     return LANES * (_SHARED + bodies * (_STATE + 6 * depth))
 

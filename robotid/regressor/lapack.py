@@ -30,11 +30,7 @@ class Triangle:
     """
 
     def __init__(self, columns: int) -> None:
-        """Begin with no rows.
-
-        Args:
-            columns: Number c of columns.
-        """
+        """Begin with no rows of so many columns."""
         self.R = np.zeros((columns, columns), order="F")
         self._panel = min(_PANEL, columns)
         self._scratch = np.empty(2 * self._panel * columns)

@@ -24,7 +24,7 @@ def predict(
     *,
     compiled: bool | None = None,
 ) -> list[Array]:
-    """Return the torque W theta that each of several parameter vectors predicts.
+    """Return the torque W theta, shape (N, n_rows) [N m, N], that each of several vectors predicts.
 
     By the rows of the regressor, times all vectors at once, or, where the rows are not compiled
     and the vectors are few, by inverse dynamics, once per vector.
@@ -34,9 +34,6 @@ def predict(
         parameters: Vectors of standard parameters, each of shape (p,), possible ones or not.
         trajectory: N samples of q, v, a and, if the torque was filtered, direction.
         compiled: As of ``build_problem``.
-
-    Returns:
-        Torques, one array of shape (N, n_rows) per vector [N m, N].
 
     Raises:
         DataError: If the trajectory's joints are not the model's.

@@ -79,20 +79,14 @@ class RowSource(ABC):
         Args:
             start: First sample.
             stop: Sample after the last one.
-
-        Returns:
-            The same columns of those rows.
         """
 
     @abstractmethod
     def select(self, columns: Array) -> "RowSource":
-        """Return the same rows with fewer columns.
+        """Return the same rows with fewer columns, column k being ``columns[k]`` of this one.
 
         Args:
             columns: Indices of the columns kept, shape (b,), of those of the whole problem.
-
-        Returns:
-            Its column k is column ``columns[k]`` of this one.
         """
 
 
@@ -137,13 +131,10 @@ class Problem:
                 yield Sample(Y, torque, row_weight, M)
 
     def select(self, columns: Array) -> "Problem":
-        """Return the problem with only the given columns.
+        """Return the same rows with only the given columns.
 
         Args:
             columns: Indices of the columns kept, shape (b,).
-
-        Returns:
-            A problem over the same rows.
         """
 
         def stream() -> Iterator[Block]:
@@ -167,13 +158,10 @@ class Problem:
 
 
 def concatenate(problems: Sequence[Problem]) -> Problem:
-    """Return one problem with the rows of several, as of several logs of one robot.
+    """Return one problem with the rows of several in order, as of several logs of one robot.
 
     Args:
         problems: At least one problem; all with the same columns and joints.
-
-    Returns:
-        The rows of the first, then of the second, and so on.
 
     Raises:
         DataError: If there is none, or their columns or joints differ.

@@ -53,21 +53,17 @@ def choose_engine(model: RobotModel, samples: int, compiled: bool | None) -> str
     """
     if compiled and not is_installed():
         raise MissingDependencyError("the compiled regressor", "numba", "fast")
-    engine = _engine(model, samples, compiled)
+    enough = -(-LONG_ENOUGH // work_per_sample(model))
+    engine = "Pinocchio"
+    if compiled is not False and not is_installed():
+        engine += " (robotid[fast] is not installed)"
+    elif compiled is None and samples < enough:
+        engine += f" (fewer than {enough} samples do not pay the start of the compiled path)"
+    elif compiled is not False:
+        reason = why_not(model)
+        engine = COMPILED if reason is None else f"{engine} ({reason})"
     _log.info("%s: regressor of %d samples: %s", model.name, samples, engine)
     return engine
-
-
-def _engine(model: RobotModel, samples: int, compiled: bool | None) -> str:
-    if compiled is False:
-        return "Pinocchio"
-    if not is_installed():
-        return "Pinocchio (robotid[fast] is not installed)"
-    enough = -(-LONG_ENOUGH // work_per_sample(model))
-    if compiled is None and samples < enough:
-        return f"Pinocchio (fewer than {enough} samples do not pay the start of the compiled path)"
-    reason = why_not(model)
-    return COMPILED if reason is None else f"Pinocchio ({reason})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +114,12 @@ class TrajectoryRows(RowSource):
         plan = self._plan
         length = _block_length(int(plan.first[-1]))
         out = np.empty((plan.first[-1], length))
-        writer, motion = self._writer(out), self.trajectory
+        motion = self.trajectory
+        writer = (
+            CompiledWriter(self.model, self._tree, plan, out)
+            if self.engine == COMPILED
+            else _PinocchioWriter(self.model, plan, out)
+        )
         for first in range(start, stop, _LOADED * length):
             last = min(first + _LOADED * length, stop)
             part = slice(first, last)
@@ -145,11 +146,6 @@ class TrajectoryRows(RowSource):
     def _is_weighted(self) -> bool:
         return bool((self.weights != 1.0).any())
 
-    def _writer(self, out: Array) -> "CompiledWriter | _PinocchioWriter":
-        if self.engine == COMPILED:
-            return CompiledWriter(self.model, self._tree, self._plan, out)
-        return _PinocchioWriter(self.model, self._plan, out)
-
 
 def trajectory_rows(
     model: RobotModel, trajectory: Trajectory, weight: Array | None, compiled: bool | None
@@ -161,9 +157,6 @@ def trajectory_rows(
         trajectory: N samples.
         weight: Weight of each row, shape (N, n_rows); None: all 1.
         compiled: As of ``choose_engine``.
-
-    Returns:
-        The rows.
 
     Raises:
         DataError: If joints or shapes do not fit the model.
@@ -205,12 +198,12 @@ class _PinocchioWriter:
     def load(
         self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks; see ``CompiledWriter.load``."""
+        """Take the samples of the next blocks."""
         self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
         self._direction = direction
 
     def write(self, start: int, stop: int) -> None:
-        """Write the rows of samples start to stop; see ``CompiledWriter.write``."""
+        """Write the rows of samples start to stop of those loaded."""
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
         out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]

@@ -64,16 +64,13 @@ def joint_torque_regressor(
 
 
 def mass_regressor(model: RobotModel, q: Array) -> Array:
-    """Return the regressor of the mass matrix: D(q, pi) = mass_regressor @ pi, drives included.
+    """Return the regressor of D(q, pi) = mass_regressor @ pi, shape (N, n_rows, n_rows, p).
 
-    Its column j is W(q, 0, e_j) - W(q, 0, 0), in which gravity and offsets cancel.
+    Drives included, column j is W(q, 0, e_j) - W(q, 0, 0), where gravity and offsets cancel.
 
     Args:
         model: The robot.
         q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-
-    Returns:
-        Regressors, shape (N, n_rows, n_rows, p).
 
     Raises:
         DataError: If q does not fit the model.
@@ -121,26 +118,19 @@ class InstantRegressor:
         ]
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the regressor of one instant.
+        """Return the regressor of one instant, shape (n, c), as of ``joint_torque_regressor``.
 
         Args:
             q: Joint coordinates, shape (n,) [rad, m].
             v: Velocities, shape (n,) [rad/s, m/s].
             a: Accelerations, shape (n,) [rad/s^2, m/s^2].
-
-        Returns:
-            Regressor, shape (n, c); the same as that of ``joint_torque_regressor``.
         """
         model, layout, Y = self._model, self._model.layout, self._Y
         x = q if self._is_plain else model.configurations(q[None])[0]
-        if self._map is None:
-            inertial = pin.computeJointTorqueRegressor(model.pin_model, self._data, x, v, a)
-        else:
-            G = self._map
-            inertial = G.T @ pin.computeJointTorqueRegressor(
-                model.pin_model, self._data, x, G @ v, G @ a
-            )
-        Y[:, : layout.n_inertial] = inertial
+        regressor, G = pin.computeJointTorqueRegressor, self._map
+        w, dw = (v, a) if G is None else (G @ v, G @ a)
+        inertial = regressor(model.pin_model, self._data, x, w, dw)
+        Y[:, : layout.n_inertial] = inertial if G is None else G.T @ inertial
         rows, motion = np.arange(len(v)), DriveMotion(v, a, np.sign(v))
         for term, place in self._terms:
             Y[rows, place] = term.column(motion)
@@ -149,13 +139,10 @@ class InstantRegressor:
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
-        """Return the regressor of the mass matrix; see ``mass_regressor``.
+        """Return the regressor of the mass matrix, shape (n, n, c); see ``mass_regressor``.
 
         Args:
             q: Joint coordinates, shape (n,) [rad, m].
-
-        Returns:
-            Regressor, shape (n, n, c).
         """
         still, unit = np.zeros(len(q)), np.eye(len(q))
         at_rest = self(q, still, still)
@@ -170,7 +157,7 @@ def build_problem(
     with_mass: bool = False,
     compiled: bool | None = None,
 ) -> Problem:
-    """Return the identification problem W pi = tau of a trajectory.
+    """Return the problem W pi = tau of a trajectory: a stream of row blocks with p columns.
 
     Its blocks come from Pinocchio. Its rows joint by joint, which the factors are made of, come
     from Pinocchio too, or from the compiled path, equal to 1e-12;
@@ -183,9 +170,6 @@ def build_problem(
         with_mass: Whether each sample also carries the regressor of its mass matrix.
         compiled: Whether to use the compiled path where it supports the robot; None: where it is
             installed and the trajectory is long enough to pay its start.
-
-    Returns:
-        A stream of row blocks with p columns.
 
     Raises:
         DataError: If joints or shapes do not fit the model.
@@ -216,7 +200,7 @@ def build_problem(
 
 
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
-    """Return the regressor at random states, which shows what any motion can excite.
+    """Return the regressor at random states, shape (N n_rows, p): what any motion can excite.
 
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
     gravity and inertia weigh alike on a finger and on a crane.
@@ -225,9 +209,6 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         model: The robot.
         samples: Number N of states.
         rng: Source of the random states.
-
-    Returns:
-        Regressors, shape (N n_rows, p).
     """
     n = len(model.joints)
     rate = np.sqrt(9.81 / model.length)  # [1/s]
@@ -238,7 +219,9 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
     if model.free_flyer:
         linear = np.array([model.length] * 3 + [1.0] * 3)
-        pose = np.column_stack([np.zeros((samples, 3)), _random_quaternions(samples, rng)])
+        quaternions = rng.standard_normal((samples, 4))
+        quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+        pose = np.column_stack([np.zeros((samples, 3)), quaternions])
         q = np.hstack([pose, q])
         v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
         a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
@@ -266,9 +249,3 @@ def _write_inertial(model: RobotModel, q: Array, v: Array, a: Array, out: Array)
     for Y, q_k, v_k, a_k in instants:
         Y_k = regressor(pin_model, data, q_k, v_k, a_k)
         Y[:] = Y_k if is_plain else G.T @ Y_k  # tau = G^T tau_pinocchio
-
-
-def _random_quaternions(samples: int, rng: np.random.Generator) -> Array:
-    quaternions = rng.standard_normal((samples, 4))
-    unit: Array = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return unit

@@ -15,7 +15,7 @@ import numpy as np
 
 from robotid._files import written_whole
 from robotid.exceptions import DataError
-from robotid.regressor.reduction import Reduction
+from robotid.regressor.factors import Reduction
 from robotid.workers.pieces import Piece
 
 __all__ = ["FOLDER", "Checkpoint"]

@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeAlias
 
 from threadpoolctl import threadpool_limits
 
-from robotid.regressor.reduction import Reduction
+from robotid.regressor.factors import Reduction
 
 __all__ = ["Outcome", "Piece", "Work", "Workload", "reduce_piece", "run_task"]
 

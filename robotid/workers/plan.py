@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from robotid._typing import ProgressCallback, ignore_progress
-from robotid.regressor.factors import available_cores
-from robotid.regressor.reduction import Reduction
+from robotid.regressor.factors import Reduction, available_cores
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.cluster import ClusterBackend
 from robotid.workers.pieces import Piece, Work, Workload, reduce_piece

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid.exceptions import DataError
-from robotid.regressor.factors import Factors
-from robotid.regressor.reduction import Reduction, join
+from robotid.regressor.factors import Factors, Reduction, join
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.pieces import Piece, reduce_piece
 from robotid.workers.plan import map_pieces

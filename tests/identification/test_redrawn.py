@@ -9,8 +9,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.cone_programme import Programme
-from robotid.estimators.consistent.cones import Cone, svec, unsvec
-from robotid.estimators.consistent.solvers import nearest
+from robotid.estimators.consistent.cones import Cone, nearest, svec, unsvec
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.prior import prior_spread

@@ -9,8 +9,8 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
 from robotid.commands.job import LogEntry, job_from_settings, read_job
+from robotid.estimators.consistent.cones import SOLVERS
 from robotid.estimators.consistent.penalties import METRICS
-from robotid.estimators.consistent.solvers import SOLVERS
 from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.robust import LOSSES

@@ -19,7 +19,7 @@ from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import lay_out, read_log, write_log
 from robotid.logs.settings import LogUnits, SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.reduction import join
+from robotid.regressor.factors import join
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel

@@ -3,7 +3,7 @@ import pinocchio as pin
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.estimators.consistent.solvers import SOLVERS
+from robotid.estimators.consistent.cones import SOLVERS
 from robotid.export.result import build_result
 from robotid.identification.findings import consistency_findings
 from robotid.identification.pipeline import identify

@@ -14,7 +14,7 @@ from helpers.piecework import (
 )
 
 from robotid.exceptions import DataError, WorkerError
-from robotid.regressor.reduction import join
+from robotid.regressor.factors import join
 from robotid.workers import cluster
 from robotid.workers.cluster import ClusterBackend
 

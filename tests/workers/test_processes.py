@@ -16,8 +16,7 @@ from robotid.exceptions import (
     SettingsError,
     WorkerError,
 )
-from robotid.regressor.factors import available_cores
-from robotid.regressor.reduction import Reduction, join
+from robotid.regressor.factors import Reduction, available_cores, join
 from robotid.workers.pieces import reduce_piece
 from robotid.workers.plan import choose_workers
 from robotid.workers.processes import ProcessBackend

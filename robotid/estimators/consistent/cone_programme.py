@@ -6,9 +6,8 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.consistent.cones import Cone, Subspace
+from robotid.estimators.consistent.cones import Cone, ConeSolution, Subspace, least_squares, nearest
 from robotid.estimators.consistent.penalties import Penalty
-from robotid.estimators.consistent.solvers import ConeSolution, least_squares, nearest
 from robotid.exceptions import NotConvergedError
 from robotid.regressor.factors import Factors
 
@@ -133,22 +132,17 @@ class Programme:
         noise = rng.standard_normal((draws, len(R))) * np.sqrt(np.maximum(size, 0.0)) @ axes.T
         lowest = triangle[:, -1] - R @ at
         y, failures = nearest(
-            lowest + noise,
-            cone.restrict(Subspace(at, inverse)),
-            max_iterations=self.max_iterations,
+            lowest + noise, cone.restrict(Subspace(at, inverse)), max_iterations=self.max_iterations
         )
         return self.scale * (y @ prior.T), failures
 
     def objective(self, rows: Array, pi: Array, weight: float) -> float:
-        """Return what is minimised.
+        """Return what is minimised: the squares of the residual plus the weighted penalty [-].
 
         Args:
             rows: Information on the base parameters, shape (k, b + 1).
             pi: Standard parameters, shape (p,).
             weight: Weight of the penalty [-].
-
-        Returns:
-            The weighted squares of the residual plus the weighted penalty [-].
         """
         residual = rows[:, :-1] @ (self.K @ pi) - rows[:, -1]
         return float(residual @ residual + weight * self.penalty.value(pi))
@@ -176,7 +170,7 @@ class Programme:
         return directions, rows[:, -1] - A @ nearest
 
     def noise(self, factors: Factors, sigma: Array, share: float, weight: float) -> Array:
-        """Return the noise level of each joint by the fit without the inequalities.
+        """Return the noise levels, shape (n,) [N m or N], by the fit without inequalities, never 0.
 
         sigma_j^2 = |tau_j - W_j pi|^2 / (rows_j - spent_j / share): rows behind a filter repeat
         each other, so that few of them are spent soon; spent_j counts the parameters that the
@@ -187,9 +181,6 @@ class Programme:
             sigma: Noise levels to start from, shape (n,) [N m or N].
             share: Share of the rows that count as independent [-].
             weight: Weight of the penalty [-].
-
-        Returns:
-            Noise levels, shape (n,) [N m or N], never quite zero.
         """
         n, size, _ = factors.R.shape
         A, r = self.whitened(factors.R.reshape(n * size, size))
@@ -214,13 +205,10 @@ class Programme:
         return sigma
 
     def prior_covariance(self, weight: float) -> Array:
-        """Return the covariance that the prior alone gives.
+        """Return the covariance, shape (p, p), of the prior alone, expanded at its centre.
 
         Args:
             weight: Weight of the penalty [-].
-
-        Returns:
-            Covariance, shape (p, p), with the penalty expanded at its centre.
         """
         H, basis = weight * self._scaled_hessian(self.penalty.centre), self.space.basis
         return self._covariance(scipy.linalg.cholesky(basis.T @ H @ basis))

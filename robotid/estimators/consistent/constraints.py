@@ -1,6 +1,5 @@
 """What else is known of the bodies: bounds of mass, centre of mass, and bodies that are known."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,10 +9,11 @@ from robotid.estimators.consistent.cones import Cone, svec
 from robotid.exceptions import SettingsError
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
-__all__ = ["SIGN_MARGIN", "Constraints", "check_constraints", "consistency_cone", "equalities"]
+__all__ = ["SIGN_MARGIN", "Constraints"]
 
 #: Drive terms stay above this share of their scale, so that rounding cannot make them negative.
 SIGN_MARGIN = 1e-9
+_OPEN = (0.0, np.inf)  # [kg]
 _ROUNDING = 1e-9  # [kg], [m]: a pinned body may lie that far outside its bounds
 
 
@@ -34,152 +34,173 @@ class Constraints:
     com: dict[str, tuple[Array, Array]] = field(default_factory=dict)
     pinned: tuple[str, ...] = ()
 
+    def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
+        """Refuse bounds that no parameters meet, before a solver looks for them.
 
-def check_constraints(
-    constraints: Constraints, layout: ParameterLayout, prior: Array, held: Array
-) -> None:
-    """Refuse bounds that no parameters meet, before a solver looks for them.
+        Args:
+            layout: The standard parameters.
+            prior: Their prior values, shape (p,).
+            held: Known share of each body, shape (10 bodies,).
 
-    Args:
-        constraints: The constraints.
-        layout: The standard parameters.
-        prior: Their prior values, shape (p,).
-        held: Known share of each body, shape (10 bodies,).
-
-    Raises:
-        SettingsError: If a body is unknown, bounds contradict each other, or a pinned body lies
-            outside its bounds or is not physically possible.
-    """
-    known = {*constraints.mass, *constraints.com, *constraints.pinned}
-    unknown = sorted(known - set(layout.bodies))
-    if unknown:
-        raise SettingsError(
-            f"constraints name {unknown}, which are no bodies of the model; links joined by fixed "
-            f"joints count to the one that a joint moves: {list(layout.bodies)}"
-        )
-    values = prior[: layout.n_inertial].reshape(-1, 10)
-    parts = held.reshape(-1, 10)
-    for body, (low, high) in constraints.mass.items():
-        i = layout.bodies.index(body)
-        _check_range(f"mass of {body}", low, high, "kg")
-        if high < parts[i, 0]:
+        Raises:
+            SettingsError: If a body is unknown, bounds contradict each other, or a pinned body lies
+                outside its bounds or is not physically possible.
+        """
+        known = {*self.mass, *self.com, *self.pinned}
+        unknown = sorted(known - set(layout.bodies))
+        if unknown:
             raise SettingsError(
-                f"mass of {body} is bounded by {high:g} kg, but its links on locked joints alone "
-                f"weigh {parts[i, 0]:g} kg; raise the bound"
+                f"constraints name {unknown}, which are no bodies of the model; links joined by "
+                f"fixed joints count to the one that a joint moves: {list(layout.bodies)}"
             )
-    for body in constraints.pinned:
-        i = layout.bodies.index(body)
-        _check_pinned(constraints, body, values[i], parts[i])
-    if constraints.total_mass is not None:
-        _check_total(constraints, layout, values)
+        values = prior[: layout.n_inertial].reshape(-1, 10)
+        parts = held.reshape(-1, 10)
+        for body, (low, high) in self.mass.items():
+            i = layout.bodies.index(body)
+            _check_range(f"mass of {body}", low, high)
+            if high < parts[i, 0]:
+                raise SettingsError(
+                    f"mass of {body} is bounded by {high:g} kg, but its links on locked joints "
+                    f"alone weigh {parts[i, 0]:g} kg; raise the bound"
+                )
+        for body in self.pinned:
+            i = layout.bodies.index(body)
+            self._check_pinned(body, values[i], parts[i])
+        if self.total_mass is not None:
+            self._check_total(layout, values)
 
+    def cone(
+        self, layout: ParameterLayout, scale: Array, held: Array, shrink: Array, margin: float
+    ) -> Cone:
+        """Return the cone of possible parameters x = pi / scale; pinned bodies have no part in it.
 
-def consistency_cone(
-    constraints: Constraints,
-    layout: ParameterLayout,
-    scale: Array,
-    held: Array,
-    shrink: Array,
-    margin: float,
-) -> Cone:
-    """Return the cone of possible parameters x = pi / scale.
+        Args:
+            layout: The standard parameters.
+            scale: Unit of each parameter, shape (p,).
+            held: Known share of each body, shape (10 bodies,).
+            shrink: Matrices T^-1/2 that make pseudo-inertias free of units, shape (bodies, 4, 4).
+            margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body beside its held share [-].
+        """
+        p = len(layout.names)
+        signs = np.flatnonzero(layout.is_nonnegative())
+        G, h = [np.eye(p)[signs]], [np.full(len(signs), -SIGN_MARGIN)]
+        labels = [f"drive_signs {layout.names[i]}" for i in signs]
+        C, c, named = self._bounds(layout)
+        C = C * scale
+        norms = np.linalg.norm(C, axis=1)
+        G.append(C / norms[:, None])
+        h.append(c / norms)
+        labels += named
+        basis = pseudo_inertia_basis()
+        S, s = [np.zeros((0, p))], [np.zeros(0)]
+        for i, J_held in enumerate(pseudo_inertia(held)):
+            if layout.bodies[i] in self.pinned:
+                continue
+            part = slice(10 * i, 10 * i + 10)
+            block = np.zeros((10, p))
+            block[:, part] = svec(shrink[i] @ basis @ shrink[i]).T * scale[part]
+            S.append(block)
+            s.append(-svec(shrink[i] @ J_held @ shrink[i] + margin * np.eye(4)))
+            labels.append(f"pseudo_inertia {layout.bodies[i]}")
+        return Cone(np.vstack(G), np.concatenate(h), np.vstack(S), np.concatenate(s), tuple(labels))
 
-    Args:
-        constraints: Bounds beside physical consistency.
-        layout: The standard parameters.
-        scale: Unit of each parameter, shape (p,).
-        held: Known share of each body, shape (10 bodies,).
-        shrink: Matrices T^-1/2 that make pseudo-inertias free of units, shape (bodies, 4, 4).
-        margin: Smallest eigenvalue of T^-1/2 J T^-1/2 of a body beside its held share [-].
+    def equalities(self, layout: ParameterLayout, prior: Array) -> tuple[Array, Array]:
+        """Return what is known exactly, as E pi = e: pinned bodies, and masses without a range.
 
-    Returns:
-        The cone; pinned bodies have no part in it.
-    """
-    p = len(layout.names)
-    signs = np.flatnonzero(layout.is_nonnegative())
-    G, h = [np.eye(p)[signs]], [np.full(len(signs), -SIGN_MARGIN)]
-    labels = [f"drive_signs {layout.names[i]}" for i in signs]
-    C, c, named = _bounds(constraints, layout)
-    C = C * scale
-    norms = np.linalg.norm(C, axis=1)
-    G.append(C / norms[:, None])
-    h.append(c / norms)
-    labels += named
-    basis = pseudo_inertia_basis()
-    S, s = [np.zeros((0, p))], [np.zeros(0)]
-    for i, J_held in enumerate(pseudo_inertia(held)):
-        if layout.bodies[i] in constraints.pinned:
-            continue
-        part = slice(10 * i, 10 * i + 10)
-        block = np.zeros((10, p))
-        block[:, part] = svec(shrink[i] @ basis @ shrink[i]).T * scale[part]
-        S.append(block)
-        s.append(-svec(shrink[i] @ J_held @ shrink[i] + margin * np.eye(4)))
-        labels.append(f"pseudo_inertia {layout.bodies[i]}")
-    return Cone(np.vstack(G), np.concatenate(h), np.vstack(S), np.concatenate(s), tuple(labels))
+        Args:
+            layout: The standard parameters.
+            prior: Their prior values, shape (p,).
 
+        Returns:
+            E, shape (k, p), and e, shape (k,).
+        """
+        p = len(layout.names)
+        pinned = [i for i, body in enumerate(layout.bodies) if body in self.pinned]
+        kept = [10 * i + k for i in pinned for k in range(10)]
+        E, e = [np.eye(p)[kept]], [prior[kept]]
+        for body, (low, high) in self.mass.items():
+            i = layout.bodies.index(body)
+            if low == high and i not in pinned:
+                E.append(np.eye(p)[[10 * i]])
+                e.append(np.array([low]))
+        if self.total_mass is not None and np.ptp(self.total_mass) == 0:
+            E.append(_all_masses(layout)[None])
+            e.append(np.array([self.total_mass[0]]))
+        return np.vstack(E), np.concatenate(e)
 
-def equalities(
-    constraints: Constraints, layout: ParameterLayout, prior: Array
-) -> tuple[Array, Array]:
-    """Return what is known exactly, as E pi = e: pinned bodies, and masses without a range.
+    def _bounds(self, layout: ParameterLayout) -> tuple[Array, Array, list[str]]:
+        """Return C, c and labels of the rows C pi + c >= 0 of bounds that leave a range."""
+        p = len(layout.names)
+        rows: list[Array] = []
+        constants: list[float] = []
+        labels: list[str] = []
 
-    Args:
-        constraints: The constraints.
-        layout: The standard parameters.
-        prior: Their prior values, shape (p,).
+        def add(row: Array, low: float, high: float, label: str) -> None:
+            if low == high:
+                return
+            for sign, bound in ((1.0, low), (-1.0, high)):
+                if np.isfinite(bound):
+                    rows.append(sign * row)
+                    constants.append(-sign * bound)
+                    labels.append(label)
 
-    Returns:
-        E, shape (k, p), and e, shape (k,).
-    """
-    p = len(layout.names)
-    pinned = [i for i, body in enumerate(layout.bodies) if body in constraints.pinned]
-    kept = [10 * i + k for i in pinned for k in range(10)]
-    E, e = [np.eye(p)[kept]], [prior[kept]]
-    for body, (low, high) in constraints.mass.items():
-        i = layout.bodies.index(body)
-        if low == high and i not in pinned:
-            E.append(np.eye(p)[[10 * i]])
-            e.append(np.array([low]))
-    if constraints.total_mass is not None and np.ptp(constraints.total_mass) == 0:
-        E.append(_all_masses(layout)[None])
-        e.append(np.array([constraints.total_mass[0]]))
-    return np.vstack(E), np.concatenate(e)
+        for body, (low, high) in self.mass.items():
+            if body not in self.pinned:
+                add(np.eye(p)[10 * layout.bodies.index(body)], low, high, f"mass {body}")
+        if self.total_mass is not None:
+            add(_all_masses(layout), *self.total_mass, "total_mass all")
+        for body, (A, b) in self.com.items():
+            if body in self.pinned:
+                continue
+            i = layout.bodies.index(body)
+            for normal, distance in zip(A, b, strict=True):
+                row = np.zeros(p)
+                row[10 * i] = distance
+                row[10 * i + 1 : 10 * i + 4] = -normal
+                rows.append(row)
+                constants.append(0.0)
+                labels.append(f"centre_of_mass {body}")
+        return np.array(rows).reshape(-1, p), np.array(constants), labels
 
+    def _check_pinned(self, body: str, values: Array, held: Array) -> None:
+        (J,) = pseudo_inertia(values - held)
+        if np.linalg.eigvalsh(J)[0] <= 0:
+            raise SettingsError(
+                f"{body} is pinned, but its inertial in the URDF is not physically possible; mend "
+                "it, or leave it out of 'pinned'"
+            )
+        low, high = self.mass.get(body, _OPEN)
+        if not low - _ROUNDING <= values[0] <= high + _ROUNDING:
+            raise SettingsError(
+                f"{body} is pinned at the URDF's {values[0]:g} kg, outside its bounds "
+                f"[{low:g}, {high:g}] kg; leave it out of 'pinned' or of 'mass'"
+            )
+        if body in self.com:
+            A, b = self.com[body]
+            centre = values[1:4] / values[0]
+            beyond = float((A @ centre - b).max())
+            if beyond > _ROUNDING:
+                raise SettingsError(
+                    f"{body} is pinned, but the URDF's centre of mass "
+                    f"{np.round(centre, 4).tolist()} m lies {1e3 * beyond:.1f} mm outside its "
+                    "bounds; leave it out of 'pinned' or widen them"
+                )
 
-def _bounds(constraints: Constraints, layout: ParameterLayout) -> tuple[Array, Array, list[str]]:
-    """Return C, c and labels of the rows C pi + c >= 0 of bounds that leave a range."""
-    p = len(layout.names)
-    rows: list[Array] = []
-    constants: list[float] = []
-    labels: list[str] = []
-
-    def add(row: Array, low: float, high: float, label: str) -> None:
-        if low == high:
-            return
-        for sign, bound in ((1.0, low), (-1.0, high)):
-            if np.isfinite(bound):
-                rows.append(sign * row)
-                constants.append(-sign * bound)
-                labels.append(label)
-
-    for body, (low, high) in constraints.mass.items():
-        if body not in constraints.pinned:
-            add(np.eye(p)[10 * layout.bodies.index(body)], low, high, f"mass {body}")
-    if constraints.total_mass is not None:
-        add(_all_masses(layout), *constraints.total_mass, "total_mass all")
-    for body, (A, b) in constraints.com.items():
-        if body in constraints.pinned:
-            continue
-        i = layout.bodies.index(body)
-        for normal, distance in zip(A, b, strict=True):
-            row = np.zeros(p)
-            row[10 * i] = distance
-            row[10 * i + 1 : 10 * i + 4] = -normal
-            rows.append(row)
-            constants.append(0.0)
-            labels.append(f"centre_of_mass {body}")
-    return np.array(rows).reshape(-1, p), np.array(constants), labels
+    def _check_total(self, layout: ParameterLayout, values: Array) -> None:
+        low, high = self.total_mass or _OPEN
+        _check_range("total_mass", low, high)
+        bounds = np.array(
+            [
+                [values[i, 0]] * 2 if body in self.pinned else self.mass.get(body, _OPEN)
+                for i, body in enumerate(layout.bodies)
+            ]
+        )
+        least, most = bounds.sum(axis=0)
+        if high < least - _ROUNDING or low > most + _ROUNDING:
+            raise SettingsError(
+                f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bodies' own bounds and "
+                f"pinned masses allow [{least:g}, {most:g}] kg; make them agree"
+            )
 
 
 def _all_masses(layout: ParameterLayout) -> Array:
@@ -188,56 +209,11 @@ def _all_masses(layout: ParameterLayout) -> Array:
     return row
 
 
-def _check_range(what: str, low: float, high: float, unit: str) -> None:
+def _check_range(what: str, low: float, high: float) -> None:
     if not low <= high:
         raise SettingsError(
-            f"{what} is bounded by [{low:g}, {high:g}] {unit}: the first is above the second; "
+            f"{what} is bounded by [{low:g}, {high:g}] kg: the first is above the second; "
             "write the smaller one first"
         )
     if high <= 0:
-        raise SettingsError(f"{what} is bounded by {high:g} {unit}, wanted a positive bound")
-
-
-def _check_pinned(constraints: Constraints, body: str, values: Array, held: Array) -> None:
-    (J,) = pseudo_inertia(values - held)
-    if np.linalg.eigvalsh(J)[0] <= 0:
-        raise SettingsError(
-            f"{body} is pinned, but its inertial in the URDF is not physically possible; mend it, "
-            "or leave it out of 'pinned'"
-        )
-    low, high = constraints.mass.get(body, (0.0, np.inf))
-    if not low - _ROUNDING <= values[0] <= high + _ROUNDING:
-        raise SettingsError(
-            f"{body} is pinned at the URDF's {values[0]:g} kg, outside its bounds "
-            f"[{low:g}, {high:g}] kg; leave it out of 'pinned' or of 'mass'"
-        )
-    if body in constraints.com:
-        A, b = constraints.com[body]
-        centre = values[1:4] / values[0]
-        beyond = float((A @ centre - b).max())
-        if beyond > _ROUNDING:
-            raise SettingsError(
-                f"{body} is pinned, but the URDF's centre of mass {np.round(centre, 4).tolist()} m "
-                f"lies {1e3 * beyond:.1f} mm outside its bounds; leave it out of 'pinned' or widen "
-                "them"
-            )
-
-
-def _check_total(constraints: Constraints, layout: ParameterLayout, values: Array) -> None:
-    low, high = constraints.total_mass or (0.0, np.inf)
-    _check_range("total_mass", low, high, "kg")
-    bounds = np.array(
-        [
-            [values[i, 0]] * 2 if body in constraints.pinned else constraints.mass.get(body, _OPEN)
-            for i, body in enumerate(layout.bodies)
-        ]
-    )
-    least, most = bounds.sum(axis=0)
-    if high < least - _ROUNDING or low > most + _ROUNDING:
-        raise SettingsError(
-            f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bodies' own bounds and "
-            f"pinned masses allow [{least:g}, {most:g}] kg; make them agree"
-        )
-
-
-_OPEN: Sequence[float] = (0.0, np.inf)
+        raise SettingsError(f"{what} is bounded by {high:g} kg, wanted a positive bound")

@@ -1,8 +1,4 @@
-"""Physically consistent fit: a convex cone programme on the factors.
-
-Every body gets a positive definite pseudo-inertia, every drive armature and friction of the right
-sign; where the data say nothing the parameters stay near their prior.
-"""
+"""Physically consistent fit: a convex cone programme on the factors."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,15 +8,10 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators.batch.least_squares import WLS
+from robotid.estimators.batch import WLS
 from robotid.estimators.consistent.cone_programme import Programme
-from robotid.estimators.consistent.cones import Subspace
-from robotid.estimators.consistent.constraints import (
-    Constraints,
-    check_constraints,
-    consistency_cone,
-    equalities,
-)
+from robotid.estimators.consistent.cones import SOLVERS, Subspace
+from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.penalties import (
     METRICS,
     Penalty,
@@ -28,7 +19,6 @@ from robotid.estimators.consistent.penalties import (
     body_units,
     make_penalty,
 )
-from robotid.estimators.consistent.solvers import SOLVERS
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError
@@ -42,7 +32,7 @@ _ACTIVE = 1e-5  # slack below which a constraint counts as active, free of units
 
 @dataclass(frozen=True, eq=False)
 class Consistent(BatchEstimator):
-    """Physically consistent estimate of the standard parameters.
+    """Physically consistent standard parameters, near their prior where the data say nothing.
 
     Minimises, over the standard parameters pi,
 
@@ -102,7 +92,7 @@ class Consistent(BatchEstimator):
                 raise DataError(f"{name} has shape {getattr(self, name).shape}, wanted {shape}")
         if not (np.isfinite(self.prior_std) & (self.prior_std > 0)).all():
             raise DataError("prior_std must be positive and finite for every parameter")
-        if not np.isfinite(self.prior).all() or not np.isfinite(self._held).all():
+        if not np.isfinite(self.prior).all() or not np.isfinite(self.known_share).all():
             raise DataError("prior and held must be finite for every parameter")
         if not (self.margin > 0 and self.prior_weight > 0):
             raise DataError(
@@ -113,7 +103,7 @@ class Consistent(BatchEstimator):
                 f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
                 f"{self.solver!r}, wanted one of {list(SOLVERS)}"
             )
-        check_constraints(self.constraints, self.layout, self.prior, self._held)
+        self.constraints.check(self.layout, self.prior, self.known_share)
 
     @property
     def in_cone(self) -> "Consistent":
@@ -152,9 +142,6 @@ class Consistent(BatchEstimator):
             estimate: Base parameters, as a recursive estimator has them at any moment. Those of
                 infinite variance count as unknown.
 
-        Returns:
-            The estimate over the p standard parameters.
-
         Raises:
             DataError: If no base parameter has a finite variance, or C is not positive definite.
             NotConvergedError: If the cone solver does not solve it.
@@ -180,39 +167,30 @@ class Consistent(BatchEstimator):
         )
 
     def noise(self, factors: Factors, sigma: Array | None = None) -> Array:
-        """Return the noise level of each joint, by the fit without the inequalities.
+        """Return the noise levels, shape (n,) [N m or N], by the fit without the inequalities.
 
         Args:
             factors: The factors, of base parameters.
             sigma: Those of weighted least squares, shape (n,), if they are known [N m or N].
-
-        Returns:
-            Noise levels, shape (n,) [N m or N]; see ``Programme.noise``.
         """
         start = self._wls(factors).sigma if sigma is None else sigma
         return self.programme.noise(factors, start, self.independent_share, self.prior_weight)
 
     def rows(self, factors: Factors, sigma: Array) -> Array:
-        """Return the rows [R d] with |R K pi - d|^2 the weighted squares of the residual.
+        """Return rows [R d], shape (b + 1, b + 1), |R K pi - d|^2 the weighted squared residual.
 
         Args:
             factors: The factors, of base parameters.
             sigma: Noise level per joint, shape (n,) [N m or N].
-
-        Returns:
-            Upper triangular factor, shape (b + 1, b + 1), free of units.
         """
         return factors.weighted(sigma / np.sqrt(self.independent_share))
 
     def objective(self, rows: Array, pi: Array) -> float:
-        """Return what the fit minimises.
+        """Return what the fit minimises; see ``Programme.objective``.
 
         Args:
             rows: Information, shape (k, b + 1).
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            The weighted squares of the residual plus the weighted penalty [-].
         """
         return self.programme.objective(rows, pi, self.prior_weight)
 
@@ -233,12 +211,11 @@ class Consistent(BatchEstimator):
     @cached_property
     def programme(self) -> Programme:
         """The convex programme, for any data and weight."""
-        size, scale = self.layout.n_inertial, self.prior_std
-        E, e = equalities(self.constraints, self.layout, self.prior)
-        cone = consistency_cone(
-            self.constraints, self.layout, scale, self._held, body_units(scale[:size]), self.margin
-        )
-        penalty = make_penalty(self.metric, self.layout, self.prior, scale, self._held)
+        scale, held = self.prior_std, self.known_share
+        units = body_units(scale[: self.layout.n_inertial])
+        E, e = self.constraints.equalities(self.layout, self.prior)
+        cone = self.constraints.cone(self.layout, scale, held, units, self.margin)
+        penalty = make_penalty(self.metric, self.layout, self.prior, scale, held)
         space = Subspace.of(E * scale, e)
         return Programme(self.K, scale, penalty, cone, space, self.solver, self.max_iterations)
 
@@ -254,25 +231,23 @@ class Consistent(BatchEstimator):
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
+    @property
+    def known_share(self) -> Array:
+        """The share of each body that is held, shape (10 bodies,); 0 for nothing."""
+        return np.zeros(self.layout.n_inertial) if self.held is None else self.held
+
     def undetermined(self, rows: Array, base_names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the base parameters that the data do not determine by themselves.
+        """Return the names of the base parameters that the data do not determine by themselves.
 
         See ``determine``; whatever metric and weight the prior has.
 
         Args:
             rows: Information, shape (k, b + 1), as of ``rows``.
             base_names: Names of the base parameters.
-
-        Returns:
-            Their names.
         """
         known = self.layout.owned_by(self.constraints.pinned)
         before = base_spread(self.K, self.prior_std, known)
         return determine(base_names, rows[:, :-1], before).undetermined
-
-    @property
-    def _held(self) -> Array:
-        return np.zeros(self.layout.n_inertial) if self.held is None else self.held
 
     def _wls(self, factors: Factors) -> Estimate:
         """Return weighted least squares; directions that the data leave open keep the prior."""
@@ -282,16 +257,12 @@ class Consistent(BatchEstimator):
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""
         is_bound = self.programme.space.basis.shape[1] < len(pi)
-        chosen = (
-            {}
-            if self.choice is None
-            else {
-                "chosen_by": self.choice.how,
-                "curve": [list(pair) for pair in self.choice.curve],
-            }
-        )
+        prior: dict[str, Any] = {"metric": self.metric, "weight": self.prior_weight}
+        if self.choice is not None:
+            prior["chosen_by"] = self.choice.how
+            prior["curve"] = [list(pair) for pair in self.choice.curve]
         return {
-            "prior": {"metric": self.metric, "weight": self.prior_weight, **chosen},
+            "prior": prior,
             "solver": self.solver,
             "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
             "active": sorted(set(self.active(pi)[1])),

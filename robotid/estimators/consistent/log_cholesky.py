@@ -15,13 +15,7 @@ from robotid.exceptions import SettingsError
 from robotid.regressor.factors import Factors
 from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
 
-__all__ = [
-    "LogCholesky",
-    "from_log_cholesky",
-    "log_cholesky_curvature",
-    "log_cholesky_jacobian",
-    "to_log_cholesky",
-]
+__all__ = ["LogCholesky", "from_log_cholesky"]
 
 _INSIDE = 1e-6  # a start on the boundary is moved inside by that, free of units
 _STEPS = 500
@@ -111,14 +105,11 @@ class LogCholesky(BatchEstimator):
         return z, value, _STEPS, False
 
     def derivatives(self, rows: Array, z: Array) -> tuple[Array, Array]:
-        """Return gradient and Hessian of the objective with respect to the coordinates.
+        """Return gradient, shape (p,), and Hessian, shape (p, p), of the objective by coordinates.
 
         Args:
             rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
-
-        Returns:
-            Gradient, shape (p,), and Hessian, shape (p, p).
         """
         fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
         pi, J = self._parameters(z)
@@ -142,8 +133,8 @@ class LogCholesky(BatchEstimator):
         """Return the coordinates of parameters, moved inside if they are on the boundary."""
         fit = self.fit_in_cone
         size, shrink = fit.layout.n_inertial, self._shrink
-        rest = shrink @ pseudo_inertia(pi[:size] - self._held) @ shrink - fit.margin * np.eye(4)
-        values, vectors = np.linalg.eigh(rest)
+        rest = pseudo_inertia(pi[:size] - fit.known_share)
+        values, vectors = np.linalg.eigh(shrink @ rest @ shrink - fit.margin * np.eye(4))
         inside = (vectors * np.maximum(values, _INSIDE)[:, None]) @ vectors.transpose(0, 2, 1)
         drives = (pi / fit.prior_std)[size:]
         signs = self._signs
@@ -162,14 +153,9 @@ class LogCholesky(BatchEstimator):
         drives[self._signs] = slope[self._signs] = np.exp(drives[self._signs])
         drives[self._signs] += SIGN_MARGIN
         scale = fit.prior_std[size:]
-        pi = np.concatenate([_inertial(rest).reshape(-1) + self._held, drives * scale])
+        pi = np.concatenate([_inertial(rest).reshape(-1) + fit.known_share, drives * scale])
         blocks = [_inertial(slopes_i).T for slopes_i in slopes]
         return pi, scipy.linalg.block_diag(*blocks, np.diag(slope * scale))
-
-    @property
-    def _held(self) -> Array:
-        held = self.fit_in_cone.held
-        return np.zeros(self.fit_in_cone.layout.n_inertial) if held is None else held
 
     @property
     def _shrink(self) -> Array:
@@ -182,33 +168,19 @@ class LogCholesky(BatchEstimator):
 
 
 def from_log_cholesky(z: Array) -> Array:
-    """Return the matrices U U^T of log-Cholesky parameters.
+    """Return the matrices U U^T, shape (n, 4, 4), of log-Cholesky parameters.
 
     U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2], [0, 0, exp d3, t3], [0, 0, 0, 1]].
 
     Args:
         z: alpha d1 d2 d3 s12 s23 s13 t1 t2 t3 of each matrix, shape (n, 10).
-
-    Returns:
-        Positive definite matrices, shape (n, 4, 4).
-
-    References:
-        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
     """
     U = _factor(z)
-    J: Array = U @ U.transpose(0, 2, 1)
-    return J
+    return U @ U.transpose(0, 2, 1)
 
 
 def to_log_cholesky(J: Array) -> Array:
-    """Return the log-Cholesky parameters of matrices; the inverse of ``from_log_cholesky``.
-
-    Args:
-        J: Positive definite matrices, shape (n, 4, 4).
-
-    Returns:
-        Parameters, shape (n, 10).
-    """
+    """Return the parameters, shape (n, 10); the inverse of ``from_log_cholesky``."""
     U = np.linalg.cholesky(J[:, ::-1, ::-1])[:, ::-1, ::-1]  # upper: J = U U^T
     alpha = np.log(U[:, 3, 3])
     U = U / U[:, 3:, 3:]
@@ -218,39 +190,23 @@ def to_log_cholesky(J: Array) -> Array:
 
 
 def log_cholesky_jacobian(z: Array) -> Array:
-    """Return the derivatives of U U^T with respect to the parameters.
-
-    Args:
-        z: Parameters, shape (n, 10).
-
-    Returns:
-        Derivatives, shape (n, 10, 4, 4).
-    """
+    """Return the derivatives of U U^T by the parameters, shape (n, 10, 4, 4)."""
     half = _slopes(z) @ _factor(z).transpose(0, 2, 1)[:, None]
     slopes: Array = half + half.transpose(0, 1, 3, 2)
     return slopes
 
 
 def log_cholesky_curvature(z: Array, G: Array) -> Array:
-    """Return the second derivatives of tr(G U U^T) with respect to the parameters.
-
-    Args:
-        z: Parameters, shape (n, 10).
-        G: Symmetric matrices, shape (n, 4, 4).
-
-    Returns:
-        Hessians, shape (n, 10, 10).
-    """
+    """Return the second derivatives of tr(G U U^T), G (n, 4, 4), by z, shape (n, 10, 10)."""
     dU, U = _slopes(z), _factor(z)
-    H = 2.0 * np.einsum("nkai,nab,nlbi->nkl", dU, G, dU, optimize=True)
+    H: Array = 2.0 * np.einsum("nkai,nab,nlbi->nkl", dU, G, dU, optimize=True)
     along = 2.0 * np.einsum("nab,nkai,nbi->nk", G, dU, U, optimize=True)  # tr(G dU U^T), twice
     # U is exponential in alpha, and its diagonal in d
     H[:, 0, :] += along
     H[:, 1:, 0] += along[:, 1:]
     for k in range(1, 4):
         H[:, k, k] += along[:, k]
-    curvature: Array = H
-    return curvature
+    return H
 
 
 _UPPER = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # s12 s23 s13 t1 t2 t3
@@ -263,8 +219,7 @@ def _factor(z: Array) -> Array:
     U[:, 3, 3] = 1.0
     for k, (i, j) in enumerate(_UPPER):
         U[:, i, j] = z[:, 4 + k]
-    scaled: Array = np.exp(z[:, 0])[:, None, None] * U
-    return scaled
+    return np.exp(z[:, 0])[:, None, None] * U
 
 
 def _slopes(z: Array) -> Array:
@@ -292,5 +247,4 @@ _TO_PI = np.linalg.inv(svec(pseudo_inertia_basis()))  # svec(J) @ _TO_PI = pi
 
 def _inertial(J: Array) -> Array:
     """Return the inertial parameters of symmetric matrices, shape (..., 10)."""
-    parameters: Array = svec(J) @ _TO_PI
-    return parameters
+    return svec(J) @ _TO_PI

@@ -5,8 +5,10 @@ Each penalty is about |delta / sigma|^2 near the prior, so that one weight means
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
+import scipy.linalg
 
 from robotid._typing import Array
 from robotid.robot.parameters import (
@@ -47,77 +49,59 @@ class WeightChoice:
 
 
 class Penalty(ABC):
-    """A convex penalty on the distance from the prior."""
+    """A convex penalty on the distance from the prior.
 
-    @property
-    @abstractmethod
-    def centre(self) -> Array:
-        """Where it is 0, shape (p,)."""
+    Attributes:
+        is_quadratic: Whether its Hessian is the same everywhere.
+        centre: Where it is 0, shape (p,).
+    """
 
-    @property
-    @abstractmethod
-    def is_quadratic(self) -> bool:
-        """Whether its Hessian is the same everywhere."""
+    is_quadratic: ClassVar[bool]
+    centre: Array
 
     @abstractmethod
     def value(self, pi: Array) -> float:
-        """Return the penalty.
+        """Return the penalty, at least 0; infinite where the metric is not defined.
 
         Args:
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            At least 0; infinite where the metric is not defined.
         """
 
     @abstractmethod
     def gradient(self, pi: Array) -> Array:
-        """Return its gradient.
+        """Return its gradient, shape (p,).
 
         Args:
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            Gradient, shape (p,).
         """
 
     @abstractmethod
     def hessian(self, pi: Array) -> Array:
-        """Return its second derivative.
+        """Return its second derivative, shape (p, p), positive definite.
 
         Args:
             pi: Standard parameters, shape (p,).
-
-        Returns:
-            Hessian, shape (p, p), positive definite.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Quadratic(Penalty):
-    """(pi - prior)^T M (pi - prior).
+    """(pi - centre)^T M (pi - centre).
 
     Attributes:
-        prior: Prior values, shape (p,).
+        centre: Prior values, shape (p,).
         M: Metric, shape (p, p), positive definite.
     """
 
-    prior: Array
+    is_quadratic = True
+    centre: Array
     M: Array
 
-    @property
-    def centre(self) -> Array:
-        return self.prior
-
-    @property
-    def is_quadratic(self) -> bool:
-        return True
-
     def value(self, pi: Array) -> float:
-        return float((pi - self.prior) @ self.M @ (pi - self.prior))
+        return float((pi - self.centre) @ self.M @ (pi - self.centre))
 
     def gradient(self, pi: Array) -> Array:
-        slope: Array = 2.0 * self.M @ (pi - self.prior)
+        slope: Array = 2.0 * self.M @ (pi - self.centre)
         return slope
 
     def hessian(self, pi: Array) -> Array:
@@ -126,31 +110,24 @@ class Quadratic(Penalty):
 
 @dataclass(frozen=True, eq=False)
 class _Entropic(Penalty):
-    """2 sum_i d(J_i || P_i) of the bodies, and |(pi - prior) / std|^2 of the drives.
+    """2 sum_i d(J_i || P_i) of the bodies, and |(pi - centre) / std|^2 of the drives.
 
     d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det, half the
     Kullback-Leibler distance of two mass distributions seen as Gaussians, times 4.
 
     Attributes:
-        prior: Prior values, shape (p,).
+        centre: Prior values, shape (p,).
         precision: 1 / std^2 of the drives, shape (drives,).
         held: Known share of each body, shape (10 bodies,).
     """
 
-    prior: Array
+    is_quadratic = False
+    centre: Array
     precision: Array
     held: Array
 
-    @property
-    def centre(self) -> Array:
-        return self.prior
-
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
     def value(self, pi: Array) -> float:
-        J, P = self._rest(pi), self._rest(self.prior)
+        J, P = self._rest(pi), self._rest(self.centre)
         if np.linalg.eigvalsh(J)[:, 0].min() <= 0:
             return float("inf")
         ratio = np.linalg.solve(P, J)
@@ -159,21 +136,21 @@ class _Entropic(Penalty):
         return float(2.0 * divergence.sum() + self.precision @ self._drives(pi) ** 2)
 
     def gradient(self, pi: Array) -> Array:
-        J, P = self._rest(pi), self._rest(self.prior)
+        J, P = self._rest(pi), self._rest(self.centre)
         slope = np.linalg.inv(P) - np.linalg.inv(J)
         inertial = 2.0 * np.einsum("nij,kij->nk", slope, pseudo_inertia_basis()).reshape(-1)
         return np.concatenate([inertial, 2.0 * self.precision * self._drives(pi)])
 
     def hessian(self, pi: Array) -> Array:
         inertial = pull_back_metric(self._rest(pi))
-        return 2.0 * _block_diagonal(inertial, self.precision)
+        H: Array = 2.0 * scipy.linalg.block_diag(*inertial, np.diag(self.precision))
+        return H
 
     def _rest(self, pi: Array) -> Array:
         return pseudo_inertia(pi[: len(self.held)] - self.held)
 
     def _drives(self, pi: Array) -> Array:
-        drives: Array = (pi - self.prior)[len(self.held) :]
-        return drives
+        return (pi - self.centre)[len(self.held) :]
 
 
 def make_penalty(
@@ -197,9 +174,6 @@ def make_penalty(
         prior_std: How far they may plausibly be wrong, shape (p,).
         held: Known share of each body, shape (10 bodies,).
 
-    Returns:
-        The penalty.
-
     References:
         Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
         approach, (24), (32).
@@ -213,21 +187,18 @@ def make_penalty(
     precision = prior_std[size:] ** -2.0
     if metric == "entropic":
         return _Entropic(repaired, precision, held)
-    return Quadratic(repaired, _block_diagonal(pull_back_metric(P), precision))
+    M = scipy.linalg.block_diag(*pull_back_metric(P), np.diag(precision))
+    return Quadratic(repaired, M)
 
 
 def pull_back_metric(J: Array) -> Array:
-    """Return the affine-invariant metric in coordinates pi: g_kl = tr(J^-1 B_k J^-1 B_l).
+    """Return the affine-invariant metrics g_kl = tr(J^-1 B_k J^-1 B_l), shape (n, 10, 10).
 
     Args:
         J: Pseudo-inertias, shape (n, 4, 4), positive definite.
 
-    Returns:
-        Metrics, shape (n, 10, 10).
-
     References:
-        Lee, Wensing, Park (2019), Geometric robot dynamic identification: a convex programming
-        approach, (22).
+        Lee, Wensing, Park (2019), as of ``make_penalty``, (22).
     """
     slopes = np.linalg.solve(J[:, None], pseudo_inertia_basis()[None])  # (n, 10, 4, 4)
     metric: Array = np.einsum("nkij,nlji->nkl", slopes, slopes)
@@ -235,20 +206,16 @@ def pull_back_metric(J: Array) -> Array:
 
 
 def body_units(spread: Array) -> Array:
-    """Return T^-1/2 per body, which makes its pseudo-inertia free of units.
+    """Return T^-1/2, which makes pseudo-inertias free of units: diagonal, shape (bodies, 4, 4).
 
     Args:
         spread: How far the inertial parameters may lie from their prior, shape (10 bodies,): mass
             m and radius r of a body's size are those of m and m r.
-
-    Returns:
-        Diagonal matrices, shape (bodies, 4, 4).
     """
     by_body = spread.reshape(-1, 10)
     mass, radius = by_body[:, 0], by_body[:, 1] / by_body[:, 0]
     diagonal = np.column_stack([1 / radius] * 3 + [np.ones_like(mass)])
-    shrink: Array = np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
-    return shrink
+    return np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
 
 
 def _widened(J: Array, shrink: Array) -> Array:
@@ -257,13 +224,4 @@ def _widened(J: Array, shrink: Array) -> Array:
     floored = (vectors * np.maximum(values, _THINNEST)[:, None]) @ vectors.transpose(0, 2, 1)
     grow = np.linalg.inv(shrink)
     changed = values[:, 0] < _THINNEST
-    widened: Array = np.where(changed[:, None, None], grow @ floored @ grow, J)
-    return widened
-
-
-def _block_diagonal(inertial: Array, precision: Array) -> Array:
-    size = 10 * len(inertial)
-    M = np.diag(np.concatenate([np.zeros(size), precision]))
-    for i, block in enumerate(inertial):
-        M[10 * i : 10 * i + 10, 10 * i : 10 * i + 10] = block
-    return M
+    return np.where(changed[:, None, None], grow @ floored @ grow, J)

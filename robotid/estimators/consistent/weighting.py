@@ -36,9 +36,6 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
         stretches: Factors of contiguous stretches of the fitted data.
         how: "cv" or "evidence".
 
-    Returns:
-        The choice.
-
     Raises:
         DataError: If "cv" has fewer than two stretches.
         NotConvergedError: If a fit does not converge.
@@ -89,7 +86,7 @@ def held_out_errors(
 
 
 def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
-    """Return the log marginal likelihood of the data as a function of the prior's weight.
+    """Return the log marginal likelihood of the data by the prior's weight, but for a constant.
 
     With x = L (pi - centre) ~ N(0, 1 / weight) before the data and r = A x + noise of unit
     variance, r ~ N(0, I + A A^T / weight). A penalty that is not quadratic is expanded at its
@@ -99,9 +96,6 @@ def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
         fit: The fit, whose own weight does not matter.
         rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
         weight: Weight of the prior.
-
-    Returns:
-        The logarithm, but for a constant that does not depend on the weight.
 
     References:
         MacKay (1992), Bayesian interpolation, section 4.

@@ -12,11 +12,11 @@ import numpy as np
 
 from robotid._files import written_whole
 from robotid._typing import Array
-from robotid.estimators.estimator import Estimate, Estimator, require_rows
-from robotid.exceptions import DataError, RankDeficientError
-from robotid.regressor.problem import Problem, Sample
+from robotid.estimators.estimator import Estimate, Estimator
+from robotid.exceptions import DataError
+from robotid.regressor.problem import Sample
 
-__all__ = ["Filter", "RecursiveEstimator", "fold", "load_state", "save_state", "scaled_rows"]
+__all__ = ["RecursiveEstimator", "fold", "load_state", "save_state", "scaled_rows"]
 
 StateT = TypeVar("StateT")
 
@@ -36,9 +36,6 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
 
         Args:
             c: Number of parameters.
-
-        Returns:
-            The state.
         """
 
     @abstractmethod
@@ -48,9 +45,6 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
         Args:
             state: The state before.
             sample: One instant; rows of weight 0 are skipped.
-
-        Returns:
-            The state after.
 
         Raises:
             DataError: If the sample is not finite or of another shape; the state stays valid.
@@ -63,36 +57,7 @@ class RecursiveEstimator(Estimator, Generic[StateT]):
         Args:
             state: The state.
             names: Names of the c parameters.
-
-        Returns:
-            The estimate.
         """
-
-
-class Filter(RecursiveEstimator[StateT]):
-    """A recursive estimator that visits the samples once, in the order of time."""
-
-    prior: Array | None
-
-    @abstractmethod
-    def rows_of(self, state: StateT) -> int:
-        """Return the number of rows that a state rests on.
-
-        Args:
-            state: The state.
-
-        Returns:
-            The number.
-        """
-
-    def fit(self, data: Problem) -> Estimate:
-        c = len(data.names)
-        state = fold(self, data.samples(), self.init(c))
-        require_rows(self.rows_of(state), c, data.n_joints)
-        estimate = self.estimate(state, data.names)
-        if estimate.rank < c and self.prior is None:
-            raise RankDeficientError(estimate.rank, estimate.undetermined, c)
-        return estimate
 
 
 def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state: StateT) -> StateT:
@@ -103,9 +68,6 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
         samples: The samples, in the order of the updates.
         state: The state before.
 
-    Returns:
-        The state after.
-
     Raises:
         DataError: If a sample is not finite or of another shape.
     """
@@ -115,15 +77,12 @@ def fold(estimator: RecursiveEstimator[StateT], samples: Iterable[Sample], state
 
 
 def scaled_rows(sample: Sample, sigma: Array, c: int) -> Array:
-    """Return the rows [Y tau] of a sample in units of their noise, those of weight 0 left out.
+    """Return rows sqrt(weight_j) / sigma_j [Y_j tau_j], shape (k, c + 1), but those of weight 0.
 
     Args:
         sample: One instant.
         sigma: Noise level of each joint, shape (n,) [N m or N].
         c: Number of parameters.
-
-    Returns:
-        Rows sqrt(weight_j) / sigma_j [Y_j tau_j], shape (k, c + 1), k <= n.
 
     Raises:
         DataError: If the sample is not finite or of another shape.
@@ -162,14 +121,11 @@ def save_state(state: Any, path: str | Path) -> None:  # noqa: ANN401
 
 
 def load_state(path: str | Path, kind: type[StateT]) -> StateT:
-    """Read a state back.
+    """Read a state back; updates from it give the same bits as an unbroken run.
 
     Args:
         path: The file.
         kind: Class of the state, as ``RLSState``.
-
-    Returns:
-        The state; updates from it give the same bits as an unbroken run.
 
     Raises:
         DataError: If the file is missing, no NPZ, or holds another kind of state.

@@ -16,7 +16,7 @@ from robotid.estimators.recursive.base import RecursiveEstimator, fold, scaled_r
 from robotid.exceptions import DataError
 from robotid.regressor.problem import Problem, Sample, shuffled
 
-__all__ = ["Descent", "DescentState", "NormalisedGradient", "Rows", "column_scale"]
+__all__ = ["PRX", "DescentState", "NormalisedGradient", "column_scale"]
 
 #: Rows of a sample: all, or the indices of those of positive weight.
 Rows: TypeAlias = slice | Array
@@ -24,6 +24,8 @@ Rows: TypeAlias = slice | Array
 _AVERAGE = 3.0  # weight of the newest iterate: 3 / (k + 2), so that the start fades as k^-3
 _MEMORY = 1000.0  # [samples] over which PRX and the residuals are averaged
 _SILENT = 1e-9  # columns smaller than this share of the largest are not scaled up
+_SMALLEST = 1e-6  # eigenvalues of D(q, P^) below this share of the largest are raised to it
+_RIDGE = 1e-9  # of metric "rows": rows that depend on each other stay soluble
 _GAIN = 0.01  # a pass that makes the squared residual smaller by less brings nothing more
 _ZERO = 2.0  # a mean PRX below this many of its standard errors is 0
 
@@ -86,9 +88,7 @@ class Descent(RecursiveEstimator[DescentState]):
     eps2: float = 1e-12
 
     def __post_init__(self) -> None:
-        for name in ("passes", "eps1", "eps2"):
-            if not getattr(self, name) > 0:
-                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
+        self._require_positive("passes", "eps1", "eps2")
         self._check()
 
     @property
@@ -175,6 +175,11 @@ class Descent(RecursiveEstimator[DescentState]):
                 break
         return replace(estimator.estimate(state, data.names), converged=settled)
 
+    def _require_positive(self, *names: str) -> None:
+        for name in names:
+            if not getattr(self, name) > 0:
+                raise DataError(f"{name} is {getattr(self, name)}, wanted a positive number")
+
     @property
     def _unit(self) -> Array | float:
         return 1.0 if self.scale is None else self.scale
@@ -223,26 +228,122 @@ class NormalisedGradient(Descent):
     def _check(self) -> None:
         if not 0 < self.step_size < 2:
             raise DataError(f"step_size is {self.step_size}, wanted above 0 and below 2")
-        if not self.regularisation > 0:
-            raise DataError(f"regularisation is {self.regularisation}, wanted a positive number")
+        self._require_positive("regularisation")
 
     def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
         gamma = self.step_size / (self.regularisation + np.vdot(Psi, Psi))
-        moved: Array = x - gamma * (e @ Psi)
-        return moved
+        return x - gamma * (e @ Psi)
+
+
+@dataclass(frozen=True, eq=False)
+class PRX(Descent):
+    """The paper's update P^ <- P^ - gamma Psi^T eta (24), with e = Psi P^ - tau and eta = M e.
+
+    * step "printed": eta = D^-1 e, gamma = sigma_D / |Psi|_F^2, sigma_D the smallest eigenvalue of
+      D(q, P^). On an arm of six joints it hardly moves.
+    * step "exact": gamma = e^T eta / |Psi^T eta|^2, the minimiser of |P~| along the direction.
+
+    Without noise |P~| never grows: with "exact" for any positive definite M, with "printed" while
+    sigma_min(D(q, P^)) <= 2 sigma_min(D(q, P)). With column scaling that is the norm of
+    scale * P~.
+
+    With noise each iterate jumps about as far as the noise of its own sample. On the recordings of
+    a UR10e and a Panda the last iterate predicts 1.3 to 1.9 times worse than weighted least
+    squares; the average of the iterates, the k-th weighted by k^2, 1.03 to 1.05 times after one
+    pass. Steps that shrink as 1/k came to 1.03 to 1.2, depending on their rate, and a dead zone of
+    the size of the noise to 1.1 to 1.7; so ``average`` takes the average.
+
+    ``fit`` scales the columns of step "exact" only.
+
+    Attributes:
+        step: "exact" or "printed".
+        metric: Of step "exact": "noise" for M = diag(sigma^-2); "mass" for M = D(q, P^)^-1, as
+            printed; "rows" for M = (Psi Psi^T)^-1, which fits a sample's rows all at once.
+        bounds: Radius of the set Omega (8) about the prior in scaled parameters; None for none.
+
+    References:
+        Tzvetkova, Extracting Inertial Parameters from Robotic Manipulators Dynamics, (20)-(25).
+    """
+
+    step: str = "exact"
+    metric: str = "noise"
+    bounds: float | None = None
+
+    @property
+    def needs_mass(self) -> bool:
+        return self.step == "printed" or self.metric == "mass"
+
+    @property
+    def _takes_scale(self) -> bool:
+        return self.step == "exact"
+
+    def _check(self) -> None:
+        if self.step not in ("exact", "printed"):
+            raise DataError(f"step is {self.step!r}, wanted 'exact' or 'printed'")
+        if self.metric not in ("noise", "mass", "rows"):
+            raise DataError(f"metric is {self.metric!r}, wanted 'noise', 'mass' or 'rows'")
+        if self.bounds is not None:
+            self._require_positive("bounds")
+
+    def _moved(self, x: Array, Psi: Array, e: Array, used: Rows, sample: Sample) -> Array:
+        if self.needs_mass:
+            step = self._massive_step(x, sample, used)
+        elif self.metric == "noise":
+            step = _exact(Psi, e, e)
+        else:
+            A = Psi @ Psi.T
+            A.flat[:: len(A) + 1] += _RIDGE * np.trace(A)
+            step = _exact(Psi, e, np.linalg.solve(A, e))
+        moved: Array = x - step
+        return moved if self.bounds is None else self._bounded(moved, self.bounds)
+
+    def _massive_step(self, x: Array, sample: Sample, used: Rows) -> Array:
+        """Return the step with eta = D^-1 e (20), rows as the paper has them."""
+        Psi = sample.Y[used] / self._unit
+        values, vectors = self._inertia(x, sample)
+        e = np.zeros(len(values))
+        e[used] = Psi @ x - sample.tau[used]
+        eta = vectors @ ((e @ vectors) / values)  # D^-1 e
+        if self.step == "exact":
+            return _exact(Psi, e[used], eta[used])
+        gamma = values[0] / np.vdot(Psi, Psi)  # sigma_D / |Psi|_F^2
+        printed: Array = gamma * (eta[used] @ Psi)  # (24)
+        return printed
+
+    def _inertia(self, x: Array, sample: Sample) -> tuple[Array, Array]:
+        """Return eigenvalues and eigenvectors of D(q, P^), which is linear in P^ (11).
+
+        Any positive definite D keeps the proof, so an estimate that makes it indefinite on its way
+        costs nothing: small and negative eigenvalues are raised.
+        """
+        if sample.mass_regressor is None:
+            raise DataError(
+                "PRX needs the mass regressor of each sample; build the problem with "
+                "build_problem(..., with_mass=True)"
+            )
+        D = sample.mass_regressor @ (x / self._unit)  # (n, n)
+        if not np.isfinite(D).all():
+            raise DataError("the mass regressor of the sample is not finite, so it was refused")
+        values, vectors = np.linalg.eigh((D + D.T) / 2)
+        largest = float(np.abs(values).max())
+        return np.maximum(values, _SMALLEST * largest if largest > 0 else 1.0), vectors
+
+    def _bounded(self, x: Array, radius: float) -> Array:
+        """Return P^ projected onto Omega (8), a ball about the prior."""
+        centre = self.init(len(x)).x
+        away = x - centre
+        distance = float(np.linalg.norm(away))
+        return x if distance <= radius else centre + away * (radius / distance)
 
 
 def column_scale(problem: Problem, sigma: Array) -> Array:
-    """Return the root mean square of each column, rows in units of their noise.
+    """Return the root mean square of columns, shape (c,), positive, rows in units of their noise.
 
     Scaled by it, all columns have the same norm. A column without data keeps 1.
 
     Args:
         problem: The rows.
         sigma: Noise level of each joint, shape (n,) [N m or N].
-
-    Returns:
-        Scaled parameters per parameter, shape (c,), positive.
 
     Raises:
         DataError: If a row is not finite.
@@ -257,3 +358,11 @@ def column_scale(problem: Problem, sigma: Array) -> Array:
         raise DataError("the problem holds a row that is not finite; check the trajectory")
     rms = np.sqrt(squares / max(count, 1))
     return np.where(rms > _SILENT * rms.max(initial=0.0), rms, 1.0)
+
+
+def _exact(Psi: Array, e: Array, eta: Array) -> Array:
+    """Return gamma* Psi^T eta, gamma* = e^T eta / |Psi^T eta|^2: the nearest point to P."""
+    direction = eta @ Psi
+    square = direction @ direction
+    gamma = (e @ eta) / square if square > 0 else 0.0
+    return gamma * direction

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.estimators.consistent.cones import Cone, Subspace, svec, unsvec
-from robotid.estimators.consistent.solvers import SOLVERS, least_squares
+from robotid.estimators.consistent.cones import SOLVERS, Cone, Subspace, least_squares, svec, unsvec
 from robotid.exceptions import NotConvergedError
 from robotid.robot.parameters import pseudo_inertia_basis
 
@@ -81,7 +80,7 @@ def test_bounds_without_a_point_are_named(solver):
 
 @pytest.mark.parametrize(("solver", "name"), [("clarabel", "Clarabel"), ("scs", "SCS")])
 def test_a_solver_that_stops_early_says_so(solver, name, monkeypatch):
-    monkeypatch.setattr("robotid.estimators.consistent.solvers._SCS_ITERATIONS", 1)
+    monkeypatch.setattr("robotid.estimators.consistent.cones._SCS_ITERATIONS", 1)
     A, d = np.diag(10.0 ** np.arange(-5, 5)), -np.arange(1.0, 11.0)
     text = f"was not solved by {name}, with the constraints psd; "
     with pytest.raises(NotConvergedError, match=text) as caught:
