@@ -53,9 +53,6 @@ def doubts_of(
         joints: The model's joints. A finding whose place names some is about these only.
         kept: Names of the recordings kept apart, one each.
         is_robust: Whether a robust loss was set.
-
-    Returns:
-        The doubts in the order of the findings.
     """
     outvoted = {_place(f) for f in findings if is_robust and is_outvoted(f)}
     found = []

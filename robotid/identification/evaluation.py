@@ -203,9 +203,6 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
         evaluations: The recordings, at least one.
         name: Which parameters predict.
 
-    Returns:
-        The metrics.
-
     Raises:
         DataError: If no row of any recording is used.
     """

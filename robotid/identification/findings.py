@@ -26,9 +26,6 @@ def fit_findings(identification: Identification) -> list[Finding]:
 
     Args:
         identification: What was found.
-
-    Returns:
-        The findings, none if all is well.
     """
     findings = []
     known = identification.determination
@@ -77,9 +74,6 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
     Args:
         model: The robot.
         stated: Names of the locked joints that stand where the user says, or follow others.
-
-    Returns:
-        A warning "locked_at_zero", or none.
     """
     assumed = [name for name in model.locked if name not in stated]
     if not assumed:
@@ -96,9 +90,6 @@ def log_findings(logs: Sequence[Log]) -> list[Finding]:
 
     Args:
         logs: The logs.
-
-    Returns:
-        A note "log_note" per note.
     """
     by_note: dict[str, list[str]] = {}
     for log in logs:
@@ -115,9 +106,6 @@ def consistency_findings(identification: Identification) -> list[Finding]:
 
     Args:
         identification: What was found.
-
-    Returns:
-        The findings, none if all is well.
     """
     findings = []
     check, details = identification.mass_matrix, identification.estimate.details

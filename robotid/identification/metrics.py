@@ -99,9 +99,6 @@ class TorqueSums:
             prediction: Predicted torque, shape (N, n) [N m, N].
             mask: Rows used, shape (N, n), bool.
             baselines: Other predictions to compare with, by name, each of shape (N, n).
-
-        Returns:
-            The sums.
         """
         rows = mask.sum(axis=0)
         mean = np.sum(tau, axis=0, where=mask) / np.maximum(rows, 1)
@@ -125,9 +122,6 @@ class TorqueSums:
         Args:
             other: Those of other rows of the same joints, with the same baselines.
 
-        Returns:
-            The sums.
-
         References:
             Chan, Golub, LeVeque (1983), Algorithms for Computing the Sample Variance, (2.1).
         """
@@ -149,9 +143,6 @@ class TorqueSums:
         Args:
             names: Names of the n joints.
             units: Units of their torques.
-
-        Returns:
-            The metrics.
 
         Raises:
             DataError: If no row is used at all.

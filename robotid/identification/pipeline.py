@@ -171,9 +171,6 @@ class Identification:
 
         Args:
             evaluation: One of the recordings.
-
-        Returns:
-            The band.
         """
         K, C = self.mapping.K, self.standard_covariance
         return torque_band(
@@ -194,9 +191,6 @@ class Identification:
 
         Args:
             name: "estimate" or "wls".
-
-        Returns:
-            The metrics.
         """
         return pool(self.model, self.fitted, name)
 
@@ -238,9 +232,6 @@ def identify(
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
 
-    Returns:
-        The identification.
-
     Raises:
         DataError: If a log does not fit the model or is too short.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
@@ -261,9 +252,6 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
     Args:
         recordings: The recordings.
         choice: Which estimator.
-
-    Returns:
-        The identification.
 
     Raises:
         DataError: If a row of a log cannot be used.

@@ -132,9 +132,6 @@ class Recordings:
             parameters: Standard parameters by name, each of shape (p,).
             prior: Those of the URDF, shape (p,).
 
-        Returns:
-            Evaluations of the fitted logs, and of those kept apart.
-
         Raises:
             DataError: If no row of a log is used.
         """

@@ -130,9 +130,6 @@ def reweigh(
         loss: "huber" or "tukey".
         prior: Standard parameters of the URDF, shape (p,), kept where the data say nothing.
 
-    Returns:
-        The recordings with weights.
-
     Raises:
         NotConvergedError: If the weights do not settle.
         SettingsError: If the recordings are not in memory.

@@ -45,9 +45,6 @@ def base_problem(
         with_mass: As of ``build_problem``.
         compiled: As of ``build_problem``.
 
-    Returns:
-        The problem.
-
     Raises:
         DataError: If the trajectory's joints are not the model's.
     """
@@ -61,9 +58,6 @@ def independent_share(signals: SignalSettings) -> float:
 
     Args:
         signals: The settings, resolved.
-
-    Returns:
-        The share, at most 1.
     """
     if signals.cutoff is None or signals.rate is None:
         return 1.0

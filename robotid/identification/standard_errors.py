@@ -200,9 +200,6 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     Args:
         estimate: Base parameters, shape (b,).
         wls: Weighted least squares of the same rows.
-
-    Returns:
-        The estimate, with what weighted least squares says of the data.
     """
     distance = estimate.theta - wls.theta
     covariance = wls.covariance + np.outer(distance, distance)
@@ -230,9 +227,6 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
         theta: Estimate, shape (c,).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
         bread: Covariance of the parameters if rows were independent, shape (c, c).
-
-    Returns:
-        The scatter.
 
     Raises:
         DataError: If there are fewer than 12 stretches.

@@ -27,9 +27,6 @@ def identification_line(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        One line.
     """
     return (
         f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
@@ -42,9 +39,6 @@ def identification_text(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        Lines.
     """
     lines = [identification_line(found)[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
     for caption, ours, wls in _tables(found):
@@ -60,9 +54,6 @@ def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None
     Args:
         metrics: Metrics, as in result.json.
         wls: Those of weighted least squares, or none.
-
-    Returns:
-        A line of headers, and one per joint.
     """
     others = {} if wls is None else wls["per_joint"]
     width = max(len(joint) for joint in metrics["per_joint"])
@@ -86,9 +77,6 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
 
     Args:
         verdict: Status, reasons and joints, as in result.json.
-
-    Returns:
-        The status, the reasons, and the joints of each status.
     """
     lines = [f"verdict: {verdict['status']}", *(f"  - {reason}" for reason in verdict["reasons"])]
     by_status: dict[str, list[str]] = {}
@@ -103,9 +91,6 @@ def cell(value: float | None, width: int = 7) -> str:
     Args:
         value: The percentage, or None.
         width: Width of the column.
-
-    Returns:
-        Text of that width.
     """
     return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
 
@@ -115,9 +100,6 @@ def identification_html(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML without scripts or styles.
     """
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
     tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))

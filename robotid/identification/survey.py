@@ -331,9 +331,6 @@ def hold_log(
         log: The log, of the model's joints in its order.
         signals: How it becomes a trajectory.
         held: Positions of locked joints, if it has them, by name [rad or m].
-
-    Returns:
-        The log; what is wrong with it is told as it is read.
     """
     count = len(log.t)
     return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
@@ -361,9 +358,6 @@ def survey_log(
         window: First and last time stamp kept, on the log's own clock [s]; None for the ends.
         length: Rows per piece; None: the log is read at once and kept in memory. A file that is
             only read whole is one piece.
-
-    Returns:
-        The log.
 
     Raises:
         DataError: If time does not increase, the window holds fewer than two rows, or units are

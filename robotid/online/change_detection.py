@@ -178,9 +178,6 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
         covariance: Its covariance C, shape (b, b).
         columns: Columns K_L of the base mapping that belong to the body, shape (b, 10).
         spread: How large each parameter of a load may be, shape (10,).
-
-    Returns:
-        The load.
     """
     scale = np.sqrt(np.diag(covariance))
     L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))

@@ -165,9 +165,6 @@ class OnlineIdentifier:
         Args:
             index: Which of ``changes``.
 
-        Returns:
-            The load.
-
         Raises:
             DataError: If there has been no such change.
         """

@@ -66,9 +66,6 @@ class LiveSignals:
             q: Joint positions, shape (n,) [rad or m].
             tau: Joint torques, shape (n,) [N m or N].
 
-        Returns:
-            Instants, delayed; usually one.
-
         Raises:
             DataError: If a number is not finite or time does not increase; nothing is changed then.
         """

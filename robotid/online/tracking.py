@@ -67,9 +67,6 @@ def track(
         settings: How the identification runs.
         observer: Called after each sample with its row of the log and the identifier.
 
-    Returns:
-        The history, about 20 rows a second.
-
     Raises:
         DataError: If the log is too short for a first estimate, or the base floats.
         SettingsError: If a setting does not fit the log.
