@@ -38,15 +38,12 @@ class TorqueBand:
         return both
 
     def held(self, tau: Array, prediction: Array, mask: Array) -> Array:
-        """Return which share of the measured torques lies in the 95 % band.
+        """Return which share of each joint's torques lies in the 95 % band; NaN without a row.
 
         Args:
             tau: Measured torques of the whole trajectory, shape (N, n_rows) [N m, N].
             prediction: Predicted ones, shape (N, n_rows) [N m, N].
             mask: Rows used, shape (N, n_rows), bool.
-
-        Returns:
-            Shares, shape (n_rows,); not a number where no row is used.
         """
         used = mask[self.samples]
         miss = np.abs(tau[self.samples] - prediction[self.samples])
@@ -57,13 +54,9 @@ class TorqueBand:
 
 
 def torque_band(
-    model: RobotModel,
-    mapping: BaseMapping,
-    trajectory: Trajectory,
-    covariance: Array,
-    noise: Array,
+    model: RobotModel, mapping: BaseMapping, trajectory: Trajectory, covariance: Array, noise: Array
 ) -> TorqueBand:
-    """Return the band of the torques that an estimate predicts for a motion.
+    """Return the band of predicted torques, at up to 500 samples: the root of diag(W C W^T).
 
     Args:
         model: The robot.
@@ -71,9 +64,6 @@ def torque_band(
         trajectory: N samples.
         covariance: Of the base parameters, shape (b, b), finite.
         noise: Standard deviation of the torque's residual, shape (n_rows,) [N m, N].
-
-    Returns:
-        The band at up to 500 samples: the root of the diagonal of W C W^T.
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))

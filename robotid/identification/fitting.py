@@ -105,18 +105,14 @@ def make_estimator(
             gate = None if settings.gate is False else float(settings.gate)
             return Kalman(sigma, beta, C, settings.walk, gate, share)
         case PRXSettings() | GradientSettings():
-            is_shuffled = settings.seed >= 0
-            order = np.random.default_rng(settings.seed) if is_shuffled else None
-            passes, average = settings.passes, settings.average
+            common: dict[str, Any] = {
+                "average": settings.average,
+                "passes": settings.passes,
+                "rng": np.random.default_rng(settings.seed) if settings.seed >= 0 else None,
+            }
             if isinstance(settings, GradientSettings):
-                size = settings.step_size
-                return NormalisedGradient(
-                    sigma, beta, step_size=size, average=average, passes=passes, rng=order
-                )
-            step, metric = settings.step, settings.metric
-            return PRX(
-                sigma, beta, step=step, metric=metric, average=average, passes=passes, rng=order
-            )
+                return NormalisedGradient(sigma, beta, step_size=settings.step_size, **common)
+            return PRX(sigma, beta, step=settings.step, metric=settings.metric, **common)
     raise SettingsError(f"{settings!r} describes no estimator; take EstimatorSettings(name)")
 
 
@@ -167,7 +163,10 @@ def make_constraints(
         geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
             the body; boxes stated in ``com`` go before them.
     """
-    com = dict(geometry)
-    for name, (low, high) in bounds.boxes.items():
-        com[name] = (np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, np.negative(low)]))
+    A = np.vstack([np.eye(3), -np.eye(3)])
+    boxes = {
+        name: (A, np.array([*high, *np.negative(low)]))
+        for name, (low, high) in bounds.boxes.items()
+    }
+    com = {**geometry, **boxes}
     return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned))

@@ -58,8 +58,7 @@ class Metrics:
                     "relative_error_pct": m.relative_error_pct,
                     "r2": m.r2,
                     "rows": m.rows,
-                    "urdf_relative_error_pct": m.baselines["urdf"],
-                    "gravity_only_relative_error_pct": m.baselines["gravity_only"],
+                    **{f"{x}_relative_error_pct": m.baselines[x] for x in ("urdf", "gravity_only")},
                     "better_than_constant": m.better_than_constant,
                 }
                 for joint, m in self.per_joint.items()
@@ -163,10 +162,7 @@ class TorqueSums:
             relative_error_pct=self._relative_error(j, residual),
             r2=1.0 - residual / spread if spread > 0 else 0.0,
             rows=int(self.rows[j]),
-            baselines={
-                name: self._relative_error(j, float(squares[j]))
-                for name, squares in self.baselines.items()
-            },
+            baselines={x: self._relative_error(j, float(s[j])) for x, s in self.baselines.items()},
             better_than_constant=residual < spread,
         )
 

@@ -77,14 +77,11 @@ class Outlier:
 
 
 def loss_weight(loss: str, r: Array) -> Array:
-    """Return the weight of rows in the equivalent least squares.
+    """Return the weight psi(r) / r of rows in the equivalent least squares, from 0 to 1.
 
     Args:
         loss: "huber" or "tukey".
         r: Residuals in standard deviations, any shape.
-
-    Returns:
-        Weights from 0 to 1, psi(r) / r.
 
     References:
         Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting
@@ -99,14 +96,11 @@ def loss_weight(loss: str, r: Array) -> Array:
 
 
 def loss_slope(loss: str, r: Array) -> Array:
-    """Return psi'(r), how much a row still resists a change of the parameters.
+    """Return psi'(r), at most 1: how much a row still resists a change of the parameters.
 
     Args:
         loss: "huber" or "tukey".
         r: Residuals in standard deviations, any shape.
-
-    Returns:
-        Slopes, at most 1.
     """
     u = (r / LOSSES[loss]) ** 2
     slope: Array = np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
@@ -114,10 +108,7 @@ def loss_slope(loss: str, r: Array) -> Array:
 
 
 def reweigh(
-    recordings: Recordings,
-    reductions: tuple[Reduction, ...],
-    loss: str,
-    prior: Array,
+    recordings: Recordings, reductions: tuple[Reduction, ...], loss: str, prior: Array
 ) -> Reweighted:
     """Weigh rows down that fit badly, until the fit does not change any more.
 
@@ -139,22 +130,19 @@ def reweigh(
             f"robust is {loss!r}: its weights are found in several passes over rows in memory; "
             "raise rows_in_memory in [reduction], cut the log with start and end, or leave it out"
         )
-    mapping = recordings.mapping
-    weighted, stages = recordings, ["huber"] if loss == "huber" else ["huber", "tukey"]
-    for stage in stages:
+    mapping, weighted = recordings.mapping, recordings
+    wls = WLS(prior=mapping.to_base(prior))
+    for stage in ("huber",) if loss == "huber" else ("huber", "tukey"):
         before = None
         for _ in range(_MAX_ITERATIONS):
-            beta = mapping.to_base(prior)
-            fit = WLS(prior=beta).fit(join(reductions).factors)
+            fit = wls.fit(join(reductions).factors)
             if before is not None:
                 moved = np.abs(fit.theta - before) / np.maximum(fit.std_error, 1e-300)
                 if moved.max() < _TOLERANCE:
                     break
             before = fit.theta
-            standard = mapping.to_standard(fit.theta, prior)
-            residuals = _scaled_residuals(recordings, standard)
-            weights = tuple(loss_weight(stage, r) for r in residuals)
-            weighted = replace(recordings, weights=weights)
+            residuals = _scaled_residuals(recordings, mapping.to_standard(fit.theta, prior))
+            weighted = replace(recordings, weights=tuple(loss_weight(stage, r) for r in residuals))
             reductions = weighted.reduce()
         else:
             raise NotConvergedError(
@@ -187,11 +175,10 @@ def find_outliers(
         within half a second of each other are one.
     """
     found: list[Outlier] = []
+    step = _friction_step(model, standard)
     for e in evaluations:
-        motion, mask = e.recording.trajectory, e.recording.mask
-        prediction = e.torques["estimate"]
+        motion, mask, prediction = e.recording.trajectory, e.recording.mask, e.torques["estimate"]
         scales = _scales([motion.tau - prediction], [mask])
-        step = _friction_step(model, standard)
         turning = np.abs(motion.v) * (e.recording.signals.cutoff or np.inf) <= np.abs(motion.a)
         excess = np.abs(motion.tau - prediction) - np.where(turning, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
@@ -201,17 +188,9 @@ def find_outliers(
             edges = np.flatnonzero(np.diff(motion.t[rows]) > _NEAR) + 1
             for i, k in pairwise([0, *edges.tolist(), len(rows)] if len(rows) else []):
                 worst = rows[i:k][np.argmax(sizes[rows[i:k], j])]
-                found.append(
-                    Outlier(
-                        Path(e.recording.log.path).name or "log",
-                        joint,
-                        float(motion.t[worst]),
-                        float(motion.tau[worst, j]),
-                        float(prediction[worst, j]),
-                        float(sizes[worst, j]),
-                        k - i,
-                    )
-                )
+                log, at = Path(e.recording.log.path).name or "log", float(motion.t[worst])
+                tau, wanted, size = (float(x[worst, j]) for x in (motion.tau, prediction, sizes))
+                found.append(Outlier(log, joint, at, tau, wanted, size, k - i))
     return tuple(sorted(found, key=lambda outlier: -outlier.size))
 
 

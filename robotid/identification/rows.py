@@ -13,15 +13,12 @@ __all__ = ["base_problem", "independent_share", "row_mask"]
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return which rows are used: those where the sign of every friction speed is sure.
+    """Return which rows are used, (N, n_rows): those where every friction speed's sign is sure.
 
     Args:
         model: The robot. Without Coulomb friction to identify every row is used.
         trajectory: N samples.
         min_velocity: Bound on the speed of a joint or of a coupled drive [rad/s or m/s].
-
-    Returns:
-        Flags, shape (N, n_rows), bool.
     """
     return sure_rows(model.layout, trajectory.v, min_velocity)
 

@@ -98,10 +98,7 @@ class Scatter:
         return sandwich
 
     def freedom(self) -> Array:
-        """Return how many degrees of freedom the variance of each parameter rests on.
-
-        Returns:
-            Degrees of freedom of Student's distribution, shape (c,), at least 1.
+        """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
 
         References:
             Bell, McCaffrey (2002), Bias reduction in standard errors for linear regression with
@@ -159,14 +156,15 @@ def measured_errors(
         NotConvergedError: If more than a fifth of the redrawn fits are not solved.
     """
     b = len(factors.names)
-    binds = bool(estimate.details.get("active")) and redraws is not None and redraws.draws > 0
+    if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
+        redraws = None  # no bound binds, or it is left out
     if len(stretches) < _FEWEST:
         method = (
             f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
             f"only {len(stretches)} stretches longer than the filter's memory"
         )
         errors = StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
-        if redraws is None or not binds:
+        if redraws is None:
             return estimate, errors
         R = factors.weighted(sigma)[:b, :b]
         return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
@@ -186,7 +184,7 @@ def measured_errors(
     estimate = replace(estimate, covariance=covariance)
     method = f"the scatter of the scores of {len(stretches)} stretches"
     errors = StandardErrors(method, len(stretches), found.inflation, found.freedom())
-    if redraws is not None and binds:
+    if redraws is not None:
         return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
     return estimate, errors
 
@@ -258,13 +256,10 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
 
 
 def quantile(freedom: Array) -> Array:
-    """Return how many standard errors a two-sided 95 % interval reaches.
+    """Return how many standard errors a two-sided 95 % interval reaches, shape (c,).
 
     Args:
-        freedom: Degrees of freedom of each standard error, shape (c,).
-
-    Returns:
-        Quantiles of Student's distribution, shape (c,).
+        freedom: Degrees of freedom of each standard error, in Student's distribution, shape (c,).
     """
     reach: Array = scipy.special.stdtrit(freedom, 0.975)
     return reach

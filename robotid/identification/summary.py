@@ -22,6 +22,9 @@ __all__ = [
 ]
 
 
+_NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
+
+
 def identification_line(found: Identification) -> str:
     """Return an identification in one line.
 
@@ -103,11 +106,8 @@ def identification_html(found: Identification) -> str:
     """
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
     tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))
-    link = (
-        f'<a href="{escape(found.report)}">{escape(found.report)}</a>'
-        if found.report
-        else "robotid.write_report(found, 'report.html') writes the whole report"
-    )
+    report = escape(found.report)
+    link = f'<a href="{report}">{report}</a>' if report else _NO_REPORT
     return (
         f"<p><strong>{escape(found.model.name)}</strong>: {len(found.base)} base parameters by "
         f"{found.estimator.name}; verdict <strong>{found.verdict.status}</strong></p>\n"
@@ -125,14 +125,8 @@ def _tables(found: Identification) -> list[tuple[str, Metrics, Metrics]]:
 
 
 def _errors(caption: str, metrics: Metrics) -> str:
-    rows = [
-        [
-            code(joint),
-            percent(m.relative_error_pct),
-            number(m.rmse, ".3g"),
-            text(m.unit),
-            percent(m.baselines["urdf"]),
-        ]
-        for joint, m in metrics.per_joint.items()
-    ]
+    rows = []
+    for joint, m in metrics.per_joint.items():
+        error, urdf = percent(m.relative_error_pct), percent(m.baselines["urdf"])
+        rows.append([code(joint), error, number(m.rmse, ".3g"), text(m.unit), urdf])
     return table(caption, ["joint", "error %", "RMSE", "unit", "URDF %"], rows)
