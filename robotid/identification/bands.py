@@ -34,8 +34,7 @@ class TorqueBand:
     @property
     def total(self) -> Array:
         """Standard deviation of a measured torque about its prediction, shape (k, n_rows)."""
-        both: Array = np.hypot(self.parameters, self.noise)
-        return both
+        return np.asarray(np.hypot(self.parameters, self.noise))
 
     def held(self, tau: Array, prediction: Array, mask: Array) -> Array:
         """Return which share of each joint's torques lies in the 95 % band; NaN without a row.
@@ -47,10 +46,8 @@ class TorqueBand:
         """
         used = mask[self.samples]
         miss = np.abs(tau[self.samples] - prediction[self.samples])
-        is_held = (miss <= REACH * self.total) & used
-        count = used.sum(axis=0)
-        share: Array = np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
-        return share
+        is_held, count = (miss <= REACH * self.total) & used, used.sum(axis=0)
+        return np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
 def torque_band(

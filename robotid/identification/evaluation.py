@@ -138,13 +138,7 @@ def evaluate_logs(
     sought = [score.sampled for score in apart]
     own = _score_logs(fitted, partial(work, sought=sought), plan)
     again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(apart))]
-    return (
-        tuple(_conclude(log, score) for log, score in zip(fitted, own, strict=True)),
-        tuple(
-            _conclude(log, score, is_refitted=is_refitted)
-            for log, score, is_refitted in zip(kept, apart, again, strict=True)
-        ),
-    )
+    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, kept, apart, again))
 
 
 def shares_rows(one: Log, other: Log) -> bool:
@@ -298,7 +292,7 @@ def _predict_all(
     return dict(zip((*parameters, *_BASELINES), torques, strict=True))
 
 
-def _conclude(log: SurveyedLog, score: _Score, *, is_refitted: bool = False) -> Evaluation:
+def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:
     """Return the evaluation of a log."""
     motions, masks, torques = zip(*score.shown, strict=True)
     extent = Extent(
@@ -310,14 +304,12 @@ def _conclude(log: SurveyedLog, score: _Score, *, is_refitted: bool = False) -> 
         rows_used=score.used,
         segments=len(score.segments),
     )
-    head, model = log.head, log.model
+    head, model, sums = log.head, log.model, score.sums
     names = [head.joints[j] for j in np.flatnonzero(score.turned)]
     if names:
         head = replace(head, notes=(*head.notes, turns_note(names)))
-    mask = np.concatenate(masks)
-    recording = Recording(head, log.signals, _joined(motions), mask, extent)
+    recording = Recording(head, log.signals, _joined(motions), np.concatenate(masks), extent)
     predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
-    sums = score.sums
     metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
     return Evaluation(recording, predicted, sums, metrics, is_refitted)
 

@@ -50,21 +50,13 @@ _FOLDS = 6  # held out in turn by prior_weight = "cv"
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known before the data.
+    """What is known before the data."""
 
-    Attributes:
-        pi: Standard parameters of the URDF, shape (p,).
-        spread: How far they may plausibly be wrong, shape (p,).
-        share: Share of the rows that count as independent [-].
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        stretches: Factors of the stretches of the fitted logs, to choose a weight with.
-    """
-
-    pi: Array
-    spread: Array
-    share: float
-    sigma: Array
-    stretches: tuple[Factors, ...] = ()
+    pi: Array  # (p,), standard parameters of the URDF
+    spread: Array  # (p,), how far they may plausibly be wrong
+    share: float  # share of the rows that count as independent [-]
+    sigma: Array  # (n,), noise level of each joint [N m or N]
+    stretches: tuple[Factors, ...] = ()  # of the fitted logs, to choose a weight with
 
 
 def make_estimator(
@@ -164,9 +156,7 @@ def make_constraints(
             the body; boxes stated in ``com`` go before them.
     """
     A = np.vstack([np.eye(3), -np.eye(3)])
-    boxes = {
-        name: (A, np.array([*high, *np.negative(low)]))
-        for name, (low, high) in bounds.boxes.items()
-    }
-    com = {**geometry, **boxes}
+    com = dict(geometry)
+    for name, (low, high) in bounds.boxes.items():
+        com[name] = (A, np.concatenate([high, np.negative(low)]))
     return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned))

@@ -103,8 +103,7 @@ class TorqueSums:
         mean = np.sum(tau, axis=0, where=mask) / np.maximum(rows, 1)
 
         def squares(values: Array) -> Array:
-            total: Array = np.sum(values**2, axis=0, where=mask)
-            return total
+            return np.asarray(np.sum(values**2, axis=0, where=mask))
 
         return cls(
             rows=rows,

@@ -238,8 +238,7 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
 
     Raises:
         DataError: If a row of a log cannot be used.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
-        NotConvergedError: If a solver fails.
+        RankDeficientError, NotConvergedError: As of ``identify``.
     """
     model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice)
@@ -290,9 +289,8 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     prior = model.standard_parameters()
     reductions, grown = recordings.reduce(), 1.0
     if choice.is_robust:
-        robust = reweigh(recordings, reductions, choice.loss, prior)
-        recordings, reductions = robust.recordings, robust.reductions
-        grown = robust.loss_of_efficiency**2
+        recordings, reductions, understated = reweigh(recordings, reductions, choice.loss, prior)
+        grown = understated**2
     reduction = join(reductions)
     stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share

@@ -20,7 +20,6 @@ from robotid.robot.model import RobotModel
 __all__ = [
     "LOSSES",
     "Outlier",
-    "Reweighted",
     "find_outliers",
     "loss_slope",
     "loss_weight",
@@ -36,21 +35,6 @@ _MAX_ITERATIONS = 50
 _OUTLIER = 12.0  # standard deviations from which a row is named
 _MATTERS = 0.1  # of the joint's torque, from which a row is named
 _NEAR = 0.5  # [s] rows closer than this are one outlier, smeared by the filter
-
-
-@dataclass(frozen=True, eq=False)
-class Reweighted:
-    """What reweighting ends with.
-
-    Attributes:
-        recordings: The recordings with their rows' weights.
-        reductions: What the weighted rows come down to.
-        loss_of_efficiency: By how much the weighted rows understate standard errors [-].
-    """
-
-    recordings: Recordings
-    reductions: tuple[Reduction, ...]
-    loss_of_efficiency: float
 
 
 @dataclass(frozen=True)
@@ -109,7 +93,7 @@ def loss_slope(loss: str, r: Array) -> Array:
 
 def reweigh(
     recordings: Recordings, reductions: tuple[Reduction, ...], loss: str, prior: Array
-) -> Reweighted:
+) -> tuple[Recordings, tuple[Reduction, ...], float]:
     """Weigh rows down that fit badly, until the fit does not change any more.
 
     The scale of each joint's residual is its median absolute deviation, which outliers hardly move.
@@ -120,6 +104,10 @@ def reweigh(
         reductions: What they come down to without weights.
         loss: "huber" or "tukey".
         prior: Standard parameters of the URDF, shape (p,), kept where the data say nothing.
+
+    Returns:
+        The recordings with their rows' weights, what the weighted rows come down to, and by how
+        much they understate standard errors [-].
 
     Raises:
         NotConvergedError: If the weights do not settle.
@@ -154,7 +142,7 @@ def reweigh(
     scaled = np.concatenate([r.ravel() for r in residuals])[used]
     weight = loss_weight(loss, scaled)
     slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
-    return Reweighted(weighted, reductions, float(weight.mean()) / slope)
+    return weighted, reductions, float(weight.mean()) / slope
 
 
 def find_outliers(

@@ -60,36 +60,22 @@ class StandardErrors:
 
 @dataclass(frozen=True, eq=False)
 class Redraws:
-    """How the spread of a physically consistent fit is told where its bounds bind.
-
-    Attributes:
-        fit: The fit.
-        draws: Fits to data and prior drawn anew; 0 leaves the bounds out.
-        rng: Source of the noise.
-    """
+    """How the spread of a physically consistent fit is told where its bounds bind."""
 
     fit: Consistent
-    draws: int
-    rng: np.random.Generator
+    draws: int  # fits to data and prior drawn anew; 0 leaves the bounds out
+    rng: np.random.Generator  # source of the noise
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """How much the scores of s stretches scatter about zero, over c parameters.
+    """How much the scores of s stretches scatter about zero, over c parameters."""
 
-    Attributes:
-        meat: Covariance of the score W^T S^-1 (tau - W theta) of all stretches, shape (c, c).
-        bread: Covariance of the parameters if rows were independent, shape (c, c).
-        inflation: Mean ratio of the scatter to that of independent rows [-].
-        factors: Factors R_s of the weighted rows of each stretch, shape (s, c, c).
-        adjusted: The same behind the correction for their leverage, shape (s, c, c).
-    """
-
-    meat: Array
-    bread: Array
-    inflation: float
-    factors: Array
-    adjusted: Array
+    meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all stretches
+    bread: Array  # (c, c), covariance of the parameters if rows were independent
+    inflation: float  # mean ratio of the scatter to that of independent rows [-]
+    factors: Array  # (s, c, c), factors R_s of the weighted rows of each stretch
+    adjusted: Array  # (s, c, c), the same behind the correction for their leverage
 
     @property
     def covariance(self) -> Array:

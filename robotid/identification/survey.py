@@ -76,42 +76,25 @@ class _Header:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What was read of a piece.
+    """What was read of a piece."""
 
-    Attributes:
-        positions: Recorded positions of its rows, shape (samples, n), full turns left in.
-        torques: Recorded torques, likewise.
-        trajectory: Its smooth motion, of no samples if none is left.
-        mask: Rows of the motion that are used, shape (N, n_rows), bool.
-        turned: Joints whose full turns were taken out, shape (n,), bool.
-    """
-
-    positions: Array
-    torques: Array
-    trajectory: Trajectory
-    mask: Array
-    turned: Array
+    positions: Array  # (samples, n), as recorded, full turns left in [rad or m]
+    torques: Array  # (samples, n), as recorded [N m or N]
+    trajectory: Trajectory  # its smooth motion, of no samples if none is left
+    mask: Array  # (N, n_rows), bool: rows of the motion that are used
+    turned: Array  # (n,), bool: joints whose full turns were taken out
 
 
 @dataclass(frozen=True, eq=False)
 class LogPiece:
-    """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole.
+    """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole."""
 
-    Attributes:
-        header: What the pieces of the log have in common.
-        first: Its first row.
-        stop: The row after its last one.
-        span: First row that is read with it, and the row after the last one.
-        near: Where in the file the span starts, or a little before.
-        stretches: The uninterrupted stretches that it has rows of.
-    """
-
-    header: _Header
-    first: int
-    stop: int
-    span: tuple[int, int]
-    near: Place
-    stretches: tuple[Stretch, ...]
+    header: _Header  # what the pieces of the log have in common
+    first: int  # its first row
+    stop: int  # the row after its last one
+    span: tuple[int, int]  # first row that is read with it, and the row after the last one
+    near: Place  # where in the file the span starts, or a little before
+    stretches: tuple[Stretch, ...]  # the uninterrupted ones that it has rows of
 
     @property
     def name(self) -> str:

@@ -150,11 +150,8 @@ def judge(
     poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
     reasons = [*alarms, *poor]
     if not validation:
-        why = (
-            f"{list(refitted)} hold rows that were fitted"
-            if refitted
-            else "no validation log given"
-        )
+        held = f"{list(refitted)} hold rows that were fitted"
+        why = held if refitted else "no validation log given"
         reasons.append(f"the prediction of a new motion was not evaluated: {why}")
     reasons += [reason for _, doubt, _ in found.values() for reason in doubt]
     reasons += _in_words(doubts)
@@ -204,15 +201,16 @@ def doubts_of(
         kept: Names of the recordings kept apart, one each.
         is_robust: Whether a robust loss was set.
     """
-    outvoted = {_place(f) for f in findings if is_robust and is_outvoted(f)}
-    found = []
+    # the places of jumps of a torque, as other findings call them: log and joint
+    outvoted = {f.where.replace(": tau_", ": ") for f in findings if is_robust and is_outvoted(f)}
+    found: list[Doubt] = []
     for finding in findings:
         if finding.severity != "warning" or finding.code not in _WORDS or _is_harmless(finding):
             continue
         # spikes that a robust fit leaves out are what physics could not explain
         if finding.code == "unexplained_torque" and finding.where in outvoted:
             continue
-        found += list(_doubts(finding, joints))
+        found += _doubts(finding, joints)
     repeated = {f.where for f in findings if f.code == "repeated_motion"}
     if kept and repeated.issuperset(kept):
         found.append(Doubt("repeated_motion", "", _REPEATED))
@@ -220,13 +218,10 @@ def doubts_of(
 
 
 def is_outvoted(finding: Finding) -> bool:
-    """Return whether a robust loss makes a finding harmless: jumps of the torque.
+    """Return whether a robust loss makes it harmless: it is about jumps of the torque only.
 
     Args:
-        finding: The finding.
-
-    Returns:
-        Whether it is about rows of the torque only; a position that jumps spoils the regressor.
+        finding: The finding; a position that jumps spoils the regressor.
     """
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
 
@@ -336,8 +331,3 @@ def _is_harmless(finding: Finding) -> bool:
         return False
     error, wls = finding.evidence["error_pct"], finding.evidence["wls_error_pct"]
     return error < max(_WRONG * wls, _HARMLESS)
-
-
-def _place(finding: Finding) -> str:
-    """Return the place of jumps of a torque as other findings call it: log and joint."""
-    return finding.where.replace(": tau_", ": ")

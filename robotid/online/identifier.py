@@ -53,7 +53,8 @@ class OnlineIdentifier:
         names: Names of the base parameters.
 
     Raises:
-        DataError: If the base floats.
+        DataError: If the base floats; later, by ``reading``, ``compared`` and ``estimate``, until
+            the robot has moved enough for a first estimate.
         SettingsError: If the cut-off is not below half the rate.
     """
 
@@ -118,11 +119,7 @@ class OnlineIdentifier:
 
     @property
     def reading(self) -> Reading:
-        """What is known now.
-
-        Raises:
-            DataError: If the robot has not moved enough for a first estimate.
-        """
+        """What is known now."""
         self._require_ready()
         variance = np.maximum(np.diag(self._state.P), 0.0)
         left = np.minimum(variance / self._prior_variance, 1.0)
@@ -137,21 +134,13 @@ class OnlineIdentifier:
 
     @property
     def compared(self) -> tuple[Array, Array]:
-        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each.
-
-        Raises:
-            DataError: If the robot has not moved enough for a first estimate.
-        """
+        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each."""
         self._require_ready()
         return self._compared
 
     @property
     def estimate(self) -> Estimate:
-        """The estimate as the batch estimators return it.
-
-        Raises:
-            DataError: If the robot has not moved enough for a first estimate.
-        """
+        """The estimate as the batch estimators return it."""
         kalman = self._require_ready()
         told, sigma = self._innovations.is_converged, np.sqrt(self._innovations.variance)
         estimate = kalman.estimate(self._state, self.names)
