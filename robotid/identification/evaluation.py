@@ -19,15 +19,7 @@ from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
 from robotid.workers.plan import WorkPlan
 
-__all__ = [
-    "Evaluation",
-    "Extent",
-    "Recording",
-    "evaluate_logs",
-    "pool",
-    "predict",
-    "shares_rows",
-]
+__all__ = ["Evaluation", "Extent", "Recording", "evaluate_logs", "pool", "predict", "shares_rows"]
 
 _BASELINES = ("urdf", "gravity_only")
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots

@@ -17,14 +17,7 @@ from robotid.regressor.reduction import Reduction, join
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "LOSSES",
-    "Outlier",
-    "find_outliers",
-    "loss_slope",
-    "loss_weight",
-    "reweigh",
-]
+__all__ = ["LOSSES", "Outlier", "find_outliers", "loss_slope", "loss_weight", "reweigh"]
 
 #: Losses with a bounded influence of each row, and the bound of their quadratic part in standard
 #: deviations, for which they lose 5 % against least squares where noise is normal.

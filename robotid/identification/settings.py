@@ -305,9 +305,7 @@ class KalmanSettings(RecursiveSettings):
 
     name: str = _called("kalman", "a Kalman filter over the samples")
     walk: float = setting(
-        0.0,
-        "random walk per sample, as a share of the prior's spread [-]",
-        within=_NOT_NEGATIVE,
+        0.0, "random walk per sample, as a share of the prior's spread [-]", within=_NOT_NEGATIVE
     )
     gate: float | bool = setting(
         1 - 1e-7,
