@@ -15,7 +15,7 @@ from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
-from robotid.identification.prior import spread_of
+from robotid.identification.prior import prior_spread
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -294,7 +294,7 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     reduction = join(reductions)
     stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share
-    spread = spread_of(model, reduction.squares, reduction.samples)
+    spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Known(prior, spread, share, rough.sigma, stretches)
     known = model.layout.owned_by(choice.bounds.pinned)

@@ -203,7 +203,7 @@ class OnlineIdentifier:
         t, q, v, a, tau = (np.array(x) for x in zip(*self._early, strict=True))
         joints, segment = self.model.joints, np.zeros(len(t), dtype=int)
         seen = Trajectory(t, q, v, a, tau, joints, 1.0 / self._dt, segment)
-        spread = prior_spread(self.model, [seen])
+        spread = prior_spread(self.model, seen.squares, len(seen.t))
         beta = self.mapping.to_base(self.model.standard_parameters())
         KS = self.mapping.K * spread
         C = KS @ KS.T
