@@ -1,9 +1,13 @@
+import re
+
 import numpy as np
 import pytest
 from helpers.synthetic import truth
 
 from robotid.exceptions import DataError
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.simulation.closed_loop import Noise, simulate
 from robotid.simulation.motions import FourierTrajectory, random_fourier
@@ -77,3 +81,22 @@ def test_noise_is_of_the_size_asked_for(ur5, rng):
     assert np.std(noisy.v - clean.v) == pytest.approx(1e-3, rel=0.1)
     share = np.std(noisy.tau - clean.tau, axis=0) / np.sqrt(np.mean(clean.tau**2, axis=0))
     np.testing.assert_allclose(share, 0.05, rtol=0.15)
+
+
+def test_a_slow_joint_keeps_its_speed_limit(tmp_path, rng):
+    text = example_urdf("ur5_robot.urdf").read_text()
+    slow = tmp_path / "slow.urdf"
+    slow.write_text(re.sub(r'velocity="[\d.]+"', 'velocity="0.5"', text))
+    model = RobotModel.from_urdf(slow)
+    assert {joint.velocity for joint in model.limits} == {0.5}
+    _, v, _ = random_fourier(model, rng).evaluate(np.linspace(0, 10, 5000))
+    assert 0.4 < np.abs(v).max() < 0.46  # nine tenths of it
+
+
+def test_the_plant_is_integrated_in_short_steps_whatever_the_rate_of_the_log(ur5):
+    motion = random_fourier(ur5, np.random.default_rng(0))
+    rare, often = (
+        simulate(ur5, truth(ur5), motion, rate=rate, duration=1.0, rng=np.random.default_rng(0))
+        for rate in (25.0, 200.0)
+    )
+    np.testing.assert_allclose(rare.q, often.q[::8], atol=1e-3)
