@@ -21,7 +21,6 @@ __all__ = [
     "verdict_lines",
 ]
 
-
 _NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
 
 

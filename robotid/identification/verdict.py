@@ -7,19 +7,7 @@ from typing import Any
 from robotid.findings import Finding
 from robotid.identification.metrics import JointMetrics, Metrics
 
-__all__ = [
-    "DOUBTFUL",
-    "NOT_EVALUATED",
-    "Doubt",
-    "JointVerdict",
-    "Verdict",
-    "doubts_of",
-    "is_outvoted",
-    "judge",
-]
-
-#: Status of a joint that no kept recording moves: never a pass.
-NOT_EVALUATED = "not evaluated"
+__all__ = ["DOUBTFUL", "Doubt", "JointVerdict", "Verdict", "doubts_of", "is_outvoted", "judge"]
 
 _GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
 _POOR = 50.0  # [%] a joint predicted worse than this is not usable
@@ -261,9 +249,9 @@ def _joint_verdict(
     poor: list[str], doubts: list[str], errors: list[float], *, is_still: bool
 ) -> JointVerdict:
     """Return the verdict on a joint from what was found on each kept recording."""
-    if not errors:
+    if not errors:  # never a pass
         where = "recording" if is_still else "kept recording"
-        return JointVerdict(NOT_EVALUATED, (f"it does not move in any {where}", *doubts))
+        return JointVerdict("not evaluated", (f"it does not move in any {where}", *doubts))
     if poor or doubts:
         return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
     said = f"predicted within {max(errors):.1f} %, better than by a constant and than by the URDF"
