@@ -1,4 +1,4 @@
-"""An online identification over a recorded log, as if it came in live; its history in files."""
+"""An online identification over a recorded log, as if it came in live."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
