@@ -18,10 +18,10 @@ from robotid.exceptions import DataError, NotConvergedError, RankDeficientError,
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
 from robotid.findings import Finding
-from robotid.identification.doubts import doubts_of
 from robotid.identification.findings import fit_findings, locked_findings, log_findings
 from robotid.identification.pipeline import Identification, conclude
 from robotid.identification.recordings import Recordings
+from robotid.identification.verdict import doubts_of
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.report.document import write_report
 from robotid.robot.model import RobotModel

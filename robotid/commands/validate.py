@@ -10,11 +10,10 @@ from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import alarming, diagnose
 from robotid.export.result import load_result, recording_metrics, stated_parameters
 from robotid.findings import Finding
-from robotid.identification.doubts import doubts_of
 from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
 from robotid.identification.metrics import Metrics
 from robotid.identification.survey import SurveyedLog
-from robotid.identification.verdict import Doubt, Verdict, judge
+from robotid.identification.verdict import Doubt, Verdict, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 

@@ -30,7 +30,7 @@ from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import Finding, by_severity, listed
-from robotid.identification.doubts import DOUBTFUL, is_outvoted
+from robotid.identification.verdict import DOUBTFUL, is_outvoted
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping

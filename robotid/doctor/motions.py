@@ -10,7 +10,7 @@ from robotid.estimators import WLS
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
 from robotid.findings import Finding
-from robotid.identification.prior import spread_of
+from robotid.identification.prior import prior_spread
 from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
@@ -103,7 +103,7 @@ def check_excitation(
         return
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
     squares = np.sum([motion.squares for motion in thinned], axis=0)
-    spread = spread_of(model, squares, sum(len(motion.t) for motion in thinned))
+    spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
     rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
     known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
     evidence = {

@@ -34,36 +34,26 @@ class TorqueBand:
     @property
     def total(self) -> Array:
         """Standard deviation of a measured torque about its prediction, shape (k, n_rows)."""
-        both: Array = np.hypot(self.parameters, self.noise)
-        return both
+        return np.asarray(np.hypot(self.parameters, self.noise))
 
     def held(self, tau: Array, prediction: Array, mask: Array) -> Array:
-        """Return which share of the measured torques lies in the 95 % band.
+        """Return which share of each joint's torques lies in the 95 % band; NaN without a row.
 
         Args:
             tau: Measured torques of the whole trajectory, shape (N, n_rows) [N m, N].
             prediction: Predicted ones, shape (N, n_rows) [N m, N].
             mask: Rows used, shape (N, n_rows), bool.
-
-        Returns:
-            Shares, shape (n_rows,); not a number where no row is used.
         """
         used = mask[self.samples]
         miss = np.abs(tau[self.samples] - prediction[self.samples])
-        is_held = (miss <= REACH * self.total) & used
-        count = used.sum(axis=0)
-        share: Array = np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
-        return share
+        is_held, count = (miss <= REACH * self.total) & used, used.sum(axis=0)
+        return np.where(count > 0, is_held.sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
 def torque_band(
-    model: RobotModel,
-    mapping: BaseMapping,
-    trajectory: Trajectory,
-    covariance: Array,
-    noise: Array,
+    model: RobotModel, mapping: BaseMapping, trajectory: Trajectory, covariance: Array, noise: Array
 ) -> TorqueBand:
-    """Return the band of the torques that an estimate predicts for a motion.
+    """Return the band of predicted torques, at up to 500 samples: the root of diag(W C W^T).
 
     Args:
         model: The robot.
@@ -71,9 +61,6 @@ def torque_band(
         trajectory: N samples.
         covariance: Of the base parameters, shape (b, b), finite.
         noise: Standard deviation of the torque's residual, shape (n_rows,) [N m, N].
-
-    Returns:
-        The band at up to 500 samples: the root of the diagonal of W C W^T.
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))

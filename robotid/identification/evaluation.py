@@ -1,6 +1,6 @@
 """Predicted torque of recordings, and its metrics: piece by piece, a log in memory at once."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import chain
@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.identification.metrics import Metrics, TorqueSums
-from robotid.identification.survey import LogPiece, SurveyedLog
+from robotid.identification.survey import PieceTask, SurveyedLog
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import turns_note
@@ -19,17 +19,9 @@ from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
 from robotid.workers.plan import WorkPlan
 
-__all__ = [
-    "Evaluation",
-    "Extent",
-    "Recording",
-    "evaluate_logs",
-    "pool",
-    "predict",
-    "predict_all",
-    "shares_rows",
-]
+__all__ = ["Evaluation", "Extent", "Recording", "evaluate_logs", "pool", "predict", "shares_rows"]
 
+_BASELINES = ("urdf", "gravity_only")
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
 _SAMPLED = 200  # rows spread over a log that are looked for in others
 _SHARED = 0.02  # share of them that another recording may hold: windows that meet share a row
@@ -138,13 +130,7 @@ def evaluate_logs(
     sought = [score.sampled for score in apart]
     own = _score_logs(fitted, partial(work, sought=sought), plan)
     again = [any(_is_shared(score.found[k]) for score in own) for k in range(len(apart))]
-    return (
-        tuple(_conclude(log, score) for log, score in zip(fitted, own, strict=True)),
-        tuple(
-            _conclude(log, score, is_refitted=is_refitted)
-            for log, score, is_refitted in zip(kept, apart, again, strict=True)
-        ),
-    )
+    return tuple(map(_conclude, fitted, own)), tuple(map(_conclude, kept, apart, again))
 
 
 def shares_rows(one: Log, other: Log) -> bool:
@@ -162,39 +148,6 @@ def shares_rows(one: Log, other: Log) -> bool:
     return _is_shared(_rows_in(rows[:: _sampled_every(len(rows))], others))
 
 
-def predict_all(
-    model: RobotModel,
-    trajectory: Trajectory,
-    parameters: Mapping[str, Array],
-    prior: Array,
-    *,
-    compiled: bool | None = None,
-) -> dict[str, Array]:
-    """Return the torques that parameters and the baselines predict.
-
-    Args:
-        model: The robot.
-        trajectory: N samples.
-        parameters: Standard parameters by name, each of shape (p,).
-        prior: Those of the URDF, shape (p,).
-        compiled: As of ``predict``.
-
-    Returns:
-        Torques by name, each of shape (N, n_rows): those of the parameters, "urdf" and
-        "gravity_only".
-    """
-    *torques, urdf = predict(model, [*parameters.values(), prior], trajectory, compiled=compiled)
-    still = np.zeros_like(trajectory.v)
-    (gravity,) = predict(
-        model,
-        [_without_drives(model, prior)],
-        replace(trajectory, v=still, a=still, direction=None),
-        compiled=compiled,
-    )
-    predicted = dict(zip(parameters, torques, strict=True))
-    return {**predicted, "urdf": urdf, "gravity_only": gravity}
-
-
 def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Metrics:
     """Return the metrics over several recordings together.
 
@@ -203,9 +156,6 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
         evaluations: The recordings, at least one.
         name: Which parameters predict.
 
-    Returns:
-        The metrics.
-
     Raises:
         DataError: If no row of any recording is used.
     """
@@ -213,29 +163,21 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
     return together.metrics(model.row_names, model.row_units)
 
 
+_Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, torques
+
+
 @dataclass(frozen=True, eq=False)
 class _Score:
-    """What is known of a log, or of its pieces so far.
+    """What is known of a log, or of its pieces so far."""
 
-    Attributes:
-        sums: What the metrics are made of, by name of the parameters.
-        smooth: Samples.
-        used: Torque rows used.
-        segments: Numbers of the stretches that have samples.
-        turned: Joints whose full turns were taken out, shape (n,), bool.
-        shown: Motion, rows used and torques of all samples, or of a few stretches.
-        sampled: Recorded rows spread over the log, shape (m, 2 n).
-        found: Which of the sampled rows of other logs are in this one, one array for each log.
-    """
-
-    sums: Mapping[str, TorqueSums]
-    smooth: int
-    used: int
-    segments: frozenset[int]
-    turned: Array
-    shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...]
-    sampled: Array
-    found: tuple[Array, ...]
+    sums: Mapping[str, TorqueSums]  # what the metrics are made of, by name of the parameters
+    smooth: int  # samples
+    used: int  # torque rows used
+    segments: frozenset[int]  # numbers of the stretches that have samples
+    turned: Array  # (n,), bool: joints whose full turns were taken out
+    shown: tuple[_Shown, ...]  # all samples, or a few stretches
+    sampled: Array  # (m, 2 n), recorded rows spread over the log
+    found: tuple[Array, ...]  # which of the sampled rows of each other log are in this one
 
     def join(self, other: "_Score") -> "_Score":
         """Return what is known with the pieces that follow."""
@@ -252,20 +194,11 @@ class _Score:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _Part(PieceTask):
     """A piece, and what is kept of it: recorded rows spread over it, and a stretch for plots."""
 
-    piece: LogPiece
     sampled: slice
     shown: slice | None
-
-    @property
-    def name(self) -> str:
-        return self.piece.name
-
-    @property
-    def samples(self) -> int:
-        return self.piece.samples
 
 
 def _parts(log: SurveyedLog) -> list[_Part]:
@@ -286,11 +219,7 @@ def _score_logs(
     """Return what is known of each log; refuse one without samples."""
     parts = [_parts(log) for log in logs]
     every = list(chain.from_iterable(parts))
-    found: Iterator[_Score] = (
-        (work(part, None) for part in every)
-        if plan is None
-        else plan.map(work, every, "evaluating")
-    )
+    found = (work(x, None) for x in every) if plan is None else plan.map(work, every, "evaluating")
     scores = []
     for log, own in zip(logs, parts, strict=True):
         by_piece = [next(found) for _ in own]
@@ -316,21 +245,18 @@ def _score(
     """Return what is known of a piece, with the torques of a part of it."""
     header, rows = whole.piece.header, whole.piece.read()
     model, motion, mask = header.model, rows.trajectory, rows.mask
-    names = [*parameters, "urdf", "gravity_only"]
-    torques = {name: np.empty((0, model.n_rows)) for name in names}
+    torques = {name: np.empty((0, model.n_rows)) for name in (*parameters, *_BASELINES)}
     if len(motion.t):
-        torques = predict_all(model, motion, parameters, prior, compiled=header.is_compiled)
-    baselines = {key: torques[key] for key in ("urdf", "gravity_only")}
-    shown: tuple[tuple[Trajectory, Array, Mapping[str, Array]], ...] = ()
+        torques = _predict_all(model, motion, parameters, prior, header.is_compiled)
+    baselines = {name: torques[name] for name in _BASELINES}
+    shown: tuple[_Shown, ...] = ()
     if whole.shown is not None and len(motion.t):
         part = slice(*whole.shown.indices(len(motion.t)))
         kept = {name: torque[part] for name, torque in torques.items()}
         shown = ((motion.part(part.start, part.stop), mask[part], kept),)
     recorded = np.hstack([rows.positions, rows.torques])
     return _Score(
-        sums={
-            name: TorqueSums.of(motion.tau, torques[name], mask, baselines) for name in parameters
-        },
+        sums={x: TorqueSums.of(motion.tau, torques[x], mask, baselines) for x in parameters},
         smooth=len(motion.t),
         used=int(mask.sum()),
         segments=frozenset(np.unique(motion.segment).tolist()),
@@ -341,7 +267,24 @@ def _score(
     )
 
 
-def _conclude(log: SurveyedLog, score: _Score, *, is_refitted: bool = False) -> Evaluation:
+def _predict_all(
+    model: RobotModel,
+    trajectory: Trajectory,
+    parameters: Mapping[str, Array],
+    prior: Array,
+    compiled: bool | None,
+) -> dict[str, Array]:
+    """Return the torques that parameters and baselines predict, by name, each (N, n_rows)."""
+    every = [*parameters.values(), prior]
+    torques = predict(model, every, trajectory, compiled=compiled)
+    inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
+    still = np.zeros_like(trajectory.v)
+    at_rest = replace(trajectory, v=still, a=still, direction=None)
+    torques += predict(model, [inertial], at_rest, compiled=compiled)
+    return dict(zip((*parameters, *_BASELINES), torques, strict=True))
+
+
+def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:
     """Return the evaluation of a log."""
     motions, masks, torques = zip(*score.shown, strict=True)
     extent = Extent(
@@ -353,14 +296,12 @@ def _conclude(log: SurveyedLog, score: _Score, *, is_refitted: bool = False) -> 
         rows_used=score.used,
         segments=len(score.segments),
     )
-    head, model = log.head, log.model
+    head, model, sums = log.head, log.model, score.sums
     names = [head.joints[j] for j in np.flatnonzero(score.turned)]
     if names:
         head = replace(head, notes=(*head.notes, turns_note(names)))
-    mask = np.concatenate(masks)
-    recording = Recording(head, log.signals, _joined(motions), mask, extent)
+    recording = Recording(head, log.signals, _joined(motions), np.concatenate(masks), extent)
     predicted = {name: np.concatenate([t[name] for t in torques]) for name in torques[0]}
-    sums = score.sums
     metrics = {name: s.metrics(model.row_names, model.row_units) for name, s in sums.items()}
     return Evaluation(recording, predicted, sums, metrics, is_refitted)
 
@@ -396,9 +337,3 @@ def _rows_in(sampled: Array, rows: Array) -> Array:
 def _is_shared(found: Array) -> bool:
     """Return whether so many rows are in another log that it holds the same recording."""
     return int(found.sum()) > max(1, _SHARED * len(found))
-
-
-def _without_drives(model: RobotModel, pi: Array) -> Array:
-    inertial = pi.copy()
-    inertial[model.layout.n_inertial :] = 0.0
-    return inertial

@@ -26,9 +26,6 @@ def fit_findings(identification: Identification) -> list[Finding]:
 
     Args:
         identification: What was found.
-
-    Returns:
-        The findings, none if all is well.
     """
     findings = []
     known = identification.determination
@@ -54,19 +51,17 @@ def fit_findings(identification: Identification) -> list[Finding]:
         )
         where = evaluation.recording.log.path
         findings.append(Finding("validation_was_fitted", "warning", where, message))
-    ours, wls = identification.metrics(), identification.metrics("wls")
-    asked = _asked(identification)
-    for joint, measured in ours.per_joint.items():
-        if measured.rmse > _DIFFERS * wls.per_joint[joint].rmse:
+    wls, asked = identification.metrics("wls").per_joint, _asked(identification)
+    for joint, measured in identification.metrics().per_joint.items():
+        free = wls[joint]
+        if measured.rmse > _DIFFERS * free.rmse:
             message = (
                 f"{joint}: the residual is {measured.rmse:.3g} {measured.unit} against "
-                f"{wls.per_joint[joint].rmse:.3g} of unconstrained WLS: physics and data disagree "
-                f"there; check {asked}the torque scale (gains), the drive model and the payload"
+                f"{free.rmse:.3g} of unconstrained WLS: physics and data disagree there; check "
+                f"{asked}the torque scale (gains), the drive model and the payload"
             )
-            evidence = {
-                "error_pct": measured.relative_error_pct or 0.0,
-                "wls_error_pct": wls.per_joint[joint].relative_error_pct or 0.0,
-            }
+            errors = {"error_pct": measured, "wls_error_pct": free}
+            evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
             findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
     return findings
 
@@ -77,9 +72,6 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
     Args:
         model: The robot.
         stated: Names of the locked joints that stand where the user says, or follow others.
-
-    Returns:
-        A warning "locked_at_zero", or none.
     """
     assumed = [name for name in model.locked if name not in stated]
     if not assumed:
@@ -96,9 +88,6 @@ def log_findings(logs: Sequence[Log]) -> list[Finding]:
 
     Args:
         logs: The logs.
-
-    Returns:
-        A note "log_note" per note.
     """
     by_note: dict[str, list[str]] = {}
     for log in logs:
@@ -115,9 +104,6 @@ def consistency_findings(identification: Identification) -> list[Finding]:
 
     Args:
         identification: What was found.
-
-    Returns:
-        The findings, none if all is well.
     """
     findings = []
     check, details = identification.mass_matrix, identification.estimate.details
@@ -147,15 +133,14 @@ def consistency_findings(identification: Identification) -> list[Finding]:
     bounds = [name for name in details.get("active", ()) if name.startswith(_USER_BOUNDS)]
     if bounds:
         against = _speaks_against(identification)
-        message = (
-            f"the bounds {bounds} bind: {against}; check these bounds, the torque scale (gains) "
-            "and the payload"
+        why = (
+            f"{against}; check these bounds, the torque scale (gains) and the payload"
             if against
-            else f"the bounds {bounds} bind: the URDF's values lie beyond them, and the torque is "
-            "explained as well as without"
+            else "the URDF's values lie beyond them, and the torque is explained as well as without"
         )
         is_stated = bool(_stated(identification).intersection(bounds))
         severity = "warning" if against and is_stated else "note"
+        message = f"the bounds {bounds} bind: {why}"
         findings.append(Finding("bound_binds", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:
@@ -177,17 +162,13 @@ def _outlier_findings(identification: Identification) -> list[Finding]:
         for o in outliers[:_NAMED]
     ]
     more = f"; and {len(outliers) - _NAMED} more" if len(outliers) > _NAMED else ""
-    advice = (
-        "they were weighted down"
-        if identification.estimator.is_robust
-        else "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
-    )
-    message = (
-        f"{len(outliers)} places of the fitted logs are not explained: {'; '.join(places)}{more}; "
-        f"{advice}"
-    )
+    advice = "look at the recording there, cut it out, or set robust = 'tukey' in [estimator]"
+    if identification.estimator.is_robust:
+        advice = "they were weighted down"
+    found = f"{len(outliers)} places of the fitted logs are not explained: {'; '.join(places)}"
     evidence = {"places": float(len(outliers)), "largest": outliers[0].size}
-    return [Finding("outliers", "warning", outliers[0].joint, message, evidence)]
+    where, message = outliers[0].joint, f"{found}{more}; {advice}"
+    return [Finding("outliers", "warning", where, message, evidence)]
 
 
 def _asked(identification: Identification) -> str:
@@ -203,7 +184,7 @@ def _asked(identification: Identification) -> str:
 
 def _speaks_against(identification: Identification) -> str:
     """Return what data or masses say against bounds that bind, in words; empty if nothing."""
-    ours, wls = identification.metrics().per_joint, identification.metrics("wls").per_joint
+    ours, wls = (identification.metrics(name).per_joint for name in ("estimate", "wls"))
     costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
     if costs:
         return f"the data push against them at {costs}"

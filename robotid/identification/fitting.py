@@ -50,21 +50,13 @@ _FOLDS = 6  # held out in turn by prior_weight = "cv"
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known before the data.
+    """What is known before the data."""
 
-    Attributes:
-        pi: Standard parameters of the URDF, shape (p,).
-        spread: How far they may plausibly be wrong, shape (p,).
-        share: Share of the rows that count as independent [-].
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        stretches: Factors of the stretches of the fitted logs, to choose a weight with.
-    """
-
-    pi: Array
-    spread: Array
-    share: float
-    sigma: Array
-    stretches: tuple[Factors, ...] = ()
+    pi: Array  # (p,), standard parameters of the URDF
+    spread: Array  # (p,), how far they may plausibly be wrong
+    share: float  # share of the rows that count as independent [-]
+    sigma: Array  # (n,), noise level of each joint [N m or N]
+    stretches: tuple[Factors, ...] = ()  # of the fitted logs, to choose a weight with
 
 
 def make_estimator(
@@ -77,9 +69,6 @@ def make_estimator(
         model: The robot.
         mapping: Standard to base parameters.
         prior: What is known before the data.
-
-    Returns:
-        The estimator.
 
     Raises:
         SettingsError: If constraints contradict each other or do not fit the robot.
@@ -108,18 +97,14 @@ def make_estimator(
             gate = None if settings.gate is False else float(settings.gate)
             return Kalman(sigma, beta, C, settings.walk, gate, share)
         case PRXSettings() | GradientSettings():
-            is_shuffled = settings.seed >= 0
-            order = np.random.default_rng(settings.seed) if is_shuffled else None
-            passes, average = settings.passes, settings.average
+            common: dict[str, Any] = {
+                "average": settings.average,
+                "passes": settings.passes,
+                "rng": np.random.default_rng(settings.seed) if settings.seed >= 0 else None,
+            }
             if isinstance(settings, GradientSettings):
-                size = settings.step_size
-                return NormalisedGradient(
-                    sigma, beta, step_size=size, average=average, passes=passes, rng=order
-                )
-            step, metric = settings.step, settings.metric
-            return PRX(
-                sigma, beta, step=step, metric=metric, average=average, passes=passes, rng=order
-            )
+                return NormalisedGradient(sigma, beta, step_size=settings.step_size, **common)
+            return PRX(sigma, beta, step=settings.step, metric=settings.metric, **common)
     raise SettingsError(f"{settings!r} describes no estimator; take EstimatorSettings(name)")
 
 
@@ -133,9 +118,6 @@ def consistent_fit(
         model: The robot.
         mapping: Standard to base parameters.
         prior: What is known before the data.
-
-    Returns:
-        The estimator.
 
     Raises:
         SettingsError: If constraints contradict each other or do not fit the robot.
@@ -172,11 +154,9 @@ def make_constraints(
         bounds: The constraints as a job states them.
         geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
             the body; boxes stated in ``com`` go before them.
-
-    Returns:
-        The constraints.
     """
+    A = np.vstack([np.eye(3), -np.eye(3)])
     com = dict(geometry)
     for name, (low, high) in bounds.boxes.items():
-        com[name] = (np.vstack([np.eye(3), -np.eye(3)]), np.concatenate([high, np.negative(low)]))
+        com[name] = (A, np.concatenate([high, np.negative(low)]))
     return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned))

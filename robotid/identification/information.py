@@ -34,9 +34,6 @@ def information(found: Identification) -> Information:
 
     Args:
         found: The identification.
-
-    Returns:
-        The information.
     """
     A = found.factors.weighted(found.wls.sigma)[:, :-1]
     norms = np.linalg.norm(A, axis=0)

@@ -58,8 +58,7 @@ class Metrics:
                     "relative_error_pct": m.relative_error_pct,
                     "r2": m.r2,
                     "rows": m.rows,
-                    "urdf_relative_error_pct": m.baselines["urdf"],
-                    "gravity_only_relative_error_pct": m.baselines["gravity_only"],
+                    **{f"{x}_relative_error_pct": m.baselines[x] for x in ("urdf", "gravity_only")},
                     "better_than_constant": m.better_than_constant,
                 }
                 for joint, m in self.per_joint.items()
@@ -99,16 +98,12 @@ class TorqueSums:
             prediction: Predicted torque, shape (N, n) [N m, N].
             mask: Rows used, shape (N, n), bool.
             baselines: Other predictions to compare with, by name, each of shape (N, n).
-
-        Returns:
-            The sums.
         """
         rows = mask.sum(axis=0)
         mean = np.sum(tau, axis=0, where=mask) / np.maximum(rows, 1)
 
         def squares(values: Array) -> Array:
-            total: Array = np.sum(values**2, axis=0, where=mask)
-            return total
+            return np.asarray(np.sum(values**2, axis=0, where=mask))
 
         return cls(
             rows=rows,
@@ -124,9 +119,6 @@ class TorqueSums:
 
         Args:
             other: Those of other rows of the same joints, with the same baselines.
-
-        Returns:
-            The sums.
 
         References:
             Chan, Golub, LeVeque (1983), Algorithms for Computing the Sample Variance, (2.1).
@@ -150,9 +142,6 @@ class TorqueSums:
             names: Names of the n joints.
             units: Units of their torques.
 
-        Returns:
-            The metrics.
-
         Raises:
             DataError: If no row is used at all.
         """
@@ -172,10 +161,7 @@ class TorqueSums:
             relative_error_pct=self._relative_error(j, residual),
             r2=1.0 - residual / spread if spread > 0 else 0.0,
             rows=int(self.rows[j]),
-            baselines={
-                name: self._relative_error(j, float(squares[j]))
-                for name, squares in self.baselines.items()
-            },
+            baselines={x: self._relative_error(j, float(s[j])) for x, s in self.baselines.items()},
             better_than_constant=residual < spread,
         )
 

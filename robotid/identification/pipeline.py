@@ -12,17 +12,13 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.identification.bands import TorqueBand, torque_band
-from robotid.identification.evaluation import Evaluation, pool
+from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
-from robotid.identification.prior import spread_of
+from robotid.identification.prior import prior_spread
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
-from robotid.identification.settings import (
-    BoundedSettings,
-    EstimatorSettings,
-    RecursiveSettings,
-)
+from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
 from robotid.identification.standard_errors import (
     Redraws,
     StandardErrors,
@@ -45,12 +41,7 @@ from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = [
-    "EstimatorSettings",
-    "Identification",
-    "conclude",
-    "identify",
-]
+__all__ = ["EstimatorSettings", "Identification", "conclude", "identify"]
 
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
@@ -146,18 +137,15 @@ class Identification:
     @property
     def sources(self) -> tuple[str, ...]:
         """Where each standard parameter comes from: "data", "mixed" or "prior"."""
-        # what a bound says is neither
-        unbounded = self.errors.unbounded
-        after = self.standard_error if unbounded is None else unbounded
+        layout, unbounded = self.model.layout, self.errors.unbounded
+        after = self.standard_error if unbounded is None else unbounded  # a bound is no source
         share = after / np.maximum(self.prior_std, _KNOWN)
-        names = np.where(
-            share < _FROM_DATA, "data", np.where(share > _FROM_PRIOR, "prior", "mixed")
-        )
-        kept = self.model.layout.owned_by(self.estimate.details.get("pinned", ()))
         masses = self.estimator.bounds.masses.items()
         known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
-        kept = kept | np.isin(self.model.layout.names, known)
-        return tuple(np.where(kept, "prior", names).tolist())
+        kept = layout.owned_by(self.estimate.details.get("pinned", ()))
+        kept = kept | np.isin(layout.names, known) | (share > _FROM_PRIOR)
+        names = np.where(kept, "prior", np.where(share < _FROM_DATA, "data", "mixed"))
+        return tuple(names.tolist())
 
     @property
     def base_interval(self) -> Array:
@@ -170,18 +158,10 @@ class Identification:
 
         Args:
             evaluation: One of the recordings.
-
-        Returns:
-            The band.
         """
-        K, C = self.mapping.K, self.standard_covariance
-        return torque_band(
-            self.model,
-            self.mapping,
-            evaluation.recording.trajectory,
-            K @ C @ K.T,
-            self.estimate.sigma,
-        )
+        mapping, motion = self.mapping, evaluation.recording.trajectory
+        covariance = mapping.K @ self.standard_covariance @ mapping.K.T
+        return torque_band(self.model, mapping, motion, covariance, self.estimate.sigma)
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
@@ -193,21 +173,18 @@ class Identification:
 
         Args:
             name: "estimate" or "wls".
-
-        Returns:
-            The metrics.
         """
         return pool(self.model, self.fitted, name)
 
     @property
     def refitted(self) -> tuple[Evaluation, ...]:
         """Validation recordings that hold rows which were fitted: they show no prediction."""
-        return tuple(evaluation for evaluation in self.validation if evaluation.is_refitted)
+        return tuple(e for e in self.validation if e.is_refitted)
 
     @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        kept = [evaluation for evaluation in self.validation if not evaluation.is_refitted]
+        kept = [e for e in self.validation if not e.is_refitted]
         return judge(
             self.metrics(),
             {e.recording.name: e.metrics["estimate"] for e in kept},
@@ -216,7 +193,7 @@ class Identification:
             joints=self.model.joints,
             alarms=self.alarms,
             doubts=self.doubts,
-            refitted=[evaluation.recording.name for evaluation in self.refitted],
+            refitted=[e.recording.name for e in self.refitted],
         )
 
 
@@ -236,9 +213,6 @@ def identify(
         validation: Recordings kept apart to measure the prediction with.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
-
-    Returns:
-        The identification.
 
     Raises:
         DataError: If a log does not fit the model or is too short.
@@ -261,13 +235,9 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
         recordings: The recordings.
         choice: Which estimator.
 
-    Returns:
-        The identification.
-
     Raises:
         DataError: If a row of a log cannot be used.
-        RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
-        NotConvergedError: If a solver fails.
+        RankDeficientError, NotConvergedError: As of ``identify``.
     """
     model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice)
@@ -275,9 +245,10 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
     estimate, wls, errors = _measured(ground, choice)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
-    wls_standard = mapping.to_standard(wls.theta, prior, spread)
-    candidates = {"estimate": standard, "wls": wls_standard}
-    fitted, kept = recordings.evaluate(candidates, prior)
+    candidates = {"estimate": standard, "wls": mapping.to_standard(wls.theta, prior, spread)}
+    fitted, kept = evaluate_logs(
+        recordings.fitted, recordings.kept, candidates, prior, plan=recordings.plan
+    )
     is_base = estimate.names == mapping.base_names
     return Identification(
         model=model,
@@ -301,23 +272,14 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
 
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """What every estimator stands on.
+    """What every estimator stands on."""
 
-    Attributes:
-        recordings: The recordings, their rows weighted if a robust loss was asked for.
-        factors: What all fitted rows come down to, base parameters.
-        before: What is known without them, and how they are cut into stretches.
-        rough: Weighted least squares on them.
-        determination: Which base parameters they determine.
-        grown: By how much a robust loss widens the covariance [-].
-    """
-
-    recordings: Recordings
-    factors: Factors
-    before: Known
-    rough: Estimate
-    determination: Determination
-    grown: float
+    recordings: Recordings  # their rows weighted if a robust loss was asked for
+    factors: Factors  # what all fitted rows come down to, base parameters
+    before: Known  # without them, and how they are cut into stretches
+    rough: Estimate  # weighted least squares on them
+    determination: Determination  # which base parameters they determine
+    grown: float  # by how much a robust loss widens the covariance [-]
 
 
 def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
@@ -326,13 +288,12 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     prior = model.standard_parameters()
     reductions, grown = recordings.reduce(), 1.0
     if choice.is_robust:
-        robust = reweigh(recordings, reductions, choice.loss, prior)
-        recordings, reductions = robust.recordings, robust.reductions
-        grown = robust.loss_of_efficiency**2
+        recordings, reductions, understated = reweigh(recordings, reductions, choice.loss, prior)
+        grown = understated**2
     reduction = join(reductions)
     stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
     factors, share = reduction.factors, recordings.share
-    spread = spread_of(model, reduction.squares, reduction.samples)
+    spread = prior_spread(model, reduction.squares, reduction.samples)
     rough = WLS(prior=mapping.to_base(prior), independent_share=share).fit(factors)
     before = Known(prior, spread, share, rough.sigma, stretches)
     known = model.layout.owned_by(choice.bounds.pinned)
@@ -345,27 +306,25 @@ def _measured(
     ground: _Ground, choice: EstimatorSettings
 ) -> tuple[Estimate, Estimate, StandardErrors]:
     """Return the estimate and that of WLS with measured standard errors, and their ground."""
-    recordings, factors, rough = ground.recordings, ground.factors, ground.rough
-    model, mapping, before = recordings.model, recordings.mapping, ground.before
+    factors, rough, mapping = ground.factors, ground.rough, ground.recordings.mapping
     try:
-        estimate, fit, weighing = _run(choice, model, mapping, before, recordings, factors, rough)
+        estimate, fit, weighing = _run(choice, ground)
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
-    stretches, share = before.stretches, before.share
-    wls, errors = measured_errors(rough, stretches, factors, share, mapping.K, rough.sigma)
+    stretches, share, K = ground.before.stretches, ground.before.share, mapping.K
+    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma)
     if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
         sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
+        if estimate.names == mapping.names:
+            sigma = estimate.sigma
+        redraws = None  # of what no bound can bind
+        if fit is not None and isinstance(choice, BoundedSettings):
+            redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
+        is_filter = weighing == "by age"
         estimate, errors = measured_errors(
-            estimate,
-            stretches,
-            factors,
-            share,
-            mapping.K,
-            estimate.sigma if estimate.names == mapping.names else sigma,
-            is_filter=weighing == "by age",
-            redraws=_redraws(choice, fit),
+            estimate, stretches, factors, share, K, sigma, is_filter=is_filter, redraws=redraws
         )
     if ground.grown != 1.0:
         estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
@@ -373,32 +332,21 @@ def _measured(
     return estimate, wls, errors
 
 
-def _redraws(choice: EstimatorSettings, fit: Consistent | None) -> Redraws | None:
-    """Return the fits to redrawn data that tell the standard errors where bounds bind."""
-    if fit is None or not isinstance(choice, BoundedSettings):
-        return None
-    return Redraws(fit, choice.draws, np.random.default_rng(0))
-
-
 def _run(
-    choice: EstimatorSettings,
-    model: RobotModel,
-    mapping: BaseMapping,
-    prior: Known,
-    recordings: Recordings,
-    factors: Factors,
-    wls: Estimate,
+    choice: EstimatorSettings, ground: _Ground
 ) -> tuple[Estimate, Consistent | None, Weighing]:
     """Return the estimate, what made it physically consistent if it is, and how rows weighed."""
-    estimator = make_estimator(choice, model, mapping, prior)
+    recordings, before = ground.recordings, ground.before
+    model, mapping = recordings.model, recordings.mapping
+    estimator = make_estimator(choice, model, mapping, before)
     if estimator.reads == "factors":
-        return estimator.fit(factors), estimator.in_cone, estimator.weighing
+        return estimator.fit(ground.factors), estimator.in_cone, estimator.weighing
     estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))
     if not (isinstance(choice, RecursiveSettings) and choice.physical):
         return estimate, None, estimator.weighing
     if estimator.weighing == "by step":
-        estimate = with_wls_errors(estimate, wls)
-    fit = consistent_fit(choice, model, mapping, prior)
+        estimate = with_wls_errors(estimate, ground.rough)
+    fit = consistent_fit(choice, model, mapping, before)
     return fit.project(estimate), fit, estimator.weighing
 
 

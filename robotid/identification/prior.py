@@ -1,24 +1,21 @@
 """What is known before any data: the URDF's parameters and how far the truth may lie from them."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from robotid._typing import Array
-from robotid.logs.data import Trajectory
 from robotid.robot.drives import DriveMotion
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["prior_spread", "spread_of"]
+__all__ = ["prior_spread"]
 
 _SMALLEST_MASS = 0.1  # of the mean mass: a link may be that wrong even if its URDF says 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
 
 
-def prior_spread(model: RobotModel, trajectories: Sequence[Trajectory]) -> Array:
-    """Return how far each standard parameter may plausibly lie from its prior value.
+def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
+    """Return how far each standard parameter may plausibly lie from its prior value, shape (p,).
 
     The spread of a body is its own size: its mass m, m r and m r^2, with r the distance of the
     centre of mass plus the radius of gyration. That of a drive term is what would alone explain
@@ -27,25 +24,9 @@ def prior_spread(model: RobotModel, trajectories: Sequence[Trajectory]) -> Array
 
     Args:
         model: The robot, with the URDF's parameters.
-        trajectories: The motions that drive terms are scaled with.
-
-    Returns:
-        Spreads, shape (p,), positive, SI units.
-    """
-    squares = np.sum([trajectory.squares for trajectory in trajectories], axis=0)
-    return spread_of(model, squares, sum(len(trajectory.t) for trajectory in trajectories))
-
-
-def spread_of(model: RobotModel, squares: Array, samples: int) -> Array:
-    """Return the same from sums over the motions.
-
-    Args:
-        model: The robot, with the URDF's parameters.
-        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows).
+        squares: Sums of tau^2, v^2 and a^2 over the samples, shape (3, n_rows), which drive terms
+            are scaled with; see ``Trajectory.squares``.
         samples: Number of samples.
-
-    Returns:
-        Spreads, shape (p,), positive, SI units.
     """
     rms = np.sqrt(squares / max(samples, 1))
     return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
@@ -78,6 +59,4 @@ def _drive_spread(model: RobotModel, rms: Array) -> Array:
 
 def _positive(rms: Array) -> Array:
     """Return the root mean square of each column, never 0."""
-    floor = 1e-3 * rms.max() if rms.max() > 0 else 1.0
-    bounded: Array = np.maximum(rms, floor)
-    return bounded
+    return np.maximum(rms, 1e-3 * rms.max() if rms.max() > 0 else 1.0)

@@ -1,11 +1,10 @@
 """What an identification asks of its logs: their factors, their samples, their predictions."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 
 from robotid._typing import Array
-from robotid.identification.evaluation import Evaluation, evaluate_logs
 from robotid.identification.rows import base_problem, independent_share
 from robotid.identification.survey import ReducedPiece, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping
@@ -121,23 +120,6 @@ class Recordings:
             self.model.support()[:, self.mapping.independent],
             mass_stream if with_mass else None,
         )
-
-    def evaluate(
-        self, parameters: Mapping[str, Array], prior: Array
-    ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
-        """Return how well parameters predict every log; see ``evaluate_logs``.
-
-        Args:
-            parameters: Standard parameters by name, each of shape (p,).
-            prior: Those of the URDF, shape (p,).
-
-        Returns:
-            Evaluations of the fitted logs, and of those kept apart.
-
-        Raises:
-            DataError: If no row of a log is used.
-        """
-        return evaluate_logs(self.fitted, self.kept, parameters, prior, plan=self.plan)
 
     def _problem(self, k: int, with_mass: bool = False) -> Problem:
         """Return the rows of a log in memory, weighted."""

@@ -17,15 +17,7 @@ from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = [
-    "LOSSES",
-    "Outlier",
-    "Reweighted",
-    "find_outliers",
-    "loss_slope",
-    "loss_weight",
-    "reweigh",
-]
+__all__ = ["LOSSES", "Outlier", "find_outliers", "loss_slope", "loss_weight", "reweigh"]
 
 #: Losses with a bounded influence of each row, and the bound of their quadratic part in standard
 #: deviations, for which they lose 5 % against least squares where noise is normal.
@@ -36,21 +28,6 @@ _MAX_ITERATIONS = 50
 _OUTLIER = 12.0  # standard deviations from which a row is named
 _MATTERS = 0.1  # of the joint's torque, from which a row is named
 _NEAR = 0.5  # [s] rows closer than this are one outlier, smeared by the filter
-
-
-@dataclass(frozen=True, eq=False)
-class Reweighted:
-    """What reweighting ends with.
-
-    Attributes:
-        recordings: The recordings with their rows' weights.
-        reductions: What the weighted rows come down to.
-        loss_of_efficiency: By how much the weighted rows understate standard errors [-].
-    """
-
-    recordings: Recordings
-    reductions: tuple[Reduction, ...]
-    loss_of_efficiency: float
 
 
 @dataclass(frozen=True)
@@ -77,14 +54,11 @@ class Outlier:
 
 
 def loss_weight(loss: str, r: Array) -> Array:
-    """Return the weight of rows in the equivalent least squares.
+    """Return the weight psi(r) / r of rows in the equivalent least squares, from 0 to 1.
 
     Args:
         loss: "huber" or "tukey".
         r: Residuals in standard deviations, any shape.
-
-    Returns:
-        Weights from 0 to 1, psi(r) / r.
 
     References:
         Huber (1964), Robust estimation of a location parameter; Beaton, Tukey (1974), The fitting
@@ -99,14 +73,11 @@ def loss_weight(loss: str, r: Array) -> Array:
 
 
 def loss_slope(loss: str, r: Array) -> Array:
-    """Return psi'(r), how much a row still resists a change of the parameters.
+    """Return psi'(r), at most 1: how much a row still resists a change of the parameters.
 
     Args:
         loss: "huber" or "tukey".
         r: Residuals in standard deviations, any shape.
-
-    Returns:
-        Slopes, at most 1.
     """
     u = (r / LOSSES[loss]) ** 2
     slope: Array = np.where(u < 1.0, 1.0 if loss == "huber" else (1.0 - u) * (1.0 - 5.0 * u), 0.0)
@@ -114,11 +85,8 @@ def loss_slope(loss: str, r: Array) -> Array:
 
 
 def reweigh(
-    recordings: Recordings,
-    reductions: tuple[Reduction, ...],
-    loss: str,
-    prior: Array,
-) -> Reweighted:
+    recordings: Recordings, reductions: tuple[Reduction, ...], loss: str, prior: Array
+) -> tuple[Recordings, tuple[Reduction, ...], float]:
     """Weigh rows down that fit badly, until the fit does not change any more.
 
     The scale of each joint's residual is its median absolute deviation, which outliers hardly move.
@@ -131,7 +99,8 @@ def reweigh(
         prior: Standard parameters of the URDF, shape (p,), kept where the data say nothing.
 
     Returns:
-        The recordings with weights.
+        The recordings with their rows' weights, what the weighted rows come down to, and by how
+        much they understate standard errors [-].
 
     Raises:
         NotConvergedError: If the weights do not settle.
@@ -142,22 +111,19 @@ def reweigh(
             f"robust is {loss!r}: its weights are found in several passes over rows in memory; "
             "raise rows_in_memory in [reduction], cut the log with start and end, or leave it out"
         )
-    mapping = recordings.mapping
-    weighted, stages = recordings, ["huber"] if loss == "huber" else ["huber", "tukey"]
-    for stage in stages:
+    mapping, weighted = recordings.mapping, recordings
+    wls = WLS(prior=mapping.to_base(prior))
+    for stage in ("huber",) if loss == "huber" else ("huber", "tukey"):
         before = None
         for _ in range(_MAX_ITERATIONS):
-            beta = mapping.to_base(prior)
-            fit = WLS(prior=beta).fit(join(reductions).factors)
+            fit = wls.fit(join(reductions).factors)
             if before is not None:
                 moved = np.abs(fit.theta - before) / np.maximum(fit.std_error, 1e-300)
                 if moved.max() < _TOLERANCE:
                     break
             before = fit.theta
-            standard = mapping.to_standard(fit.theta, prior)
-            residuals = _scaled_residuals(recordings, standard)
-            weights = tuple(loss_weight(stage, r) for r in residuals)
-            weighted = replace(recordings, weights=weights)
+            residuals = _scaled_residuals(recordings, mapping.to_standard(fit.theta, prior))
+            weighted = replace(recordings, weights=tuple(loss_weight(stage, r) for r in residuals))
             reductions = weighted.reduce()
         else:
             raise NotConvergedError(
@@ -169,7 +135,7 @@ def reweigh(
     scaled = np.concatenate([r.ravel() for r in residuals])[used]
     weight = loss_weight(loss, scaled)
     slope = max(float(loss_slope(loss, scaled).mean()), 1e-3)
-    return Reweighted(weighted, reductions, float(weight.mean()) / slope)
+    return weighted, reductions, float(weight.mean()) / slope
 
 
 def find_outliers(
@@ -190,11 +156,10 @@ def find_outliers(
         within half a second of each other are one.
     """
     found: list[Outlier] = []
+    step = _friction_step(model, standard)
     for e in evaluations:
-        motion, mask = e.recording.trajectory, e.recording.mask
-        prediction = e.torques["estimate"]
+        motion, mask, prediction = e.recording.trajectory, e.recording.mask, e.torques["estimate"]
         scales = _scales([motion.tau - prediction], [mask])
-        step = _friction_step(model, standard)
         turning = np.abs(motion.v) * (e.recording.signals.cutoff or np.inf) <= np.abs(motion.a)
         excess = np.abs(motion.tau - prediction) - np.where(turning, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
@@ -204,17 +169,9 @@ def find_outliers(
             edges = np.flatnonzero(np.diff(motion.t[rows]) > _NEAR) + 1
             for i, k in pairwise([0, *edges.tolist(), len(rows)] if len(rows) else []):
                 worst = rows[i:k][np.argmax(sizes[rows[i:k], j])]
-                found.append(
-                    Outlier(
-                        Path(e.recording.log.path).name or "log",
-                        joint,
-                        float(motion.t[worst]),
-                        float(motion.tau[worst, j]),
-                        float(prediction[worst, j]),
-                        float(sizes[worst, j]),
-                        k - i,
-                    )
-                )
+                log, at = Path(e.recording.log.path).name or "log", float(motion.t[worst])
+                tau, wanted, size = (float(x[worst, j]) for x in (motion.tau, prediction, sizes))
+                found.append(Outlier(log, joint, at, tau, wanted, size, k - i))
     return tuple(sorted(found, key=lambda outlier: -outlier.size))
 
 

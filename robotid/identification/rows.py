@@ -13,15 +13,12 @@ __all__ = ["base_problem", "independent_share", "row_mask"]
 
 
 def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> Array:
-    """Return which rows are used: those where the sign of every friction speed is sure.
+    """Return which rows are used, (N, n_rows): those where every friction speed's sign is sure.
 
     Args:
         model: The robot. Without Coulomb friction to identify every row is used.
         trajectory: N samples.
         min_velocity: Bound on the speed of a joint or of a coupled drive [rad/s or m/s].
-
-    Returns:
-        Flags, shape (N, n_rows), bool.
     """
     return sure_rows(model.layout, trajectory.v, min_velocity)
 
@@ -45,9 +42,6 @@ def base_problem(
         with_mass: As of ``build_problem``.
         compiled: As of ``build_problem``.
 
-    Returns:
-        The problem.
-
     Raises:
         DataError: If the trajectory's joints are not the model's.
     """
@@ -61,9 +55,6 @@ def independent_share(signals: SignalSettings) -> float:
 
     Args:
         signals: The settings, resolved.
-
-    Returns:
-        The share, at most 1.
     """
     if signals.cutoff is None or signals.rate is None:
         return 1.0

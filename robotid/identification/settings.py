@@ -27,6 +27,7 @@ __all__ = [
     "WLSSettings",
 ]
 
+_NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 
@@ -79,16 +80,11 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
     low, high = float(pair[0]), float(pair[1])
+    found = f"{what} is [{low:g}, {high:g}] kg"
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise SettingsError(
-            f"{what} is [{low:g}, {high:g}] kg, wanted finite numbers; write a large one for no "
-            "upper bound"
-        )
+        raise SettingsError(f"{found}, wanted finite numbers; write a large one for no upper bound")
     if not low <= high:
-        raise SettingsError(
-            f"{what} is [{low:g}, {high:g}] kg: the first is above the second; write the smaller "
-            "one first"
-        )
+        raise SettingsError(f"{found}: the first is above the second; write the smaller one first")
     return low, high
 
 
@@ -133,9 +129,8 @@ class EstimatorSettings(Settings):
         own.sort(key=lambda key: key not in kind.__annotations__)
         for key in options:
             if key not in own:
-                raise SettingsError(
-                    f"estimator {name!r} has no setting {key!r}; it has {listed(own)}"
-                )
+                had = listed(own)
+                raise SettingsError(f"estimator {name!r} has no setting {key!r}; it has {had}")
         return super().__new__(kind)
 
     @classmethod
@@ -287,9 +282,7 @@ class LogCholeskySettings(ConsistentSettings):
         "log_cholesky", "the consistent fit without a cone, in log-Cholesky parameters"
     )
     starts: int = setting(
-        0,
-        "random starts beside the one from the cone programme",
-        within=Range("x >= 0", lambda x: x >= 0),
+        0, "random starts beside the one from the cone programme", within=_NOT_NEGATIVE
     )
     seed: int = setting(0, "seed of the random starts")
 
@@ -312,9 +305,7 @@ class KalmanSettings(RecursiveSettings):
 
     name: str = _called("kalman", "a Kalman filter over the samples")
     walk: float = setting(
-        0.0,
-        "random walk per sample, as a share of the prior's spread [-]",
-        within=Range("x >= 0", lambda x: x >= 0),
+        0.0, "random walk per sample, as a share of the prior's spread [-]", within=_NOT_NEGATIVE
     )
     gate: float | bool = setting(
         1 - 1e-7,

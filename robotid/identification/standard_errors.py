@@ -60,36 +60,22 @@ class StandardErrors:
 
 @dataclass(frozen=True, eq=False)
 class Redraws:
-    """How the spread of a physically consistent fit is told where its bounds bind.
-
-    Attributes:
-        fit: The fit.
-        draws: Fits to data and prior drawn anew; 0 leaves the bounds out.
-        rng: Source of the noise.
-    """
+    """How the spread of a physically consistent fit is told where its bounds bind."""
 
     fit: Consistent
-    draws: int
-    rng: np.random.Generator
+    draws: int  # fits to data and prior drawn anew; 0 leaves the bounds out
+    rng: np.random.Generator  # source of the noise
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """How much the scores of s stretches scatter about zero, over c parameters.
+    """How much the scores of s stretches scatter about zero, over c parameters."""
 
-    Attributes:
-        meat: Covariance of the score W^T S^-1 (tau - W theta) of all stretches, shape (c, c).
-        bread: Covariance of the parameters if rows were independent, shape (c, c).
-        inflation: Mean ratio of the scatter to that of independent rows [-].
-        factors: Factors R_s of the weighted rows of each stretch, shape (s, c, c).
-        adjusted: The same behind the correction for their leverage, shape (s, c, c).
-    """
-
-    meat: Array
-    bread: Array
-    inflation: float
-    factors: Array
-    adjusted: Array
+    meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all stretches
+    bread: Array  # (c, c), covariance of the parameters if rows were independent
+    inflation: float  # mean ratio of the scatter to that of independent rows [-]
+    factors: Array  # (s, c, c), factors R_s of the weighted rows of each stretch
+    adjusted: Array  # (s, c, c), the same behind the correction for their leverage
 
     @property
     def covariance(self) -> Array:
@@ -98,10 +84,7 @@ class Scatter:
         return sandwich
 
     def freedom(self) -> Array:
-        """Return how many degrees of freedom the variance of each parameter rests on.
-
-        Returns:
-            Degrees of freedom of Student's distribution, shape (c,), at least 1.
+        """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
 
         References:
             Bell, McCaffrey (2002), Bias reduction in standard errors for linear regression with
@@ -159,14 +142,15 @@ def measured_errors(
         NotConvergedError: If more than a fifth of the redrawn fits are not solved.
     """
     b = len(factors.names)
-    binds = bool(estimate.details.get("active")) and redraws is not None and redraws.draws > 0
+    if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
+        redraws = None  # no bound binds, or it is left out
     if len(stretches) < _FEWEST:
         method = (
             f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
             f"only {len(stretches)} stretches longer than the filter's memory"
         )
         errors = StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
-        if redraws is None or not binds:
+        if redraws is None:
             return estimate, errors
         R = factors.weighted(sigma)[:b, :b]
         return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
@@ -186,7 +170,7 @@ def measured_errors(
     estimate = replace(estimate, covariance=covariance)
     method = f"the scatter of the scores of {len(stretches)} stretches"
     errors = StandardErrors(method, len(stretches), found.inflation, found.freedom())
-    if redraws is not None and binds:
+    if redraws is not None:
         return _bounded(estimate, errors, redraws, factors, sigma, share**2 * found.meat)
     return estimate, errors
 
@@ -200,9 +184,6 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     Args:
         estimate: Base parameters, shape (b,).
         wls: Weighted least squares of the same rows.
-
-    Returns:
-        The estimate, with what weighted least squares says of the data.
     """
     distance = estimate.theta - wls.theta
     covariance = wls.covariance + np.outer(distance, distance)
@@ -230,9 +211,6 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
         theta: Estimate, shape (c,).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
         bread: Covariance of the parameters if rows were independent, shape (c, c).
-
-    Returns:
-        The scatter.
 
     Raises:
         DataError: If there are fewer than 12 stretches.
@@ -264,13 +242,10 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
 
 
 def quantile(freedom: Array) -> Array:
-    """Return how many standard errors a two-sided 95 % interval reaches.
+    """Return how many standard errors a two-sided 95 % interval reaches, shape (c,).
 
     Args:
-        freedom: Degrees of freedom of each standard error, shape (c,).
-
-    Returns:
-        Quantiles of Student's distribution, shape (c,).
+        freedom: Degrees of freedom of each standard error, in Student's distribution, shape (c,).
     """
     reach: Array = scipy.special.stdtrit(freedom, 0.975)
     return reach

@@ -21,15 +21,14 @@ __all__ = [
     "verdict_lines",
 ]
 
+_NO_REPORT = "robotid.write_report(found, 'report.html') writes the whole report"
+
 
 def identification_line(found: Identification) -> str:
     """Return an identification in one line.
 
     Args:
         found: The identification.
-
-    Returns:
-        One line.
     """
     return (
         f"<Identification of {found.model.name}: {len(found.base)} base parameters by "
@@ -42,9 +41,6 @@ def identification_text(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        Lines.
     """
     lines = [identification_line(found)[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
     for caption, ours, wls in _tables(found):
@@ -60,9 +56,6 @@ def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None
     Args:
         metrics: Metrics, as in result.json.
         wls: Those of weighted least squares, or none.
-
-    Returns:
-        A line of headers, and one per joint.
     """
     others = {} if wls is None else wls["per_joint"]
     width = max(len(joint) for joint in metrics["per_joint"])
@@ -86,9 +79,6 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
 
     Args:
         verdict: Status, reasons and joints, as in result.json.
-
-    Returns:
-        The status, the reasons, and the joints of each status.
     """
     lines = [f"verdict: {verdict['status']}", *(f"  - {reason}" for reason in verdict["reasons"])]
     by_status: dict[str, list[str]] = {}
@@ -103,9 +93,6 @@ def cell(value: float | None, width: int = 7) -> str:
     Args:
         value: The percentage, or None.
         width: Width of the column.
-
-    Returns:
-        Text of that width.
     """
     return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
 
@@ -115,17 +102,11 @@ def identification_html(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML without scripts or styles.
     """
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in found.verdict.reasons)
     tables = "".join(_errors(caption, metrics) for caption, metrics, _ in _tables(found))
-    link = (
-        f'<a href="{escape(found.report)}">{escape(found.report)}</a>'
-        if found.report
-        else "robotid.write_report(found, 'report.html') writes the whole report"
-    )
+    report = escape(found.report)
+    link = f'<a href="{report}">{report}</a>' if report else _NO_REPORT
     return (
         f"<p><strong>{escape(found.model.name)}</strong>: {len(found.base)} base parameters by "
         f"{found.estimator.name}; verdict <strong>{found.verdict.status}</strong></p>\n"
@@ -143,14 +124,8 @@ def _tables(found: Identification) -> list[tuple[str, Metrics, Metrics]]:
 
 
 def _errors(caption: str, metrics: Metrics) -> str:
-    rows = [
-        [
-            code(joint),
-            percent(m.relative_error_pct),
-            number(m.rmse, ".3g"),
-            text(m.unit),
-            percent(m.baselines["urdf"]),
-        ]
-        for joint, m in metrics.per_joint.items()
-    ]
+    rows = []
+    for joint, m in metrics.per_joint.items():
+        error, urdf = percent(m.relative_error_pct), percent(m.baselines["urdf"])
+        rows.append([code(joint), error, number(m.rmse, ".3g"), text(m.unit), urdf])
     return table(caption, ["joint", "error %", "RMSE", "unit", "URDF %"], rows)

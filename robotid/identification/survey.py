@@ -31,13 +31,21 @@ from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.robot.model import RobotModel
-from robotid.workers.pieces import Piece
+from robotid.workers.pieces import Piece, Workload
 
-__all__ = ["PIECE", "LogPiece", "ReducedPiece", "Rows", "SurveyedLog", "hold_log", "survey_log"]
+__all__ = [
+    "PIECE",
+    "LogPiece",
+    "PieceTask",
+    "ReducedPiece",
+    "Rows",
+    "SurveyedLog",
+    "hold_log",
+    "survey_log",
+]
 
 #: Rows of a piece, if nothing else is said.
 PIECE = 16384
-_ALL = slice(None)
 _WINDOW = 20_000  # rows of each window that is looked at closely
 
 
@@ -68,42 +76,25 @@ class _Header:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What was read of a piece.
+    """What was read of a piece."""
 
-    Attributes:
-        positions: Recorded positions of its rows, shape (samples, n), full turns left in.
-        torques: Recorded torques, likewise.
-        trajectory: Its smooth motion, of no samples if none is left.
-        mask: Rows of the motion that are used, shape (N, n_rows), bool.
-        turned: Joints whose full turns were taken out, shape (n,), bool.
-    """
-
-    positions: Array
-    torques: Array
-    trajectory: Trajectory
-    mask: Array
-    turned: Array
+    positions: Array  # (samples, n), as recorded, full turns left in [rad or m]
+    torques: Array  # (samples, n), as recorded [N m or N]
+    trajectory: Trajectory  # its smooth motion, of no samples if none is left
+    mask: Array  # (N, n_rows), bool: rows of the motion that are used
+    turned: Array  # (n,), bool: joints whose full turns were taken out
 
 
 @dataclass(frozen=True, eq=False)
 class LogPiece:
-    """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole.
+    """A stretch of rows of a log, with what is needed to read it and to smooth it as the whole."""
 
-    Attributes:
-        header: What the pieces of the log have in common.
-        first: Its first row.
-        stop: The row after its last one.
-        span: First row that is read with it, and the row after the last one.
-        near: Where in the file the span starts, or a little before.
-        stretches: The uninterrupted stretches that it has rows of.
-    """
-
-    header: _Header
-    first: int
-    stop: int
-    span: tuple[int, int]
-    near: Place
-    stretches: tuple[Stretch, ...]
+    header: _Header  # what the pieces of the log have in common
+    first: int  # its first row
+    stop: int  # the row after its last one
+    span: tuple[int, int]  # first row that is read with it, and the row after the last one
+    near: Place  # where in the file the span starts, or a little before
+    stretches: tuple[Stretch, ...]  # the uninterrupted ones that it has rows of
 
     @property
     def name(self) -> str:
@@ -140,26 +131,15 @@ class LogPiece:
             speeds=friction_speeds(header.model.layout),
         )
         rows = slice(self.first - self.span[0], self.stop - self.span[0])
-        return Rows(
-            raw.q[rows],
-            raw.tau[rows],
-            trajectory,
-            row_mask(header.model, trajectory, header.signals.min_velocity),
-            (log.q != raw.q).any(axis=0),
-        )
+        mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+        return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
-class ReducedPiece(Piece):
-    """A piece to be reduced to factors of base parameters.
-
-    Attributes:
-        piece: The piece.
-        mapping: Standard to base parameters.
-    """
+class PieceTask(Workload):
+    """Something to do with a piece of a log."""
 
     piece: LogPiece
-    mapping: BaseMapping
 
     @property
     def name(self) -> str:
@@ -169,16 +149,18 @@ class ReducedPiece(Piece):
     def samples(self) -> int:
         return self.piece.samples
 
+
+@dataclass(frozen=True, eq=False)
+class ReducedPiece(PieceTask, Piece):
+    """A piece to be reduced to factors of base parameters."""
+
+    mapping: BaseMapping
+
     def reduce(self, *, threads: int | None = None) -> Reduction:
         header, rows = self.piece.header, self.piece.read()
-        problem = base_problem(
-            header.model,
-            self.mapping,
-            rows.trajectory,
-            rows.mask,
-            compiled=header.is_compiled,
-        )
-        return Reduction.of(problem, rows.trajectory, threads=threads)
+        motion, compiled = rows.trajectory, header.is_compiled
+        problem = base_problem(header.model, self.mapping, motion, rows.mask, compiled=compiled)
+        return Reduction.of(problem, motion, threads=threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,15 +235,18 @@ class SurveyedLog:
             DataError: If measured velocity or acceleration is asked for and the log has none.
             SettingsError: If a setting does not fit the log.
         """
+
+        def lag() -> float:
+            return float(np.median([velocity_lag(_unwrap(self.model, x)) for x in self.windows]))
+
+        v, a = self.windows[0].v, self.windows[0].a
         return decide(
             self.asked,
             self.step,
             self.path or "log",
-            has_velocity=self.windows[0].v is not None,
-            has_acceleration=self.windows[0].a is not None,
-            lag=lambda: float(
-                np.median([velocity_lag(_unwrap(self.model, window)) for window in self.windows])
-            ),
+            has_velocity=v is not None,
+            has_acceleration=a is not None,
+            lag=lag,
         )
 
     @cached_property
@@ -275,11 +260,6 @@ class SurveyedLog:
             Stretch(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
             for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
         )
-
-    @cached_property
-    def pieces(self) -> tuple[LogPiece, ...]:
-        """Its pieces, in order."""
-        return tuple(self._cut())
 
     @property
     def whole(self) -> Rows:
@@ -298,12 +278,13 @@ class SurveyedLog:
         """Return the error of a log without a stretch that is long enough."""
         return too_short(self.path or "log", len(self.stretches), self.signals)
 
-    def _cut(self) -> Iterator[LogPiece]:
-        """Yield pieces of so many rows each, and which rows are to be read with each."""
+    @cached_property
+    def pieces(self) -> tuple[LogPiece, ...]:
+        """Its pieces, in order, each with the rows that are read around it."""
         stamps, stretches, window = self.stamps, self.stretches, (self.first, self.stop)
         header = _Header(self.model, self.source, self.signals, self.stop - self.first)
         reach = filter_reach(self.signals)
-        begins = [stretch.first for stretch in stretches]
+        begins, found = [stretch.first for stretch in stretches], list[LogPiece]()
         for first in range(*window, self.length):
             stop = min(first + self.length, window[1])
             mine = stretches[bisect_right(begins, first) - 1 : bisect_right(begins, stop - 1)]
@@ -314,26 +295,20 @@ class SurveyedLog:
                 low = max(span[0] - 1, window[0])
                 span = low, low + 2
             near = _near(self.places, span[0])
-            yield LogPiece(header, first, stop, span, near, tuple(mine))
+            found.append(LogPiece(header, first, stop, span, near, tuple(mine)))
+        return tuple(found)
 
 
 def hold_log(
-    model: RobotModel,
-    log: Log,
-    signals: SignalSettings,
-    *,
-    held: Mapping[str, Array] | None = None,
+    model: RobotModel, log: Log, signals: SignalSettings, held: Mapping[str, Array] | None = None
 ) -> SurveyedLog:
-    """Return a log in memory, ready to be read as one piece.
+    """Return a log in memory, ready to be read as one piece; its faults are told as it is read.
 
     Args:
         model: The robot.
         log: The log, of the model's joints in its order.
         signals: How it becomes a trajectory.
         held: Positions of locked joints, if it has them, by name [rad or m].
-
-    Returns:
-        The log; what is wrong with it is told as it is read.
     """
     count = len(log.t)
     return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
@@ -362,9 +337,6 @@ def survey_log(
         length: Rows per piece; None: the log is read at once and kept in memory. A file that is
             only read whole is one piece.
 
-    Returns:
-        The log.
-
     Raises:
         DataError: If time does not increase, the window holds fewer than two rows, or units are
             suspect.
@@ -378,15 +350,13 @@ def survey_log(
         kept = log if window == (None, None) else log.window(*window)
         inside = slice(*np.searchsorted(log.t, [kept.t[0], np.nextafter(kept.t[-1], np.inf)]))
         positions = _positions(held, [columns], layout, model, inside)
-        return hold_log(model, kept, signals, held=positions)
-    reader, places = _reader(table, wanted), list[Place]()
-    stamps = map_stamps(_stamps(reader, layout, places), _file(layout))
-    first, stop = _window(stamps, layout, *window)
+        return hold_log(model, kept, signals, positions)
+    reader, places, where = _reader(table, wanted), list[Place](), Path(layout.path).name
+    stamps = map_stamps(_stamps(reader, layout, places), where)
+    first, stop = _window(stamps, where, *window)
     ranges = _close_looks(first, stop)
     found = [reader.read(wanted, i, j, _near(places, i)) for i, j in ranges]
-    windows = tuple(
-        _log_of(layout, columns, i) for columns, (i, _) in zip(found, ranges, strict=True)
-    )
+    windows = tuple(_log_of(layout, x, i) for x, (i, _) in zip(found, ranges, strict=True))
     for log in windows:
         check_units(log, layout.units, layout.prismatic)
     positions = _positions(held, found, layout, model)
@@ -445,15 +415,9 @@ def _near(places: Sequence[Place], row: int) -> Place:
     return places[max(bisect_right(places, row, key=lambda place: place.row) - 1, 0)]
 
 
-def _file(layout: LogLayout) -> str:
-    return Path(layout.path).name
-
-
-def _window(
-    stamps: Array, layout: LogLayout, start: float | None, end: float | None
-) -> tuple[int, int]:
+def _window(stamps: Array, where: str, start: float | None, end: float | None) -> tuple[int, int]:
     """Return the rows from start to end; see ``Log.window``."""
-    where, count = _file(layout), len(stamps)
+    count = len(stamps)
     if count < 2:
         raise DataError(f"{where} has {count} rows, wanted at least 2")
     first = 0 if start is None else int(np.searchsorted(stamps, start))
@@ -492,7 +456,7 @@ def _positions(
     windows: Sequence[Mapping[str, Array]],
     layout: LogLayout,
     model: RobotModel,
-    inside: slice = _ALL,
+    inside: slice = slice(None),
 ) -> dict[str, Array]:
     """Return the positions of locked joints that were read, in rad or m."""
     turning = {joint.name for joint in model.tree.movable if joint.type != "prismatic"}

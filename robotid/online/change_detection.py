@@ -62,15 +62,12 @@ class ChangeDetector:
         self._began = np.full(n, np.nan)
 
     def push(self, t: float, squares: Array, share: float) -> float | None:
-        """Take one sample.
+        """Take one sample; return when the change began if one is flagged now [s], else None.
 
         Args:
             t: Its time [s].
             squares: Squared innovations in variances, shape (n,); 0 for rows that say nothing.
             share: How much of an independent sample it is [-].
-
-        Returns:
-            When the change began if one is flagged now [s], else None.
         """
         evidence = self.evidence + share * (np.minimum(squares, _LARGEST) - self.drift)
         evidence[squares == 0.0] = self.evidence[squares == 0.0]
@@ -130,7 +127,7 @@ class Innovations:
         used: Array,
         share: float,
     ) -> float | None:
-        """Take one sample.
+        """Take one sample; return when a change began if one is flagged now [s], else None.
 
         Args:
             t: Its time [s].
@@ -140,9 +137,6 @@ class Innovations:
             doubt: Variance of the prediction from the parameters, shape (n,) [(N m)^2 or N^2].
             used: Which rows count, shape (n,), bool.
             share: How much of an independent sample it is [-].
-
-        Returns:
-            When a change began if one is flagged now [s], else None.
         """
         expected = doubt + self.variance + self._model_error**2 * self._torque
         # before it has converged, an innovation says nothing about change
@@ -178,9 +172,6 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
         covariance: Its covariance C, shape (b, b).
         columns: Columns K_L of the base mapping that belong to the body, shape (b, 10).
         spread: How large each parameter of a load may be, shape (10,).
-
-    Returns:
-        The load.
     """
     scale = np.sqrt(np.diag(covariance))
     L = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
@@ -193,13 +184,10 @@ def payload_of(difference: Array, covariance: Array, columns: Array, spread: Arr
 
 
 def load_spread(spread: Array) -> Array:
-    """Return how large the ten parameters of a load may be: a mean link's mass, twice its size.
+    """Return how large each parameter of a load may be, (10,): a mean link's mass, twice its size.
 
     Args:
         spread: How far the inertial parameters of all bodies may be wrong, shape (10 bodies,).
-
-    Returns:
-        Spreads, shape (10,).
     """
     by_body = spread.reshape(-1, 10)
     mass = max(float(by_body[:, 0].mean()), float(by_body[-1, 0]))

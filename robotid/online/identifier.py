@@ -53,7 +53,8 @@ class OnlineIdentifier:
         names: Names of the base parameters.
 
     Raises:
-        DataError: If the base floats.
+        DataError: If the base floats; later, by ``reading``, ``compared`` and ``estimate``, until
+            the robot has moved enough for a first estimate.
         SettingsError: If the cut-off is not below half the rate.
     """
 
@@ -98,19 +99,18 @@ class OnlineIdentifier:
                 self._skipped += 1
                 if self._skipped % self._every == 0:
                     self._take(instant, t)
-            self._now = t
         elif len(rest) == 3:
-            v, a, tau = rest
-            self._check(t, q, v, a, tau)
+            self._check(t, q, *rest)
             if self.delay:  # nothing is filtered here, and nothing left out
                 self.delay, self._every = 0.0, 1
                 self._pace()
-            self._take((t, np.asarray(q), np.asarray(v), np.asarray(a), np.asarray(tau)), t)
-            self._now = t
+            v, a, tau = map(np.asarray, rest)
+            self._take((t, np.asarray(q), v, a, tau), t)
         else:
             raise DataError(
                 f"update takes (t, q, tau) or (t, q, v, a, tau), found {2 + len(rest)} values"
             )
+        self._now = t
 
     @property
     def is_ready(self) -> bool:
@@ -119,14 +119,9 @@ class OnlineIdentifier:
 
     @property
     def reading(self) -> Reading:
-        """What is known now.
-
-        Raises:
-            DataError: If the robot has not moved enough for a first estimate.
-        """
+        """What is known now."""
         self._require_ready()
-        P = self._state.P
-        variance = np.maximum(np.diag(P), 0.0)
+        variance = np.maximum(np.diag(self._state.P), 0.0)
         left = np.minimum(variance / self._prior_variance, 1.0)
         return Reading(
             t=self._t,
@@ -139,34 +134,23 @@ class OnlineIdentifier:
 
     @property
     def compared(self) -> tuple[Array, Array]:
-        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each.
-
-        Raises:
-            DataError: If the robot has not moved enough for a first estimate.
-        """
+        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each."""
         self._require_ready()
         return self._compared
 
     @property
     def estimate(self) -> Estimate:
-        """The estimate as the batch estimators return it.
-
-        Raises:
-            DataError: If the robot has not moved enough for a first estimate.
-        """
+        """The estimate as the batch estimators return it."""
         kalman = self._require_ready()
-        converged = self.reading.converged
-        estimate = replace(kalman.estimate(self._state, self.names), converged=converged)
-        return replace(estimate, sigma=np.sqrt(self._innovations.variance))
+        told, sigma = self._innovations.is_converged, np.sqrt(self._innovations.variance)
+        estimate = kalman.estimate(self._state, self.names)
+        return replace(estimate, converged=told, sigma=sigma)
 
     def payload(self, index: int = -1) -> Payload:
         """Return the load on the last body that explains what a change has changed by now.
 
         Args:
             index: Which of ``changes``.
-
-        Returns:
-            The load.
 
         Raises:
             DataError: If there has been no such change.
@@ -208,7 +192,7 @@ class OnlineIdentifier:
         if self._kalman is not None:
             self._step(instant, now)
             return
-        _, _, v, _, _ = instant
+        v = instant[2]
         if (np.abs(v) >= self.settings.min_velocity).any():
             self._early.append(instant)
         if len(self._early) * self._dt >= self.settings.warmup:
@@ -219,13 +203,12 @@ class OnlineIdentifier:
         t, q, v, a, tau = (np.array(x) for x in zip(*self._early, strict=True))
         joints, segment = self.model.joints, np.zeros(len(t), dtype=int)
         seen = Trajectory(t, q, v, a, tau, joints, 1.0 / self._dt, segment)
-        spread = prior_spread(self.model, [seen])
+        spread = prior_spread(self.model, seen.squares, len(seen.t))
         beta = self.mapping.to_base(self.model.standard_parameters())
         KS = self.mapping.K * spread
         C = KS @ KS.T
         size = self.model.layout.n_inertial
-        last = slice(size - 10, size)  # the ten parameters of the last body
-        self._load_columns = self.mapping.K[:, last]
+        self._load_columns = self.mapping.K[:, size - 10 : size]  # of the last body
         self._load_spread = load_spread(spread[:size])
         KL = self._load_columns * self._load_spread
         self._reopening = KL @ KL.T + _REOPENED**2 * C
@@ -234,7 +217,7 @@ class OnlineIdentifier:
         s = self.settings
         detector = ChangeDetector(len(joints), s.threshold, s.drift)
         self._innovations = Innovations(rms, self._dt, s.noise_memory, s.model_error, detector)
-        walk = self.settings.walk * np.sqrt(self._dt)
+        walk = s.walk * np.sqrt(self._dt)
         # noise levels change as they are learnt, so they come with the weights of the rows
         self._kalman = Kalman(np.ones(len(joints)), beta, C, walk, None, self._share)
         self._state: KalmanState = self._kalman.init(len(beta))
@@ -245,7 +228,7 @@ class OnlineIdentifier:
     def _step(self, instant: Instant, now: float) -> None:
         t, q, v, a, tau = instant
         kalman = self._require_ready()
-        used = self._rows_used(v)
+        used = sure_rows(self.model.layout, v[None], self.settings.min_velocity)[0]
         Y = self._regressor(q, v, a)
         e = tau - Y @ self._state.theta
         doubt = np.einsum("ij,ij->i", Y @ self._state.P, Y)  # variance of the prediction
@@ -257,10 +240,6 @@ class OnlineIdentifier:
         onset = self._innovations.push(t, tau, e, residual, doubt, used, self._share)
         if onset is not None:
             self._reopen(now, onset)
-
-    def _rows_used(self, v: Array) -> Array:
-        used: Array = sure_rows(self.model.layout, v[None], self.settings.min_velocity)[0]
-        return used
 
     def _reopen(self, now: float, onset: float) -> None:
         """Go back to what was known before the change, and make the covariance wide again."""

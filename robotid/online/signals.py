@@ -59,15 +59,12 @@ class LiveSignals:
         self._next, self._count = 0.0, 0
 
     def push(self, t: float, q: Array, tau: Array) -> Iterator[Instant]:
-        """Take a sample and return the instants that it completes.
+        """Take a sample and return the instants that it completes, delayed; usually one.
 
         Args:
             t: Time stamp [s].
             q: Joint positions, shape (n,) [rad or m].
             tau: Joint torques, shape (n,) [N m or N].
-
-        Returns:
-            Instants, delayed; usually one.
 
         Raises:
             DataError: If a number is not finite or time does not increase; nothing is changed then.
@@ -78,9 +75,9 @@ class LiveSignals:
         if not (np.isfinite(t) and np.isfinite(u.sum())):
             raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
         last = self._last
-        if last is not None and t <= last[0]:
-            raise DataError(f"t must increase, but {t:.6g} s follows {last[0]:.6g} s")
         if last is not None:
+            if t <= last[0]:
+                raise DataError(f"t must increase, but {t:.6g} s follows {last[0]:.6g} s")
             jump = np.where(self._turns, u[: self._n] - last[1][: self._n], 0.0)
             u[: self._n] -= 2 * np.pi * np.round(jump / (2 * np.pi))
         self._last = (t, u)

@@ -1,4 +1,4 @@
-"""An online identification over a recorded log, as if it came in live; its history in files."""
+"""An online identification over a recorded log, as if it came in live."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,20 +40,12 @@ class Track:
     converged: Array
 
     def columns(self) -> dict[str, Array]:
-        """Return the history as columns: time, each base parameter and its standard error.
-
-        Returns:
-            Columns by name, each of shape (N,).
-        """
+        """Return the history by column, (N,) each: time, base parameters, standard errors."""
         table = {"time": self.t}
         for i, name in enumerate(self.identifier.names):
             table[name] = self.theta[:, i]
             table[f"{name}.std_error"] = self.std_error[:, i]
-        return {
-            **table,
-            "excitation": self.excitation,
-            "converged": self.converged.astype(float),
-        }
+        return table | {"excitation": self.excitation, "converged": self.converged.astype(float)}
 
 
 def track(
@@ -67,9 +59,6 @@ def track(
         settings: How the identification runs.
         observer: Called after each sample with its row of the log and the identifier.
 
-    Returns:
-        The history, about 20 rows a second.
-
     Raises:
         DataError: If the log is too short for a first estimate, or the base floats.
         SettingsError: If a setting does not fit the log.
@@ -77,24 +66,19 @@ def track(
     identifier = OnlineIdentifier(model, settings)
     times: list[float] = []
     readings: list[Reading] = []
-    for k in range(len(log.t)):
-        identifier.update(float(log.t[k]), log.q[k], log.tau[k])
+    for k, t in enumerate(log.t.tolist()):
+        identifier.update(t, log.q[k], log.tau[k])
         if observer is not None:
             observer(k, identifier)
-        is_due = not times or log.t[k] > times[-1] + 0.999 / _ROWS
+        is_due = not times or t > times[-1] + 0.999 / _ROWS
         if identifier.is_ready and (is_due or k == len(log.t) - 1):
-            times.append(float(log.t[k]))
+            times.append(t)
             readings.append(identifier.reading)
     if not readings:
         raise DataError(
             f"{log.path or 'log'}: the robot moves for less than the warm-up of "
             f"{settings.warmup:g} s, so there is no estimate; give a longer log with motion"
         )
-    return Track(
-        identifier,
-        np.array(times),
-        np.array([r.theta for r in readings]),
-        np.array([r.std_error for r in readings]),
-        np.array([r.excitation for r in readings]),
-        np.array([r.converged for r in readings]),
-    )
+    keys = ("theta", "std_error", "excitation", "converged")
+    history = {key: np.array([getattr(reading, key) for reading in readings]) for key in keys}
+    return Track(identifier, np.array(times), **history)

@@ -74,7 +74,7 @@ class RandomStates(Case):
 
 def consistent(case, **options):
     prior = case.model.standard_parameters()
-    spread = prior_spread(case.model, [case.trajectory])
+    spread = prior_spread(case.model, case.trajectory.squares, len(case.trajectory.t))
     return Consistent(case.model.layout, case.mapping.K, prior, spread, **options)
 
 

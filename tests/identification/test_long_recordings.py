@@ -61,12 +61,7 @@ def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
     wls = one.wls.theta
     np.testing.assert_allclose(other.wls.theta, wls, rtol=0, atol=rtol * np.abs(wls).max())
     np.testing.assert_allclose(other.prior_std, one.prior_std, rtol=rtol)
-    # standard errors are the scatter of stretches, which pieces cut elsewhere, 6 at the least: that
-    # knows a scatter to a third, 64 draws know it to 9 %
-    ratio = np.log(other.standard_error / one.standard_error)
-    assert abs(np.median(ratio)) < np.log(1.25), np.exp(ratio)
-    assert np.sqrt(np.mean(ratio**2)) < 1 / 3, np.exp(ratio)
-    assert np.abs(ratio).max() < np.log(3.0), np.exp(ratio)
+    check_errors(one, other)
     gap = np.abs(other.standard - one.standard) / one.standard_error
     assert gap.max() < 1e-3, "standard errors"
     for key in ("verdict", "structure", "joints", "outputs"):
@@ -77,6 +72,23 @@ def compare(job, folder, *, held=HELD, rtol=1e-9, fit_rtol=1e-5):
         assert_close(second["wls"][key], first["wls"][key], 1e-8)
     assert {w["code"] for w in second["warnings"]} == {w["code"] for w in first["warnings"]}
     return one, other
+
+
+def check_errors(one, other):
+    """Check that standard errors agree as well as each of them is known.
+
+    They are the scatter of stretches, which pieces cut elsewhere. One that rests on f degrees of
+    freedom, fewer than the stretches and the redrawn fits, is itself known to 1 / sqrt(2 f): so
+    far, with the f of both, may their logarithms differ. Of 60 normal values one is beyond 4
+    standard deviations in one case of 260. Standard parameters have no f of their own.
+    """
+    ratio = np.log(other.standard_error / one.standard_error)
+    assert abs(np.median(ratio)) < np.log(1.25), np.exp(ratio)
+    assert np.sqrt(np.mean(ratio**2)) < 1 / 3, np.exp(ratio)
+    known = np.sqrt(0.5 / one.errors.freedom + 0.5 / other.errors.freedom)
+    off = np.log(other.base_error / one.base_error) / known
+    assert np.sqrt(np.mean(off**2)) < 1.25, off
+    assert np.abs(off).max() < 4.0, off
 
 
 def without_bands(metrics):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.identification.prior import prior_spread, spread_of
+from robotid.identification.prior import prior_spread
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.robot.mass_matrix import carried_inertia
@@ -12,7 +12,9 @@ from robotid.robot.parameters import pseudo_inertia
 def test_the_spread_has_the_size_of_the_robot(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng)
     trajectory = process(log, SignalSettings(cutoff=None, trim=0.0))
-    spread = dict(zip(ur5.layout.names, prior_spread(ur5, [trajectory]), strict=True))
+    spread = dict(
+        zip(ur5.layout.names, prior_spread(ur5, trajectory.squares, len(trajectory.t)), strict=True)
+    )
     assert spread["forearm_link.m"] == ur5.tree.inertials["forearm_link"].mass
     radius = spread["forearm_link.mcx"] / spread["forearm_link.m"]
     assert 0.1 < radius < 1.0
@@ -26,12 +28,12 @@ def test_a_massless_link_still_has_a_spread(rng, ur5):
     light = ur5.with_parameters(0 * ur5.standard_parameters())
     log = exact_log(ur5, truth(ur5), rng)
     trajectory = process(log, SignalSettings(cutoff=None, trim=0.0))
-    assert (prior_spread(light, [trajectory]) > 0).all()
+    assert (prior_spread(light, trajectory.squares, len(trajectory.t)) > 0).all()
 
 
 def test_the_spread_is_what_the_docstring_says(ur5):
     squares, samples = np.array([4.0, 9.0, 25.0])[:, None] * np.ones((3, 6)), 1
-    spread = dict(zip(ur5.layout.names, spread_of(ur5, squares, samples), strict=True))
+    spread = dict(zip(ur5.layout.names, prior_spread(ur5, squares, samples), strict=True))
     inertial = ur5.tree.inertials["forearm_link"]
     mass, centre = inertial.mass, np.linalg.norm(ur5.standard_parameters()[21:24]) / inertial.mass
     J = pseudo_inertia(ur5.standard_parameters()[:60])[2]
@@ -50,5 +52,5 @@ def test_a_light_link_may_be_wrong_by_a_tenth_of_the_mean_mass(ur5):
     pi = ur5.standard_parameters()
     pi[20:30] *= 1e-6
     squares = np.ones((3, 6))
-    spread = spread_of(ur5.with_parameters(pi), squares, 1)
+    spread = prior_spread(ur5.with_parameters(pi), squares, 1)
     assert spread[20] == pytest.approx(0.1 * pi[:60:10].mean(), rel=1e-6)

@@ -22,7 +22,10 @@ from robotid.regressor.base_parameters import structural_mapping
 def inside(ur5, rng):
     """A fit whose prior is so narrow and so far inside that no bound binds."""
     trajectory, mapping = process(exact_log(ur5, truth(ur5), rng), EXACT), structural_mapping(ur5)
-    prior, spread = ur5.standard_parameters(), 1e-3 * prior_spread(ur5, [trajectory])
+    prior, spread = (
+        ur5.standard_parameters(),
+        1e-3 * prior_spread(ur5, trajectory.squares, len(trajectory.t)),
+    )
     prior[ur5.layout.n_inertial :] = 100.0 * spread[ur5.layout.n_inertial :]
     return Consistent(ur5.layout, mapping.K, prior, spread, metric="euclidean", margin=1e-9)
 

@@ -145,7 +145,7 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
 
 def test_its_prior_spread_would_alone_explain_the_torque(model, term, rng):
     motion = process(exact_log(model, truth(model), rng), EXACT)
-    spread = prior_spread(model, [motion])[drive_part(model)]
+    spread = prior_spread(model, motion.squares, len(motion.t))[drive_part(model)]
     assert (spread > 0).all()
     for j, s in enumerate(spread[:3]):
         tau, v, a = (np.sqrt(np.mean(x[:, j] ** 2)) for x in (motion.tau, motion.v, motion.a))

@@ -169,7 +169,9 @@ def test_rows_that_repeat_each_other_tell_the_noise_no_better(ur5, rng):
     trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
     factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
     prior = ur5.standard_parameters()
-    fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+    fit = Consistent(
+        ur5.layout, mapping.K, prior, prior_spread(ur5, trajectory.squares, len(trajectory.t))
+    )
     once = fit.noise(factors)
     repeated = replace(fit, independent_share=0.25)
     np.testing.assert_allclose(repeated.noise(merge([factors] * 4)), once, rtol=3e-3)
@@ -184,7 +186,9 @@ def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
         trajectory, mapping = process(log, EXACT), structural_mapping(ur5)
         factors = compress(mapping.reduce(build_problem(ur5, trajectory)))
         prior = ur5.standard_parameters()
-        fit = Consistent(ur5.layout, mapping.K, prior, prior_spread(ur5, [trajectory]))
+        fit = Consistent(
+            ur5.layout, mapping.K, prior, prior_spread(ur5, trajectory.squares, len(trajectory.t))
+        )
         found.append(fit.noise(factors) ** 2)
     ratio = np.sqrt(np.mean(found, axis=0)) / NOISE
     # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
