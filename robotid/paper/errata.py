@@ -44,11 +44,7 @@ class Erratum:
     on_program: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry of paper.json.
-
-        Returns:
-            Where, printed, corrected and the two torque differences.
-        """
+        """Return the entry of paper.json."""
         return {
             "where": self.where,
             "printed": self.printed,
@@ -89,9 +85,6 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
 
     Args:
         rng: Source of the random states: q within pi rad, v within 10 rad/s, a within 20 rad/s^2.
-
-    Returns:
-        The errata of (26), of G, of (27) and of (23).
     """
     somewhere = tuple(reach * rng.uniform(-1, 1, (_STATES, 2)) for reach in _REACH)
     program = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(np.linspace(0, DURATION, 401))
@@ -114,9 +107,6 @@ def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
     Args:
         duration: Length of the motion [s].
         dt: Step of the integration, Runge-Kutta of order 4 [s].
-
-    Returns:
-        Times and energies.
     """
     t = dt * np.arange(round(duration / dt) + 1)
     return EnergyDrift(t, {name: _free_energy(name, len(t), dt) for name in MODELS})

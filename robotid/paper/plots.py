@@ -37,9 +37,6 @@ def figure_3(joint: int) -> Any:  # noqa: ANN401
     Args:
         joint: Number of the joint, 0 or 1.
 
-    Returns:
-        A figure of Matplotlib.
-
     References:
         Tzvetkova, (28).
     """
@@ -59,9 +56,6 @@ def figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
     Args:
         studies: The models.
         joint: Number of the joint, 0 or 1.
-
-    Returns:
-        A figure of Matplotlib.
 
     References:
         Tzvetkova, (21).
@@ -91,9 +85,6 @@ def figure_5(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
     Args:
         studies: The models.
 
-    Returns:
-        A figure of Matplotlib.
-
     References:
         Tzvetkova, (24).
     """
@@ -115,9 +106,6 @@ def convergence_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
 
     Args:
         studies: The models.
-
-    Returns:
-        A figure of Matplotlib.
 
     References:
         Tzvetkova, (23).
@@ -142,9 +130,6 @@ def disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
 
     Args:
         studies: The models.
-
-    Returns:
-        A figure of Matplotlib.
     """
     figure, row = _figure(len(studies), height=3.2, share=True)
     shown = {"clean": "clean", "disturbed": "torque ±10 %", "noisy": "noise"}
@@ -166,9 +151,6 @@ def trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
 
     Args:
         runs: Random motions of each model.
-
-    Returns:
-        A figure of Matplotlib.
     """
     figure, row = _figure(len(runs), height=2.8, share=True)
     for axes, (name, found), colour in zip(row, runs.items(), _COLOURS, strict=False):
@@ -186,9 +168,6 @@ def energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
 
     Args:
         drift: Energies over time.
-
-    Returns:
-        A figure of Matplotlib.
     """
     figure, (axes,) = _figure(1, height=2.8)
     for name, colour in zip(drift.energy, _COLOURS, strict=False):

@@ -194,9 +194,6 @@ def run_procedure(
         keep_torques: Whether the history keeps the control.
         progress: Called with the number of each iteration that is done.
 
-    Returns:
-        The history.
-
     Raises:
         DataError: If P0 does not fit the dynamics.
         RankDeficientError: If the method is one-shot and the motion leaves parameters open.

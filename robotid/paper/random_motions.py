@@ -118,9 +118,6 @@ def random_runs(
         rng: Source of all that is random.
         reach: How far beside the program the robot may start [rad].
         progress: Called with the number of each iteration that is done.
-
-    Returns:
-        The runs.
     """
     n = dynamics.n_joints
     amplitude = rng.uniform(0.5, 2.0, (runs, n)) * rng.choice([-1.0, 1.0], (runs, n))

@@ -58,7 +58,7 @@ def run_paper(
     settings: PaperSettings | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Run the paper's simulation with its three models, and write what it gives.
+    """Run the paper's simulation with its three models, and write what it gives; return paper.json's.
 
     Every file is made in a folder of its own inside the target and then put in place.
 
@@ -67,9 +67,6 @@ def run_paper(
             missing.
         settings: How much is simulated; the defaults if None.
         progress: Called with the part of the work, iterations done, at most, and their name.
-
-    Returns:
-        The content of paper.json.
 
     References:
         Tzvetkova, section VI.

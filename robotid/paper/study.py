@@ -172,9 +172,6 @@ def study_model(
         settings: How much is simulated.
         progress: Called with the number of each iteration that is done.
 
-    Returns:
-        What it gave.
-
     References:
         Tzvetkova, section VI.
     """

@@ -64,21 +64,18 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "remarks": remarks,
         "base_parameters": _base_parameters(results),
-        "settings": _differences([_settings(result) for result in results]),
+        "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
         "versions": _differences([_versions(result) for result in results]),
     }
 
 
 def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
-    """Compare results and write the page.
+    """Compare results, write the page, and return what ``compare_results`` does.
 
     Args:
         paths: At least two result.json files.
         target: The HTML file to write; made beside it and then put in place.
-
-    Returns:
-        What ``compare_results`` returns.
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
@@ -177,18 +174,13 @@ def _common_recordings(
 def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return error and RMSE of each joint, one entry per result; None where a joint has no rows."""
     joints = dict.fromkeys(joint for m in metrics for joint in m["per_joint"])
-    table = []
+    rows = []
     for joint in joints:
         cells = [m["per_joint"].get(joint, {}) for m in metrics]
-        table.append(
-            {
-                "joint": joint,
-                "unit": next(cell["unit"] for cell in cells if cell),
-                "relative_error_pct": [cell.get("relative_error_pct") for cell in cells],
-                "rmse": [cell.get("rmse") for cell in cells],
-            }
-        )
-    return table
+        row = {key: [cell.get(key) for cell in cells] for key in ("relative_error_pct", "rmse")}
+        unit = next(cell["unit"] for cell in cells if cell)
+        rows.append({"joint": joint, "unit": unit, **row})
+    return rows
 
 
 def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -214,10 +206,9 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | Non
     return (other["value"] - one["value"]) / combined if combined > 0 else None
 
 
-def _settings(result: Mapping[str, Any]) -> dict[str, str]:
-    """Return the settings of a job, flat; recordings stand among the inputs."""
-    chosen = {k: v for k, v in result["settings"].items() if k not in _FILES}
-    return _flat(chosen)
+def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a job; recordings stand among the inputs."""
+    return {k: v for k, v in result["settings"].items() if k not in _FILES}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -254,19 +245,10 @@ def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     found: dict[tuple[Any, ...], dict[str, Any]] = {}
     for k, result in enumerate(results):
         for entry in result["inputs"]:
-            role, window = entry.get("role", ""), (entry.get("start"), entry.get("end"))
-            row = found.setdefault(
-                (role, entry["sha256"] or entry["path"], *window),
-                {
-                    "role": role,
-                    "path": entry["path"],
-                    "sha256": entry["sha256"],
-                    "start": window[0],
-                    "end": window[1],
-                    "in": [False] * len(results),
-                },
-            )
-            row["in"][k] = True
+            where = {key: entry.get(key) for key in ("path", "sha256", "start", "end")}
+            row = {"role": entry.get("role", ""), **where, "in": [False] * len(results)}
+            what = (row["role"], row["sha256"] or row["path"], row["start"], row["end"])
+            found.setdefault(what, row)["in"][k] = True
     return sorted(found.values(), key=lambda row: all(row["in"]))
 
 
@@ -287,14 +269,13 @@ def _page(content: Mapping[str, Any]) -> str:
 
 
 def _verdicts(content: Mapping[str, Any]) -> str:
-    shown = "".join(
+    return "".join(
         f'<div class="verdict {result["verdict"]["status"]}"><p>{result["label"]}: '
         f"<strong>{escape(result['verdict']['status'])}</strong> "
         f"({escape(result['estimator'])}) {code(result['path']).html}</p>"
         f"<ul>{''.join(f'<li>{escape(r)}</li>' for r in result['verdict']['reasons'])}</ul></div>\n"
         for result in content["results"]
     )
-    return shown
 
 
 def _labels(content: Mapping[str, Any], unit: str = "") -> list[str]:

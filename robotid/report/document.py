@@ -13,11 +13,12 @@ from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
 from robotid.logs.settings import SignalSettings
 from robotid.report.diagnosis import (
+    body_figures,
     drive_figures,
     information_section,
     residual_section,
 )
-from robotid.report.plots import plot_body, plot_torque
+from robotid.report.plots import plot_torque
 from robotid.report.svg import svg_element
 from robotid.report.tables import (
     base_table,
@@ -225,16 +226,11 @@ def _torque_figure(
 
 
 def _standard(found: Identification) -> str:
-    figures = ""
-    for i, body in enumerate(found.model.layout.bodies):
-        title = f"Parameters of {body} with error bars, beside the URDF's"
-        svg = svg_element(plot_body(found, i), title, f"body{i}")
-        figures += figure(f"<strong>{escape(body)}</strong>", svg)
     return (
         "<p>One of many sets with the same torque: the data fix the base parameters only, the "
         "rest follows the URDF. Source: data, where the standard error is below 30 % of the "
         "spread assumed before the fit; prior, above 90 %; mixed between.</p>\n"
-        f'<div class="plots">\n{figures}</div>\n{standard_table(found)}'
+        f"{body_figures(found)}{standard_table(found)}"
     )
 
 

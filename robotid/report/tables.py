@@ -1,4 +1,4 @@
-"""The report's tables and lists: parameters, consistency, what is open, settings, inputs."""
+"""The report's tables and lists, as HTML: parameters, consistency, what is open, settings, inputs."""
 
 from collections.abc import Sequence
 from html import escape
@@ -40,9 +40,6 @@ def drive_table(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     first = found.model.layout.n_inertial
     names = found.model.layout.drive_names
@@ -69,9 +66,6 @@ def base_table(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     mapping, units = found.mapping, found.model.layout.units
     rows = [
@@ -93,9 +87,6 @@ def standard_table(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     layout = found.model.layout
     rows = [
@@ -118,9 +109,6 @@ def consistency_section(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     layout = found.model.layout
     before, after = (
@@ -156,9 +144,6 @@ def open_section(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     wls, layout = found.wls, found.model.layout
     kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
@@ -216,9 +201,6 @@ def settings_tables(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     model = found.model
     gravity = ", ".join(f"{g:g}" for g in np.asarray(model.pin_model.gravity.linear).tolist())
@@ -247,9 +229,6 @@ def input_table(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     urdf = found.model.tree.path
     rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
@@ -260,11 +239,7 @@ def input_table(found: Identification) -> str:
 
 
 def version_table() -> str:
-    """Return the table of the versions that ran.
-
-    Returns:
-        HTML.
-    """
+    """Return the table of the versions that ran."""
     rows = [[text(name), code(version)] for name, version in versions().items()]
     return table("Versions that ran", ["what", "version"], rows)
 

@@ -39,9 +39,6 @@ def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
     Args:
         pi: Inertial parameters of the bodies, shape (10 bodies,), SI units.
 
-    Returns:
-        One ellipsoid per body.
-
     References:
         Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
         inertial parameter identification, section IV.

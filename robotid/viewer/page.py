@@ -20,9 +20,6 @@ def page(data: Mapping[str, Any]) -> str:
 
     Args:
         data: ``title``, ``notes``, ``live`` and what replay.js draws, in plain finite values.
-
-    Returns:
-        The HTML.
     """
     title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
     notes = " ".join(f"<p>{escape(note)}</p>" for note in data["notes"])

@@ -48,9 +48,6 @@ def robot_scene(model: RobotModel) -> Scene:
 
     Args:
         model: The robot.
-
-    Returns:
-        The scene.
     """
     tree = model.pin_model
     library, notes = _Library(model), []
