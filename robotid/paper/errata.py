@@ -1,12 +1,11 @@
 """What the paper's errata amount to: in torque, and in energy that the printed arm invents."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.paper.dynamics import LinearPlant, mass_matrix
+from robotid.paper.equations import LinearPlant, mass_matrix
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
     PAPER_PARAMETERS,
@@ -14,9 +13,8 @@ from robotid.paper.planar_2r import (
     printed_velocity_coefficient,
     regressor,
 )
-from robotid.paper.study import AMPLITUDE, DURATION, MODELS, paper_arm
+from robotid.paper.study import DURATION, MODELS, PROGRAM, paper_arm
 from robotid.simulation.integration import rk4
-from robotid.simulation.motions import ProgramMotion
 
 __all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
 
@@ -33,25 +31,15 @@ class Erratum:
         where: The equation.
         printed: What it says.
         corrected: What it must say.
-        anywhere: Largest torque difference over random states [N m].
-        on_program: Largest torque difference along the program motion [N m].
+        max_torque_difference: The largest over random states [N m].
+        max_torque_difference_on_program: The largest along the program motion [N m].
     """
 
     where: str
     printed: str
     corrected: str
-    anywhere: float
-    on_program: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry of paper.json."""
-        return {
-            "where": self.where,
-            "printed": self.printed,
-            "corrected": self.corrected,
-            "max_torque_difference": self.anywhere,
-            "max_torque_difference_on_program": self.on_program,
-        }
+    max_torque_difference: float
+    max_torque_difference_on_program: float
 
 
 @dataclass(frozen=True)
@@ -87,7 +75,7 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
         rng: Source of the random states: q within pi rad, v within 10 rad/s, a within 20 rad/s^2.
     """
     somewhere = tuple(reach * rng.uniform(-1, 1, (_STATES, 2)) for reach in _REACH)
-    program = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(np.linspace(0, DURATION, 401))
+    program = PROGRAM.evaluate(np.linspace(0, DURATION, 401))
     largest = [
         [float(np.abs(difference).max()) for difference in _differences(*states)]
         for states in (somewhere, program)

@@ -14,15 +14,18 @@ from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.paper.dynamics import LinearDynamics, Plant, mass_matrix, smallest_eigenvalue
-from robotid.paper.formulas import (
+from robotid.paper.equations import (
     Bounds,
+    LinearDynamics,
+    Plant,
     Sign,
     deviation,
+    mass_matrix,
     one_shot,
     proximity,
     recursive_update,
     reference_acceleration,
+    smallest_eigenvalue,
 )
 from robotid.simulation.integration import rk4
 from robotid.simulation.motions import ProgramMotion

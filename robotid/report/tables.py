@@ -1,4 +1,4 @@
-"""The report's tables and lists, as HTML: parameters, consistency, what is open, settings, inputs."""
+"""The report's tables as HTML: parameters, consistency, what is open, settings, inputs."""
 
 from collections.abc import Sequence
 from html import escape
