@@ -18,7 +18,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
 from robotid.viewer.page import frame, page
-from robotid.viewer.scene import coordinates, mass_marks, packed, robot_scene
+from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
 
 __all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay"]
 
@@ -157,13 +157,14 @@ def replay(
     if ghost is not None:
         _check(ghost[1], ghost[2], rate)
         second = _moved(model, ghost[1], ghost[2], rate)
-    scene = robot_scene(model)
     gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     start = float(t[0])
     lead = [f"0 s is {start:.3f} s of the log."] if abs(start) > 1e-9 else []
+    scene = robot_scene(model)
     data = _data(
         model,
-        scene.content,
+        scene,
+        [q] if ghost is None else [q, ghost[2]],
         motion=_packed_motion(*moved),
         ghost=None if second is None else {"label": ghost[0], **_packed_motion(*second)},  # type: ignore[index]
         masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
@@ -174,7 +175,6 @@ def replay(
             for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
         ],
         notes=[*notes, *lead, *(f"{note}." for note in scene.notes)],
-        view=_view(model, scene.corners, [q] if ghost is None else [q, ghost[2]]),
     )
     return Replay(data)
 
@@ -196,12 +196,12 @@ def live_page(
         gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
     """
     empty = np.zeros((0, 0))
-    scene = robot_scene(model)
     torques = Torques(np.zeros(0), np.zeros((0, model.n_rows)), {"predicted": empty})
     return page(
         _data(
             model,
-            scene.content,
+            robot_scene(model),
+            [q],
             motion=_packed_motion(np.zeros(0), empty),
             ghost=None,
             masses=[mass_marks(model, masses, "URDF")],
@@ -209,7 +209,6 @@ def live_page(
             bands={"names": list(names), "units": list(units), "t": None, "values": None},
             marks=[],
             notes=[],
-            view=_view(model, scene.corners, [q]),
             live=True,
         )
     )
@@ -217,12 +216,14 @@ def live_page(
 
 def _data(
     model: RobotModel,
-    scene: Mapping[str, Any],
+    scene: Scene,
+    motions: Sequence[Array],
     *,
     live: bool = False,
     **content: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    return {"title": model.name, "live": live, "scene": scene, **content}
+    view = _view(model, scene.corners, motions)
+    return {"title": model.name, "live": live, "scene": scene.content, **content, "view": view}
 
 
 def _check(t: Array, q: Array, rate: float) -> None:
