@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
+_EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 _WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
 
 
@@ -79,8 +80,8 @@ def build_result(
             "stretches": identification.errors.stretches,
             "inflation": identification.errors.inflation,
         },
-        "standard_parameters": _entries(identification, slice(0, size)),
-        "drive_parameters": _entries(identification, slice(size, None)),
+        "standard_parameters": _entries(identification, range(size)),
+        "drive_parameters": _entries(identification, range(size, len(identification.standard))),
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
@@ -248,20 +249,9 @@ def _inputs(identification: Identification) -> list[dict[str, Any]]:
     ):
         for evaluation in evaluations:
             recording = evaluation.recording
-            extent = recording.extent
-            inputs.append(
-                {
-                    "role": role,
-                    **_source(recording.log.path),
-                    "samples": extent.samples,
-                    "rate": extent.rate,
-                    "start": extent.start,
-                    "end": extent.end,
-                    "rows_used": extent.rows_used,
-                    "segments": extent.segments,
-                    "signals": dataclasses.asdict(recording.signals),
-                }
-            )
+            extent = {key: getattr(recording.extent, key) for key in _EXTENT}
+            signals = {"signals": dataclasses.asdict(recording.signals)}
+            inputs.append({"role": role, **_source(recording.log.path), **extent, **signals})
     return inputs
 
 
@@ -269,72 +259,51 @@ def _source(path: str) -> dict[str, Any]:
     return {"path": str(path), "sha256": file_sha256(path) if path else None}
 
 
-def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
-    mapping, units = identification.mapping, identification.model.layout.units
+def _base_parameters(found: Identification) -> list[dict[str, Any]]:
+    mapping, units = found.mapping, found.model.layout.units
     return [
         {
             "name": name,
-            "expression": expression,
-            "value": float(value),
-            "std_error": _finite(error),
-            "interval_95": [_finite(end) for end in interval],
+            "expression": mapping.expressions[k],
+            "value": float(found.base[k]),
+            "std_error": _finite(found.base_error[k]),
+            "interval_95": [_finite(end) for end in found.base_interval[k]],
             "unit": units[i],
         }
-        for name, expression, value, error, interval, i in zip(
-            mapping.base_names,
-            mapping.expressions,
-            identification.base,
-            identification.base_error,
-            identification.base_interval,
-            mapping.independent,
-            strict=True,
-        )
+        for k, (name, i) in enumerate(zip(mapping.base_names, mapping.independent, strict=True))
     ]
 
 
-def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:
-    layout = identification.model.layout
+def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
+    layout = found.model.layout
     return [
         {
-            "name": name,
-            "value": float(value),
-            "std_error": _finite(error),
-            "unit": unit,
-            "prior": float(prior),
-            "source": source,
+            "name": layout.names[i],
+            "value": float(found.standard[i]),
+            "std_error": _finite(found.standard_error[i]),
+            "unit": layout.units[i],
+            "prior": float(found.prior[i]),
+            "source": found.sources[i],
         }
-        for name, value, error, unit, prior, source in zip(
-            layout.names[part],
-            identification.standard[part],
-            identification.standard_error[part],
-            layout.units[part],
-            identification.prior[part],
-            identification.sources[part],
-            strict=True,
-        )
+        for i in numbers
     ]
 
 
-def _consistency(identification: Identification) -> dict[str, Any]:
-    layout = identification.model.layout
-    J = pseudo_inertia(identification.standard[: layout.n_inertial])
+def _consistency(found: Identification) -> dict[str, Any]:
+    layout = found.model.layout
+    J = pseudo_inertia(found.standard[: layout.n_inertial])
+    smallest = np.linalg.eigvalsh(J)[:, 0]
     return {
-        "is_consistent": identification.is_consistent,
+        "is_consistent": found.is_consistent,
         "links": [
-            {"name": body, "mass": float(J_i[3, 3]), "min_eigenvalue": _smallest(J_i)}
-            for body, J_i in zip(layout.bodies, J, strict=True)
+            {"name": body, "mass": float(J[i, 3, 3]), "min_eigenvalue": float(smallest[i])}
+            for i, body in enumerate(layout.bodies)
         ],
         "total_mass": float(J[:, 3, 3].sum()),
-        "mass_matrix": dataclasses.asdict(identification.mass_matrix),
-        "fit": dict(identification.estimate.details),
-        "sources": {
-            kind: identification.sources.count(kind) for kind in ("data", "mixed", "prior")
-        },
+        "mass_matrix": dataclasses.asdict(found.mass_matrix),
+        "fit": dict(found.estimate.details),
+        "sources": {kind: found.sources.count(kind) for kind in ("data", "mixed", "prior")},
     }
-
-
-def _smallest(J: Array) -> float:
-    return float(np.linalg.eigvalsh(J)[0])
 
 
 def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:

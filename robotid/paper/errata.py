@@ -104,7 +104,7 @@ def _differences(q: Array, v: Array, a: Array) -> list[Array]:
     """Return the torque that each erratum adds at N states, each shape (N, 2)."""
     P = parameters(PAPER_LINKS)
     five = parameters(PAPER_LINKS, form="corrected_five")
-    h = np.array([printed_velocity_coefficient(q_k, PAPER_LINKS) for q_k in q])
+    h = printed_velocity_coefficient(q, PAPER_LINKS)
     v1, v2 = v.T
     missing = np.stack([2 * h * v2 * (v1 + v2), np.zeros(len(q))], axis=1)  # printed - corrected
     G, G_printed = (regressor(q, v, a, form=form) for form in ("corrected_five", "printed"))

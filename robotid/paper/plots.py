@@ -89,7 +89,8 @@ def _figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
                 t = np.arange(len(u)) * DURATION / len(u)
                 upper.plot(t, u, color=colour, lw=1.0, label=f"iteration {number}")
                 lower.plot(t, u - torques[-1], color=colour, lw=1.0)
-        upper.plot(*_control(study, joint), "--", color=INK, lw=1.2, label="program control")
+        t, control = study.program_control(201)
+        upper.plot(t, control[:, joint], "--", color=INK, lw=1.2, label="program control")
         upper.set_title(study.name, fontsize=_FONT)
         lower.set_xlabel("time [s]")
     rows[0][0].set_ylabel(f"torque u{joint + 1} [N m]")
@@ -168,11 +169,6 @@ def _energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
     axes.set(xlabel="time [s]", ylabel="energy gained [%]")
     _legend(figure, axes)
     return figure
-
-
-def _control(study: ModelStudy, joint: int) -> tuple[Any, Any]:
-    t, u = study.program_control(201)
-    return t, u[:, joint]
 
 
 def _figure(columns: int, *, height: float, share: bool = False) -> tuple[Any, Any]:

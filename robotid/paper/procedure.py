@@ -94,21 +94,6 @@ class Influences:
         if self.rng is None and any(np.any(np.asarray(x) != 0) for x in (self.q, self.v, self.a)):
             raise SettingsError("sensor noise needs rng, the source of its random numbers")
 
-    def sense(self, value: Array, level: float | Array) -> Array:
-        """Return what a sensor reads.
-
-        Args:
-            value: The true values, shape (R, n).
-            level: Standard deviation of the noise.
-
-        Returns:
-            Values with noise, shape (R, n).
-        """
-        if self.rng is None or not np.any(np.asarray(level) != 0):
-            return value
-        noisy: Array = value + level * self.rng.standard_normal(value.shape)
-        return noisy
-
 
 @dataclass(frozen=True)
 class History:
@@ -257,14 +242,14 @@ class _Loop:
             q_pr = self.motion.evaluate(t)
             q, v = self._hold_lost(number, q, v, q_pr)
             distance = np.maximum(distance, np.abs(q - q_pr[0]).max(axis=1))
-            q_seen = self.influences.sense(q, self.influences.q)
-            v_seen = self.influences.sense(v, self.influences.v)
+            q_seen = self._sensed(q, self.influences.q)
+            v_seen = self._sensed(v, self.influences.v)
             q_star = reference_acceleration(q_seen, v_seen, q_pr, self.alpha, self.beta)  # (15)
             Psi = self.dynamics.regressor(q_seen, v_seen, q_star)  # (R, n, c), (22)
             u = np.einsum("rnc,rc->rn", Psi, self.P)  # (21)
             applied = u if self.influences.torque is None else u + self.influences.torque(t, u)
             a = self.plant.acceleration(q, v, applied)
-            a_seen = self.influences.sense(a, self.influences.a)
+            a_seen = self._sensed(a, self.influences.a)
             G = self.dynamics.regressor(q_seen, v_seen, a_seen)  # (12)
             prx = np.abs(proximity(G, self.P, u, sign=self.settings.sign)).max(axis=1)  # (23)
             largest = np.maximum(largest, prx)
@@ -278,6 +263,14 @@ class _Loop:
         if samples:
             self._update_once(samples)
         self._remember(number, largest, distance, torques)
+
+    def _sensed(self, value: Array, level: float | Array) -> Array:
+        """Return what a sensor reads, with white noise of a standard deviation."""
+        rng = self.influences.rng
+        if rng is None or not np.any(np.asarray(level) != 0):
+            return value
+        noisy: Array = value + level * rng.standard_normal(value.shape)
+        return noisy
 
     def _update(self, q: Array, Psi: Array, eta: Array, is_open: NDArray[np.bool_]) -> None:
         """Do (24), then (8)."""

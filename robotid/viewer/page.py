@@ -12,7 +12,6 @@ from robotid._html import scaffold
 __all__ = ["frame", "page"]
 
 _ASSETS = Path(__file__).parent / "assets"
-_SPEEDS = (0.1, 0.25, 0.5, 1, 2, 5, 10)
 
 
 def page(data: Mapping[str, Any]) -> str:
@@ -70,11 +69,10 @@ def _viewer() -> str:
     return viewer.read_text(encoding="utf-8")
 
 
-def _speeds() -> str:
-    options = (f'<option value="{s}"{" selected" * (s == 1)}>{s}×</option>' for s in _SPEEDS)
-    return "".join(options)
-
-
+_OPTIONS = "".join(
+    f'<option value="{s}"{" selected" * (s == 1)}>{s}×</option>'
+    for s in (0.1, 0.25, 0.5, 1, 2, 5, 10)
+)
 _BODY = f"""\
 <main aria-label="3-D view">
 <div id="meshcat-pane" role="img" aria-label="the robot in motion"></div>
@@ -94,7 +92,7 @@ half the torque's rms.</p>
 <div id="track"><input type="range" id="time" min="0" max="1" step="any" value="0"
  aria-label="time"></div>
 <output id="clock"></output>
-<label>speed <select id="speed">{_speeds()}</select></label>
+<label>speed <select id="speed">{_OPTIONS}</select></label>
 <label><input type="checkbox" id="loop" checked> loop</label>
 </div>
 <ul id="marks" aria-label="events" hidden></ul>

@@ -196,7 +196,6 @@ def live_page(
         gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
     """
     empty = np.zeros((0, 0))
-    torques = Torques(np.zeros(0), np.zeros((0, model.n_rows)), {"predicted": empty})
     return page(
         _data(
             model,
@@ -205,7 +204,7 @@ def live_page(
             motion=_packed_motion(np.zeros(0), empty),
             ghost=None,
             masses=[mass_marks(model, masses, "URDF")],
-            torques=_torque_rows(model, torques),
+            torques=_torque_rows(model, ["measured", "predicted"]),
             bands={"names": list(names), "units": list(units), "t": None, "values": None},
             marks=[],
             notes=[],
@@ -277,18 +276,17 @@ def _packed_motion(t: Array, q: Array) -> dict[str, Any]:
 
 def _torque_data(model: RobotModel, torques: Torques, start: float) -> dict[str, Any]:
     series = [torques.measured, *torques.predicted.values()]
-    wanted = (len(torques.t), model.n_rows)
-    for label, values in zip(["measured", *torques.predicted], series, strict=True):
+    labels, wanted = ["measured", *torques.predicted], (len(torques.t), model.n_rows)
+    for label, values in zip(labels, series, strict=True):
         if values.shape != wanted:
             raise DataError(f"torques {label!r} have shape {values.shape}, wanted {wanted}")
     t, values = _plotted(torques.t - start, np.hstack(series))
-    return {**_torque_rows(model, torques), "t": packed(t), "values": packed(values)}
+    return {**_torque_rows(model, labels), "t": packed(t), "values": packed(values)}
 
 
-def _torque_rows(model: RobotModel, torques: Torques) -> dict[str, Any]:
+def _torque_rows(model: RobotModel, labels: Sequence[str]) -> dict[str, Any]:
     """Return who is plotted, without times and values: joints, not the rows of a free base."""
-    first = model.n_rows - len(model.joints)
-    if first:
+    if model.n_rows > len(model.joints):
         raise DataError("the base floats; torques are shown of robots with a fixed base")
     tree = model.pin_model
     return {
@@ -296,7 +294,7 @@ def _torque_rows(model: RobotModel, torques: Torques) -> dict[str, Any]:
             {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
             for name, unit in zip(model.joints, model.row_units, strict=True)
         ],
-        "labels": ["measured", *torques.predicted],
+        "labels": labels,
         "t": None,
         "values": None,
     }
