@@ -51,9 +51,6 @@ def build_result(
         settings: The job, in the shape of its file.
         findings: Warnings.
         outputs: Files written beside it, by kind.
-
-    Returns:
-        The dictionary, schema_version 1.
     """
     model, size = identification.model, identification.model.layout.n_inertial
     return {
@@ -105,9 +102,6 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     Args:
         evaluation: The recording.
         name: Which parameters predict.
-
-    Returns:
-        The dictionary.
     """
     return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
 
@@ -188,13 +182,10 @@ def load_result(path: str | Path) -> Result:
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
-    """Read a result.json.
+    """Read the content of a result.json.
 
     Args:
         path: The file.
-
-    Returns:
-        Its content.
 
     Raises:
         DataError: If it is missing, no JSON, or of another schema.

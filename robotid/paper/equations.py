@@ -20,7 +20,6 @@ __all__ = [
     "PlanarDynamics",
     "Plant",
     "Sign",
-    "deviation",
     "mass_matrix",
     "one_shot",
     "proximity",
@@ -90,22 +89,6 @@ def reference_acceleration(
     q_pr, v_pr, a_pr = program
     q_star: Array = a_pr - alpha * (v - v_pr) - beta * (q - q_pr)
     return q_star
-
-
-def deviation(a: Array, q_star: Array) -> Array:
-    """Return eta = a - q_* = a - a_pr + alpha (v - v_pr) + beta (q - q_pr).
-
-    Args:
-        a: Measured accelerations, shape (..., n) [rad/s^2 or m/s^2].
-        q_star: Reference acceleration (15), shape (..., n).
-
-    Returns:
-        Difference of the real and the program motion, shape (..., n).
-
-    References:
-        Tzvetkova, (20).
-    """
-    return a - q_star
 
 
 def proximity(Psi: Array, P: Array, u: Array, *, sign: Sign = "corrected") -> Array:

@@ -48,24 +48,11 @@ class EnergyDrift:
 
     Attributes:
         t: Times, shape (N,) [s].
-        energy: Per model, shape (N,) [J].
+        gained: Per model, the energy gained since the start as a share of it, shape (N,).
     """
 
     t: Array
-    energy: dict[str, Array]
-
-    def relative(self, name: str) -> Array:
-        """Return the energy gained since the start as a share of the energy then.
-
-        Args:
-            name: Name of the model.
-
-        Returns:
-            Shares, shape (N,).
-        """
-        energy = self.energy[name]
-        gained: Array = energy / energy[0] - 1.0
-        return gained
+    gained: dict[str, Array]
 
 
 def errata(rng: np.random.Generator) -> list[Erratum]:
@@ -97,7 +84,8 @@ def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
         dt: Step of the integration, Runge-Kutta of order 4 [s].
     """
     t = dt * np.arange(round(duration / dt) + 1)
-    return EnergyDrift(t, {name: _free_energy(name, len(t), dt) for name in MODELS})
+    energy = {name: _free_energy(name, len(t), dt) for name in MODELS}
+    return EnergyDrift(t, {name: E / E[0] - 1.0 for name, E in energy.items()})
 
 
 def _differences(q: Array, v: Array, a: Array) -> list[Array]:

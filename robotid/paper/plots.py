@@ -164,8 +164,8 @@ def _trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
 def _energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
     """Draw the energy that each model gains in free motion."""
     figure, (axes,) = _figure(1, height=2.8)
-    for name, colour in zip(drift.energy, _COLOURS, strict=False):
-        axes.plot(drift.t, 100 * drift.relative(name), color=colour, lw=1.2, label=name)
+    for (name, gained), colour in zip(drift.gained.items(), _COLOURS, strict=False):
+        axes.plot(drift.t, 100 * gained, color=colour, lw=1.2, label=name)
     axes.set(xlabel="time [s]", ylabel="energy gained [%]")
     _legend(figure, axes)
     return figure
@@ -200,12 +200,8 @@ def _legend(figure: Any, axes: Any) -> None:  # noqa: ANN401
 def _label_decades(axes: Any) -> None:  # noqa: ANN401
     """Write the decades as 10⁻³: Matplotlib's own labels need its mathematics, which is off."""
     axes.yaxis.set_major_formatter(_power)
-    axes.yaxis.set_minor_formatter(_nothing)
+    axes.yaxis.set_minor_formatter("")
 
 
 def _power(value: float, _: int) -> str:
     return "10" + str(round(np.log10(value))).translate(_RAISED)
-
-
-def _nothing(_value: float, _position: int) -> str:
-    return ""

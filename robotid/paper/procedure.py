@@ -19,7 +19,6 @@ from robotid.paper.equations import (
     LinearDynamics,
     Plant,
     Sign,
-    deviation,
     mass_matrix,
     one_shot,
     proximity,
@@ -254,7 +253,8 @@ class _Loop:
             prx = np.abs(proximity(G, self.P, u, sign=self.settings.sign)).max(axis=1)  # (23)
             largest = np.maximum(largest, prx)
             if self.settings.method == "recursive":
-                self._update(q_seen, Psi, deviation(a_seen, q_star), prx > self.settings.eps1)
+                eta = a_seen - q_star  # (20), the deviation of the real from the program motion
+                self._update(q_seen, Psi, eta, prx > self.settings.eps1)
             else:
                 samples.append((G, Psi))
             if keep_torques:

@@ -89,15 +89,9 @@ def _trajectories(
     for k, name in enumerate(MODELS):
         rng = np.random.default_rng([settings.seed, k, int(reach > 0)])
         what = f"{name}, {settings.runs} motions from {where} the program"
-        dynamics, P = paper_arm(name)
+        counter = _counter(what, most, report)
         found[name] = random_runs(
-            dynamics,
-            P,
-            settings.runs,
-            most,
-            rng,
-            reach=reach,
-            progress=_counter(what, most, report),
+            *paper_arm(name), settings.runs, most, rng, reach=reach, progress=counter
         )
     return found
 
@@ -139,7 +133,7 @@ def _content(
         "errata": [asdict(e) for e in errata(np.random.default_rng(settings.seed))],
         "energy_drift": {
             "duration": float(drift.t[-1]),
-            "max_relative": {n: float(np.abs(drift.relative(n)).max()) for n in drift.energy},
+            "max_relative": {n: float(np.abs(E).max()) for n, E in drift.gained.items()},
         },
     }
 

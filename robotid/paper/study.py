@@ -47,6 +47,7 @@ PROGRAM = ProgramMotion(np.array(AMPLITUDE), DURATION)
 _START = (np.pi / 180, 0.0)  # [rad] where the robot starts, from its program
 _EPS1 = 1e-9  # [N m / s^2] PRX below it is zero
 TOLERANCE = 1e-3  # [-] relative error at which a run has converged
+_DRAWN = ("amplitude", "duration", "gain", "guess", "offset")  # what is random of a run
 _STALLED = 1e-3  # [-] a smaller share of the error lost over ten iterations is none
 
 
@@ -256,27 +257,20 @@ class RandomRuns:
         first = (self.errors < TOLERANCE).argmax(axis=0)
         return [int(k) for k in first[self.has_converged]]
 
+    @property
     def failures(self) -> list[dict[str, Any]]:
-        """Return each run that did not converge, and why.
-
-        Returns:
-            Number of the run, reason, final error, and what the run was.
-        """
+        """Each run that did not converge: its number, why, the final error, and what it was."""
         return [self._failure(int(r)) for r in np.flatnonzero(~self.has_converged)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the part of paper.json.
-
-        Returns:
-            Runs, converged, iterations of those, failures, and the tolerance.
-        """
+        """Return the part of paper.json."""
         return {
             "runs": len(self.guess),
             "converged": int(self.has_converged.sum()),
             "tolerance": TOLERANCE,
             "most_iterations": len(self.errors) - 1,
             "iterations": self.iterations,
-            "failures": self.failures(),
+            "failures": self.failures,
         }
 
     def _failure(self, r: int) -> dict[str, Any]:
@@ -284,11 +278,7 @@ class RandomRuns:
             "run": r,
             "reason": self._reason(r),
             "relative_error": float(self.errors[-1, r]),
-            "amplitude": self.amplitude[r].tolist(),
-            "duration": float(self.duration[r]),
-            "gain": float(self.gain[r]),
-            "guess": self.guess[r].tolist(),
-            "offset": self.offset[r].tolist(),
+            **{key: getattr(self, key)[r].tolist() for key in _DRAWN},
         }
 
     def _reason(self, r: int) -> str:

@@ -10,6 +10,7 @@ from robotid._files import write_text
 from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
+from robotid.findings import listed
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -66,7 +67,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "base_parameters": _base_parameters(results),
         "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
-        "versions": _differences([_versions(result) for result in results]),
+        "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
     }
 
 
@@ -106,20 +107,15 @@ def _require_same_mapping(
         if names:
             raise DataError(
                 f"{has} has {len(names)} base parameters that {lacks} has not: "
-                f"{_some(names)}; {what}"
+                f"{listed(names, 5)}; {what}"
             )
     changed = [name for name in ours if ours[name] != theirs[name]]
     if changed:
         name = changed[0]
         raise DataError(
             f"{len(changed)} base parameters stand for other sums in {first} and {second}: "
-            f"{_some(changed)}; {name} is {ours[name]} and {theirs[name]}; {what}"
+            f"{listed(changed, 5)}; {name} is {ours[name]} and {theirs[name]}; {what}"
         )
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return ", ".join(names[:5]) + more
 
 
 def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:
@@ -227,10 +223,6 @@ def _plain(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _versions(result: Mapping[str, Any]) -> dict[str, str]:
-    return dict(result.get("versions", {"robotid": result["robotid"]}))
 
 
 def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:

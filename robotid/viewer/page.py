@@ -9,7 +9,7 @@ from typing import Any
 
 from robotid._html import scaffold
 
-__all__ = ["frame", "page"]
+__all__ = ["page"]
 
 _ASSETS = Path(__file__).parent / "assets"
 
@@ -36,23 +36,6 @@ def page(data: Mapping[str, Any]) -> str:
         f"<script>{_viewer()}</script>\n<script>{_asset('uPlot.iife.min.js')}</script>\n"
         f"<script>{_asset('replay.js')}</script>\n",
         policy=policy,
-    )
-
-
-def frame(html: str, title: str, height: int) -> str:
-    """Return a page as an element for another one, as a notebook shows it.
-
-    Args:
-        html: The page.
-        title: What a screen reader calls it.
-        height: Its height [px].
-
-    Returns:
-        An iframe that holds the page; its scripts reach nothing outside.
-    """
-    return (
-        f'<iframe title="{escape(title)}" sandbox="allow-scripts" srcdoc="{escape(html)}" '
-        f'style="width: 100%; height: {height}px; border: 0"></iframe>'
     )
 
 

@@ -7,6 +7,7 @@ with what it shows, so that no process, no socket and no port is opened.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
-from robotid.viewer.page import frame, page
+from robotid.viewer.page import page
 from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
 
 __all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay"]
@@ -111,7 +112,11 @@ class Replay:
         return write_text(self.html, target)
 
     def _repr_html_(self) -> str:
-        return frame(self.html, f"{self.data['title']}: replay", 620)
+        # its scripts reach nothing outside
+        return (
+            f'<iframe title="{escape(self.data["title"])}: replay" sandbox="allow-scripts" '
+            f'srcdoc="{escape(self.html)}" style="width: 100%; height: 620px; border: 0"></iframe>'
+        )
 
 
 def replay(

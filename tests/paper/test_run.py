@@ -156,9 +156,9 @@ def test_the_errata_make_the_torques_differ_as_worked_out_by_hand():
 
 def test_only_the_physical_arm_keeps_its_energy():
     drift = energy_drift(duration=4.0, dt=4e-3)
-    assert np.abs(drift.relative("physical")).max() < 1e-9  # error of the integration
-    assert np.abs(drift.relative("printed")).max() > 0.2
-    assert np.abs(drift.relative("corrected")).max() > 0.1  # p3 != p4
+    assert np.abs(drift.gained["physical"]).max() < 1e-9  # error of the integration
+    assert np.abs(drift.gained["printed"]).max() > 0.2
+    assert np.abs(drift.gained["corrected"]).max() > 0.1  # p3 != p4
 
 
 def test_random_runs_tell_every_failure(rng):
@@ -193,7 +193,7 @@ def test_each_kind_of_failure_has_its_reason(change, reason, rng):
     runs = random_runs(dynamics, P, 1, 1, rng)
     errors = np.array(change.pop("errors", [0.5, 0.4]))[:, None]
     history = replace(runs.history, **{key: np.array([x]) for key, x in change.items()})
-    found = replace(runs, errors=errors, history=history).failures()
+    found = replace(runs, errors=errors, history=history).failures
     assert [failure["reason"] for failure in found] == [reason]
 
 
