@@ -8,6 +8,7 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid._html import Cell, code, number, percent, table, text
+from robotid.findings import listed
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import Identification
 from robotid.robot.parameters import pseudo_inertia
@@ -41,21 +42,17 @@ def drive_table(found: Identification) -> str:
     Args:
         found: The identification.
     """
-    first = found.model.layout.n_inertial
-    names = found.model.layout.drive_names
-    if not names:
+    layout, sources = found.model.layout, found.sources
+    if not layout.drive_names:
         return "<p>None was identified.</p>\n"
-    sources = found.sources
     rows = [
         [
-            code(name),
+            code(layout.names[i]),
             *_value(found.standard[i], found.standard_error[i]),
-            text(unit),
+            text(layout.units[i]),
             text(sources[i]),
         ]
-        for i, (name, unit) in enumerate(
-            zip(names, found.model.layout.units[first:], strict=True), start=first
-        )
+        for i in range(layout.n_inertial, len(layout.names))
     ]
     headers = ["parameter", "value", "standard error", "relative %", "unit", "from"]
     return table("Armature, friction and torque offset", headers, rows)
@@ -203,18 +200,19 @@ def settings_tables(found: Identification) -> str:
         found: The identification.
     """
     model = found.model
-    gravity = ", ".join(f"{g:g}" for g in np.asarray(model.pin_model.gravity.linear).tolist())
     settings = found.estimator.to_dict()
-    pairs = {"estimator": settings.pop("name")}
-    pairs |= {key.replace("_", " "): str(value) for key, value in settings.items()}
-    pairs["solver"] = f"{found.estimate.message} ({found.estimate.n_iter} iterations)"
-    pairs["drive terms"] = ", ".join(model.layout.terms) or "none"
-    pairs["gravity [m/s²]"] = gravity
-    pairs["base"] = "floating" if model.free_flyer else "fixed"
-    pairs["joints"] = ", ".join(model.joints)
-    pairs["locked joints"] = ", ".join(f"{k} = {v:g}" for k, v in model.locked.items()) or "none"
+    pairs = {
+        "estimator": settings.pop("name"),
+        **{key.replace("_", " "): str(value) for key, value in settings.items()},
+        "solver": f"{found.estimate.message} ({found.estimate.n_iter} iterations)",
+        "drive terms": listed(model.layout.terms),
+        "gravity [m/s²]": listed(f"{g:g}" for g in model.pin_model.gravity.linear.tolist()),
+        "base": "floating" if model.free_flyer else "fixed",
+        "joints": listed(model.joints),
+        "locked joints": listed(f"{k} = {v:g}" for k, v in model.locked.items()),
+    }
     for coupling in model.layout.couplings:
-        ratios = ", ".join(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
+        ratios = listed(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
         pairs[f"coupling {coupling.name}"] = ratios
     rows = [[text(key), text(value)] for key, value in pairs.items()]
     headers = ["log", "filter", "rate Hz", "velocity", "trim s", "least speed", "gap s"]
