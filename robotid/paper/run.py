@@ -104,11 +104,6 @@ def _content(
     drift: EnergyDrift,
 ) -> dict[str, Any]:
     loop = LoopSettings()
-    others = {
-        case: {study.name: _case(study, case) for study in studies}
-        for case in CASES
-        if case != "clean"
-    }
     return {
         "schema_version": 1,
         "robotid": __version__,
@@ -127,7 +122,7 @@ def _content(
         },
         "models": {study.name: _model(study) for study in studies},
         "one_shot": {study.name: study.one_shot_error for study in studies},
-        **others,
+        **{case: {s.name: _case(s, case) for s in studies} for case in CASES if case != "clean"},
         "trajectories": {name: runs.to_dict() for name, runs in near.items()},
         "trajectories_on_program": {name: runs.to_dict() for name, runs in exact.items()},
         "errata": [asdict(e) for e in errata(np.random.default_rng(settings.seed))],

@@ -288,10 +288,10 @@ def _errors_section(content: Mapping[str, Any]) -> str:
         )
         for entry in content["validation"]
     ]
-    if not content["fitted_alike"]:
+    fitted, alike = content["fitted"], content["fitted_alike"]
+    if not alike:
         parts.append("<p>The results were fitted to other recordings: of the errors below each is "
                      "that of its own, and they are not comparable.</p>\n")  # fmt: skip
-    fitted, alike = content["fitted"], content["fitted_alike"]
     parts.append(_error_table("Fitted rows of each result", content, fitted, alike))
     return "".join(parts)
 

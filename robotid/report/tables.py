@@ -14,16 +14,7 @@ from robotid.identification.pipeline import Identification
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 
-__all__ = [
-    "base_table",
-    "consistency_section",
-    "drive_table",
-    "input_table",
-    "open_section",
-    "settings_tables",
-    "standard_table",
-    "version_table",
-]
+__all__ = ["tables"]
 
 _METRICS = {
     "euclidean": "each parameter over its own spread (euclidean)",
@@ -36,12 +27,26 @@ _CHOSEN = {
 }
 
 
-def drive_table(found: Identification) -> str:
-    """Return the table of the drive parameters.
+def tables(found: Identification) -> dict[str, str]:
+    """Return the tables by the section that they stand in.
 
     Args:
         found: The identification.
     """
+    return {
+        "drives": _drive_table(found),
+        "base": _base_table(found),
+        "standard": _standard_table(found),
+        "consistency": _consistency_section(found),
+        "open": _open_section(found),
+        "settings": _settings_tables(found),
+        "inputs": _input_table(found),
+        "versions": _version_table(),
+    }
+
+
+def _drive_table(found: Identification) -> str:
+    """Return the table of the drive parameters."""
     layout, sources = found.model.layout, found.sources
     if not layout.drive_names:
         return "<p>None was identified.</p>\n"
@@ -58,12 +63,8 @@ def drive_table(found: Identification) -> str:
     return table("Armature, friction and torque offset", headers, rows)
 
 
-def base_table(found: Identification) -> str:
-    """Return the table of the base parameters.
-
-    Args:
-        found: The identification.
-    """
+def _base_table(found: Identification) -> str:
+    """Return the table of the base parameters."""
     mapping, units = found.mapping, found.model.layout.units
     rows = [
         [code(name), *_value(found.base[k], found.base_error[k]), text(units[i]), code(expression)]
@@ -79,12 +80,8 @@ def base_table(found: Identification) -> str:
     )
 
 
-def standard_table(found: Identification) -> str:
-    """Return the table of the inertial parameters of the bodies.
-
-    Args:
-        found: The identification.
-    """
+def _standard_table(found: Identification) -> str:
+    """Return the table of the inertial parameters of the bodies."""
     layout = found.model.layout
     rows = [
         [
@@ -101,12 +98,8 @@ def standard_table(found: Identification) -> str:
     return table("Standard parameters of the bodies", headers, rows)
 
 
-def consistency_section(found: Identification) -> str:
-    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix.
-
-    Args:
-        found: The identification.
-    """
+def _consistency_section(found: Identification) -> str:
+    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix."""
     layout = found.model.layout
     before, after = (
         pseudo_inertia(pi[: layout.n_inertial]) for pi in (found.prior, found.standard)
@@ -136,12 +129,8 @@ def consistency_section(found: Identification) -> str:
     )
 
 
-def open_section(found: Identification) -> str:
-    """Return what the data do not determine.
-
-    Args:
-        found: The identification.
-    """
+def _open_section(found: Identification) -> str:
+    """Return what the data do not determine."""
     wls, layout = found.wls, found.model.layout
     kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
@@ -193,12 +182,8 @@ def _combinations(found: Identification) -> str:
     )
 
 
-def settings_tables(found: Identification) -> str:
-    """Return the tables of the settings, as used.
-
-    Args:
-        found: The identification.
-    """
+def _settings_tables(found: Identification) -> str:
+    """Return the tables of the settings, as used."""
     model = found.model
     settings = found.estimator.to_dict()
     pairs = {
@@ -222,12 +207,8 @@ def settings_tables(found: Identification) -> str:
     )
 
 
-def input_table(found: Identification) -> str:
-    """Return the table of the files that were read.
-
-    Args:
-        found: The identification.
-    """
+def _input_table(found: Identification) -> str:
+    """Return the table of the files that were read."""
     urdf = found.model.tree.path
     rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
     for role, evaluations in (("fitted", found.fitted), ("validation", found.validation)):
@@ -236,7 +217,7 @@ def input_table(found: Identification) -> str:
     return table("Files read", headers, rows)
 
 
-def version_table() -> str:
+def _version_table() -> str:
     """Return the table of the versions that ran."""
     rows = [[text(name), code(version)] for name, version in versions().items()]
     return table("Versions that ran", ["what", "version"], rows)
