@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
+_EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
 _WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
 
 
@@ -43,7 +44,7 @@ def build_result(
     findings: Sequence[Finding] = (),
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of result.json, schema 1: plain values only, all of them finite.
+    """Return the content of result.json, plain values only and all of them finite.
 
     Args:
         identification: What was found.
@@ -76,8 +77,8 @@ def build_result(
             "stretches": identification.errors.stretches,
             "inflation": identification.errors.inflation,
         },
-        "standard_parameters": _entries(identification, slice(0, size)),
-        "drive_parameters": _entries(identification, slice(size, None)),
+        "standard_parameters": _entries(identification, range(size)),
+        "drive_parameters": _entries(identification, range(size, len(identification.standard))),
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
@@ -107,10 +108,15 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What an identification wrote: a result.json, and the URDF and sidecar beside it."""
+    """What an identification wrote: a result.json, and the URDF and sidecar beside it.
 
-    path: Path  # of the result.json
-    content: Mapping[str, Any]  # what it holds
+    Attributes:
+        path: The result.json.
+        content: What it holds.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
 
     def __repr__(self) -> str:
         return (
@@ -148,7 +154,8 @@ class Result:
     @property
     def verdict(self) -> Mapping[str, Any]:
         """How far to trust it: "status", "reasons" and "per_joint"."""
-        return dict(self.content["verdict"])
+        verdict: Mapping[str, Any] = self.content["verdict"]
+        return verdict
 
     @property
     def metrics(self) -> dict[str, Mapping[str, Any]]:
@@ -167,7 +174,7 @@ def load_result(path: str | Path) -> Result:
         The result: ``robot``, ``parameters``, ``verdict``, ``metrics``, and all of its content.
 
     Raises:
-        DataError: As of ``read_result``.
+        DataError: If it is missing, no JSON, or of another schema.
     """
     source = Path(path)
     source = source / "result.json" if source.is_dir() else source
@@ -175,7 +182,7 @@ def load_result(path: str | Path) -> Result:
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
-    """Return the content of a result.json.
+    """Read the content of a result.json.
 
     Args:
         path: The file.
@@ -203,11 +210,14 @@ def read_result(path: str | Path) -> dict[str, Any]:
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
-    """Return the parameters that a result states, (p,), SI units, in ``layout.names`` order.
+    """Return the standard parameters that a result states.
 
     Args:
         result: Content of a result.json.
         model: Its robot.
+
+    Returns:
+        Parameters, shape (p,), SI units, in ``layout.names`` order.
 
     Raises:
         ModelError: If a parameter of the robot is not in it.
@@ -224,23 +234,15 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
 
 def _inputs(identification: Identification) -> list[dict[str, Any]]:
     inputs = [{"role": "urdf", **_source(identification.model.tree.path)}]
-    used = [("identification", e.recording) for e in identification.fitted]
-    used += [("validation", e.recording) for e in identification.validation]
-    for role, recording in used:
-        extent = recording.extent
-        inputs.append(
-            {
-                "role": role,
-                **_source(recording.log.path),
-                "samples": extent.samples,
-                "rate": extent.rate,
-                "start": extent.start,
-                "end": extent.end,
-                "rows_used": extent.rows_used,
-                "segments": extent.segments,
-                "signals": dataclasses.asdict(recording.signals),
-            }
-        )
+    for role, evaluations in (
+        ("identification", identification.fitted),
+        ("validation", identification.validation),
+    ):
+        for evaluation in evaluations:
+            recording = evaluation.recording
+            extent = {key: getattr(recording.extent, key) for key in _EXTENT}
+            signals = {"signals": dataclasses.asdict(recording.signals)}
+            inputs.append({"role": role, **_source(recording.log.path), **extent, **signals})
     return inputs
 
 
@@ -248,55 +250,51 @@ def _source(path: str) -> dict[str, Any]:
     return {"path": str(path), "sha256": file_sha256(path) if path else None}
 
 
-def _base_parameters(identification: Identification) -> list[dict[str, Any]]:
-    mapping, units = identification.mapping, identification.model.layout.units
-    return _records(
-        name=mapping.base_names,
-        expression=mapping.expressions,
-        value=identification.base.tolist(),
-        std_error=map(_finite, identification.base_error),
-        interval_95=([_finite(end) for end in ends] for ends in identification.base_interval),
-        unit=(units[i] for i in mapping.independent),
-    )
+def _base_parameters(found: Identification) -> list[dict[str, Any]]:
+    mapping, units = found.mapping, found.model.layout.units
+    return [
+        {
+            "name": name,
+            "expression": mapping.expressions[k],
+            "value": float(found.base[k]),
+            "std_error": _finite(found.base_error[k]),
+            "interval_95": [_finite(end) for end in found.base_interval[k]],
+            "unit": units[i],
+        }
+        for k, (name, i) in enumerate(zip(mapping.base_names, mapping.independent, strict=True))
+    ]
 
 
-def _entries(identification: Identification, part: slice) -> list[dict[str, Any]]:
-    layout = identification.model.layout
-    return _records(
-        name=layout.names[part],
-        value=identification.standard[part].tolist(),
-        std_error=map(_finite, identification.standard_error[part]),
-        unit=layout.units[part],
-        prior=identification.prior[part].tolist(),
-        source=identification.sources[part],
-    )
+def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
+    layout = found.model.layout
+    return [
+        {
+            "name": layout.names[i],
+            "value": float(found.standard[i]),
+            "std_error": _finite(found.standard_error[i]),
+            "unit": layout.units[i],
+            "prior": float(found.prior[i]),
+            "source": found.sources[i],
+        }
+        for i in numbers
+    ]
 
 
-def _records(**columns: Iterable[Any]) -> list[dict[str, Any]]:
-    """Return a dictionary for each row of some columns."""
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _consistency(identification: Identification) -> dict[str, Any]:
-    layout = identification.model.layout
-    J = pseudo_inertia(identification.standard[: layout.n_inertial])
+def _consistency(found: Identification) -> dict[str, Any]:
+    layout = found.model.layout
+    J = pseudo_inertia(found.standard[: layout.n_inertial])
+    smallest = np.linalg.eigvalsh(J)[:, 0]
     return {
-        "is_consistent": identification.is_consistent,
+        "is_consistent": found.is_consistent,
         "links": [
-            {"name": body, "mass": float(J_i[3, 3]), "min_eigenvalue": _smallest(J_i)}
-            for body, J_i in zip(layout.bodies, J, strict=True)
+            {"name": body, "mass": float(J[i, 3, 3]), "min_eigenvalue": float(smallest[i])}
+            for i, body in enumerate(layout.bodies)
         ],
         "total_mass": float(J[:, 3, 3].sum()),
-        "mass_matrix": dataclasses.asdict(identification.mass_matrix),
-        "fit": dict(identification.estimate.details),
-        "sources": {
-            kind: identification.sources.count(kind) for kind in ("data", "mixed", "prior")
-        },
+        "mass_matrix": dataclasses.asdict(found.mass_matrix),
+        "fit": dict(found.estimate.details),
+        "sources": {kind: found.sources.count(kind) for kind in ("data", "mixed", "prior")},
     }
-
-
-def _smallest(J: Array) -> float:
-    return float(np.linalg.eigvalsh(J)[0])
 
 
 def _band(identification: Identification, evaluation: Evaluation) -> dict[str, Any]:

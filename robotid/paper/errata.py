@@ -1,12 +1,11 @@
 """What the paper's errata amount to: in torque, and in energy that the printed arm invents."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.paper.dynamics import LinearPlant, mass_matrix
+from robotid.paper.equations import LinearPlant, mass_matrix
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
     PAPER_PARAMETERS,
@@ -14,8 +13,7 @@ from robotid.paper.planar_2r import (
     printed_velocity_coefficient,
     regressor,
 )
-from robotid.paper.study import AMPLITUDE, DURATION, MODELS, paper_arm
-from robotid.simulation.motions import ProgramMotion
+from robotid.paper.study import DURATION, MODELS, PROGRAM, paper_arm
 from robotid.simulation.plant import rk4
 
 __all__ = ["EnergyDrift", "Erratum", "energy_drift", "errata"]
@@ -33,29 +31,15 @@ class Erratum:
         where: The equation.
         printed: What it says.
         corrected: What it must say.
-        anywhere: Largest torque difference over random states [N m].
-        on_program: Largest torque difference along the program motion [N m].
+        max_torque_difference: The largest over random states [N m].
+        max_torque_difference_on_program: The largest along the program motion [N m].
     """
 
     where: str
     printed: str
     corrected: str
-    anywhere: float
-    on_program: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry of paper.json.
-
-        Returns:
-            Where, printed, corrected and the two torque differences.
-        """
-        return {
-            "where": self.where,
-            "printed": self.printed,
-            "corrected": self.corrected,
-            "max_torque_difference": self.anywhere,
-            "max_torque_difference_on_program": self.on_program,
-        }
+    max_torque_difference: float
+    max_torque_difference_on_program: float
 
 
 @dataclass(frozen=True)
@@ -64,24 +48,11 @@ class EnergyDrift:
 
     Attributes:
         t: Times, shape (N,) [s].
-        energy: Per model, shape (N,) [J].
+        gained: Per model, the energy gained since the start as a share of it, shape (N,).
     """
 
     t: Array
-    energy: dict[str, Array]
-
-    def relative(self, name: str) -> Array:
-        """Return the energy gained since the start as a share of the energy then.
-
-        Args:
-            name: Name of the model.
-
-        Returns:
-            Shares, shape (N,).
-        """
-        energy = self.energy[name]
-        gained: Array = energy / energy[0] - 1.0
-        return gained
+    gained: dict[str, Array]
 
 
 def errata(rng: np.random.Generator) -> list[Erratum]:
@@ -89,12 +60,9 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
 
     Args:
         rng: Source of the random states: q within pi rad, v within 10 rad/s, a within 20 rad/s^2.
-
-    Returns:
-        The errata of (26), of G, of (27) and of (23).
     """
     somewhere = tuple(reach * rng.uniform(-1, 1, (_STATES, 2)) for reach in _REACH)
-    program = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(np.linspace(0, DURATION, 401))
+    program = PROGRAM.evaluate(np.linspace(0, DURATION, 401))
     largest = [
         [float(np.abs(difference).max()) for difference in _differences(*states)]
         for states in (somewhere, program)
@@ -114,19 +82,17 @@ def energy_drift(*, duration: float = 10.0, dt: float = 4e-3) -> EnergyDrift:
     Args:
         duration: Length of the motion [s].
         dt: Step of the integration, Runge-Kutta of order 4 [s].
-
-    Returns:
-        Times and energies.
     """
     t = dt * np.arange(round(duration / dt) + 1)
-    return EnergyDrift(t, {name: _free_energy(name, len(t), dt) for name in MODELS})
+    energy = {name: _free_energy(name, len(t), dt) for name in MODELS}
+    return EnergyDrift(t, {name: E / E[0] - 1.0 for name, E in energy.items()})
 
 
 def _differences(q: Array, v: Array, a: Array) -> list[Array]:
     """Return the torque that each erratum adds at N states, each shape (N, 2)."""
     P = parameters(PAPER_LINKS)
     five = parameters(PAPER_LINKS, form="corrected_five")
-    h = np.array([printed_velocity_coefficient(q_k, PAPER_LINKS) for q_k in q])
+    h = printed_velocity_coefficient(q, PAPER_LINKS)
     v1, v2 = v.T
     missing = np.stack([2 * h * v2 * (v1 + v2), np.zeros(len(q))], axis=1)  # printed - corrected
     G, G_printed = (regressor(q, v, a, form=form) for form in ("corrected_five", "printed"))

@@ -19,9 +19,6 @@ def paper_page(content: Mapping[str, Any], figures: Mapping[str, tuple[str, str]
     Args:
         content: What paper.json holds.
         figures: Caption and ``<svg>`` element of each figure, by name.
-
-    Returns:
-        HTML that fetches nothing.
     """
     shown = {name: figure(escape(said), svg) for name, (said, svg) in figures.items()}
     first = [shown[name] for name in ("figure_3a", "figure_3b", "figure_4a", "figure_4b")]

@@ -160,15 +160,15 @@ def regressor(q: Array, v: Array, a: Array, *, form: Form = "corrected") -> Arra
     return G
 
 
-def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> float:
+def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> Array:
     """Return h of erratum 1, which (26) prints for both C122 and C211.
 
     Args:
-        q: Joint angles, shape (2,) [rad].
+        q: Joint angles, shape (..., 2) [rad].
         links: Lengths and inertia of the links.
 
     Returns:
-        The coefficient [kg m^2].
+        The coefficient, shape (...) [kg m^2].
 
     Raises:
         DataError: If q does not have two entries.
@@ -176,9 +176,10 @@ def printed_velocity_coefficient(q: Array, links: PlanarLinks) -> float:
     References:
         Tzvetkova, (26).
     """
-    _, q2 = _vector("q", q, 2)
+    _, q2 = _pair("q", q)
     along, across = links.L2 * links.m2 + links.m2 * links.xbar2, links.m2 * links.ybar2  # [kg m]
-    return float(links.L1 * (np.sin(q2) * along + np.cos(q2) * across))
+    h: Array = links.L1 * (np.sin(q2) * along + np.cos(q2) * across)
+    return h
 
 
 def urdf_text(links: PlanarLinks = PAPER_LINKS) -> str:
@@ -211,13 +212,6 @@ def _body(i: int, parent: str, *numbers: float) -> str:
 def _check_form(form: str) -> None:
     if form not in PARAMETER_NAMES:
         raise SettingsError(f"form is {form!r}, wanted one of {list(PARAMETER_NAMES)}")
-
-
-def _vector(name: str, values: Array, size: int) -> Array:
-    array = np.asarray(values, dtype=float)
-    if array.shape != (size,):
-        raise DataError(f"{name} has shape {array.shape}, wanted ({size},)")
-    return array
 
 
 def _pair(name: str, values: Array) -> tuple[Array, Array]:

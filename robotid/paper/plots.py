@@ -7,20 +7,10 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.paper.errata import EnergyDrift
-from robotid.paper.random_motions import RandomRuns
-from robotid.paper.study import AMPLITUDE, CASES, DURATION, ModelStudy
+from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy, RandomRuns
 from robotid.report.svg import INK, STYLE
-from robotid.simulation.motions import ProgramMotion
 
-__all__ = [
-    "convergence_figure",
-    "disturbed_figure",
-    "energy_figure",
-    "figure_3",
-    "figure_4",
-    "figure_5",
-    "trajectories_figure",
-]
+__all__ = ["paper_figures"]
 
 # readable on white and on black
 _COLOURS = ("#0b7fd1", "#d4622a", "#23985f", "#b08400", "#b5539c")
@@ -31,20 +21,54 @@ _FONT = 8.5  # [pt]
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def figure_3(joint: int) -> Any:  # noqa: ANN401
-    """Return figure 3(a) or 3(b), the program motion of one link.
+def paper_figures(
+    studies: Sequence[ModelStudy], runs: Mapping[str, RandomRuns], drift: EnergyDrift
+) -> dict[str, tuple[str, Any]]:
+    """Return the caption of every figure, and the figure of Matplotlib, by the name of its file.
 
     Args:
-        joint: Number of the joint, 0 or 1.
-
-    Returns:
-        A figure of Matplotlib.
+        studies: The models.
+        runs: Random motions of each model.
+        drift: Energies over time.
 
     References:
-        Tzvetkova, (28).
+        Tzvetkova, figures 3 to 5.
     """
+    return {
+        "figure_3a": ("Figure 3(a). The program motion of link 1, (28)", _figure_3(0)),
+        "figure_3b": ("Figure 3(b). The program motion of link 2, (28)", _figure_3(1)),
+        "figure_4a": (
+            "Figure 4(a). Control u1 (21) in successive iterations, and the program control",
+            _figure_4(studies, 0),
+        ),
+        "figure_4b": (
+            "Figure 4(b). Control u2 (21) in successive iterations, and the program control",
+            _figure_4(studies, 1),
+        ),
+        "figure_5": (
+            "Figure 5. The estimated parameters (24) over the iterations",
+            _figure_5(studies),
+        ),
+        "convergence": (
+            "Proximity function (23) and parameter error over the iterations",
+            _convergence_figure(studies),
+        ),
+        "disturbance": (
+            "Parameter error with disturbed torque and with noisy sensors",
+            _disturbed_figure(studies),
+        ),
+        "trajectories": (
+            "Iterations that random motions took to a relative error of 10⁻³",
+            _trajectories_figure(runs),
+        ),
+        "energy": ("Energy gained in free motion", _energy_figure(drift)),
+    }
+
+
+def _figure_3(joint: int) -> Any:  # noqa: ANN401
+    """Draw the program motion (28) of one link."""
     t = np.linspace(0.0, DURATION, 201)
-    parts = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(t)
+    parts = PROGRAM.evaluate(t)
     units = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s²]")
     figure, row = _figure(3, height=2.4)
     for axes, part, label, colour in zip(row, parts, units, _COLOURS, strict=False):
@@ -53,19 +77,8 @@ def figure_3(joint: int) -> Any:  # noqa: ANN401
     return figure
 
 
-def figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
-    """Return figure 4(a) or 4(b), the control of one joint in successive iterations.
-
-    Args:
-        studies: The models.
-        joint: Number of the joint, 0 or 1.
-
-    Returns:
-        A figure of Matplotlib.
-
-    References:
-        Tzvetkova, (21).
-    """
+def _figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
+    """Draw the control (21) of one joint in successive iterations."""
     figure, rows = _grid(2, len(studies), height=4.4, share=True)
     for upper, lower, study in zip(*rows, studies, strict=True):
         kept = study.history.torques
@@ -76,7 +89,8 @@ def figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
                 t = np.arange(len(u)) * DURATION / len(u)
                 upper.plot(t, u, color=colour, lw=1.0, label=f"iteration {number}")
                 lower.plot(t, u - torques[-1], color=colour, lw=1.0)
-        upper.plot(*_control(study, joint), "--", color=INK, lw=1.2, label="program control")
+        t, control = study.program_control(201)
+        upper.plot(t, control[:, joint], "--", color=INK, lw=1.2, label="program control")
         upper.set_title(study.name, fontsize=_FONT)
         lower.set_xlabel("time [s]")
     rows[0][0].set_ylabel(f"torque u{joint + 1} [N m]")
@@ -85,18 +99,8 @@ def figure_4(studies: Sequence[ModelStudy], joint: int) -> Any:  # noqa: ANN401
     return figure
 
 
-def figure_5(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
-    """Return figure 5, the estimated parameters over the iterations.
-
-    Args:
-        studies: The models.
-
-    Returns:
-        A figure of Matplotlib.
-
-    References:
-        Tzvetkova, (24).
-    """
+def _figure_5(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
+    """Draw the estimated parameters (24) over the iterations."""
     figure, row = _figure(len(studies), height=3.2, share=True)
     colour = dict(zip(("p1", "p2", "p3", "p4", "p5"), _COLOURS, strict=True))
     for axes, study in zip(row, studies, strict=True):
@@ -110,18 +114,8 @@ def figure_5(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
     return figure
 
 
-def convergence_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
-    """Return PRX and the parameter error over the iterations.
-
-    Args:
-        studies: The models.
-
-    Returns:
-        A figure of Matplotlib.
-
-    References:
-        Tzvetkova, (23).
-    """
+def _convergence_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
+    """Draw PRX (23) and the parameter error over the iterations."""
     figure, (left, right) = _figure(2, height=3.2)
     for study, colour, style in zip(studies, _COLOURS, _STYLES, strict=False):
         numbers = np.arange(1, len(study.history.prx) + 1)
@@ -137,15 +131,8 @@ def convergence_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
     return figure
 
 
-def disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
-    """Return the parameter error under disturbance and noise.
-
-    Args:
-        studies: The models.
-
-    Returns:
-        A figure of Matplotlib.
-    """
+def _disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
+    """Draw the parameter error under disturbance and noise."""
     figure, row = _figure(len(studies), height=3.2, share=True)
     shown = {"clean": "clean", "disturbed": "torque ±10 %", "noisy": "noise"}
     shown["noisy_dead_zone"] = "noise, ε₂ = 1"
@@ -161,15 +148,8 @@ def disturbed_figure(studies: Sequence[ModelStudy]) -> Any:  # noqa: ANN401
     return figure
 
 
-def trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
-    """Return how many iterations the random motions took.
-
-    Args:
-        runs: Random motions of each model.
-
-    Returns:
-        A figure of Matplotlib.
-    """
+def _trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
+    """Draw how many iterations the random motions took."""
     figure, row = _figure(len(runs), height=2.8, share=True)
     for axes, (name, found), colour in zip(row, runs.items(), _COLOURS, strict=False):
         most, count = len(found.errors) - 1, len(found.guess)
@@ -181,26 +161,14 @@ def trajectories_figure(runs: Mapping[str, RandomRuns]) -> Any:  # noqa: ANN401
     return figure
 
 
-def energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
-    """Return the energy that each model gains in free motion.
-
-    Args:
-        drift: Energies over time.
-
-    Returns:
-        A figure of Matplotlib.
-    """
+def _energy_figure(drift: EnergyDrift) -> Any:  # noqa: ANN401
+    """Draw the energy that each model gains in free motion."""
     figure, (axes,) = _figure(1, height=2.8)
-    for name, colour in zip(drift.energy, _COLOURS, strict=False):
-        axes.plot(drift.t, 100 * drift.relative(name), color=colour, lw=1.2, label=name)
+    for (name, gained), colour in zip(drift.gained.items(), _COLOURS, strict=False):
+        axes.plot(drift.t, 100 * gained, color=colour, lw=1.2, label=name)
     axes.set(xlabel="time [s]", ylabel="energy gained [%]")
     _legend(figure, axes)
     return figure
-
-
-def _control(study: ModelStudy, joint: int) -> tuple[Any, Any]:
-    t, u = study.program_control(201)
-    return t, u[:, joint]
 
 
 def _figure(columns: int, *, height: float, share: bool = False) -> tuple[Any, Any]:
@@ -232,12 +200,8 @@ def _legend(figure: Any, axes: Any) -> None:  # noqa: ANN401
 def _label_decades(axes: Any) -> None:  # noqa: ANN401
     """Write the decades as 10⁻³: Matplotlib's own labels need its mathematics, which is off."""
     axes.yaxis.set_major_formatter(_power)
-    axes.yaxis.set_minor_formatter(_nothing)
+    axes.yaxis.set_minor_formatter("")
 
 
 def _power(value: float, _: int) -> str:
     return "10" + str(round(np.log10(value))).translate(_RAISED)
-
-
-def _nothing(_value: float, _position: int) -> str:
-    return ""

@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.paper.dynamics import LinearDynamics, Plant, mass_matrix, smallest_eigenvalue
-from robotid.paper.formulas import (
+from robotid.paper.equations import (
     Bounds,
+    LinearDynamics,
+    Plant,
     Sign,
-    deviation,
+    mass_matrix,
     one_shot,
     proximity,
     recursive_update,
     reference_acceleration,
+    smallest_eigenvalue,
 )
 from robotid.simulation.motions import ProgramMotion
 from robotid.simulation.plant import rk4
@@ -90,21 +92,6 @@ class Influences:
     def __post_init__(self) -> None:
         if self.rng is None and any(np.any(np.asarray(x) != 0) for x in (self.q, self.v, self.a)):
             raise SettingsError("sensor noise needs rng, the source of its random numbers")
-
-    def sense(self, value: Array, level: float | Array) -> Array:
-        """Return what a sensor reads.
-
-        Args:
-            value: The true values, shape (R, n).
-            level: Standard deviation of the noise.
-
-        Returns:
-            Values with noise, shape (R, n).
-        """
-        if self.rng is None or not np.any(np.asarray(level) != 0):
-            return value
-        noisy: Array = value + level * self.rng.standard_normal(value.shape)
-        return noisy
 
 
 @dataclass(frozen=True)
@@ -194,9 +181,6 @@ def run_procedure(
         keep_torques: Whether the history keeps the control.
         progress: Called with the number of each iteration that is done.
 
-    Returns:
-        The history.
-
     Raises:
         DataError: If P0 does not fit the dynamics.
         RankDeficientError: If the method is one-shot and the motion leaves parameters open.
@@ -257,19 +241,20 @@ class _Loop:
             q_pr = self.motion.evaluate(t)
             q, v = self._hold_lost(number, q, v, q_pr)
             distance = np.maximum(distance, np.abs(q - q_pr[0]).max(axis=1))
-            q_seen = self.influences.sense(q, self.influences.q)
-            v_seen = self.influences.sense(v, self.influences.v)
+            q_seen = self._sensed(q, self.influences.q)
+            v_seen = self._sensed(v, self.influences.v)
             q_star = reference_acceleration(q_seen, v_seen, q_pr, self.alpha, self.beta)  # (15)
             Psi = self.dynamics.regressor(q_seen, v_seen, q_star)  # (R, n, c), (22)
             u = np.einsum("rnc,rc->rn", Psi, self.P)  # (21)
             applied = u if self.influences.torque is None else u + self.influences.torque(t, u)
             a = self.plant.acceleration(q, v, applied)
-            a_seen = self.influences.sense(a, self.influences.a)
+            a_seen = self._sensed(a, self.influences.a)
             G = self.dynamics.regressor(q_seen, v_seen, a_seen)  # (12)
             prx = np.abs(proximity(G, self.P, u, sign=self.settings.sign)).max(axis=1)  # (23)
             largest = np.maximum(largest, prx)
             if self.settings.method == "recursive":
-                self._update(q_seen, Psi, deviation(a_seen, q_star), prx > self.settings.eps1)
+                eta = a_seen - q_star  # (20), the deviation of the real from the program motion
+                self._update(q_seen, Psi, eta, prx > self.settings.eps1)
             else:
                 samples.append((G, Psi))
             if keep_torques:
@@ -278,6 +263,14 @@ class _Loop:
         if samples:
             self._update_once(samples)
         self._remember(number, largest, distance, torques)
+
+    def _sensed(self, value: Array, level: float | Array) -> Array:
+        """Return what a sensor reads, with white noise of a standard deviation."""
+        rng = self.influences.rng
+        if rng is None or not np.any(np.asarray(level) != 0):
+            return value
+        noisy: Array = value + level * rng.standard_normal(value.shape)
+        return noisy
 
     def _update(self, q: Array, Psi: Array, eta: Array, is_open: NDArray[np.bool_]) -> None:
         """Do (24), then (8)."""

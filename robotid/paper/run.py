@@ -1,6 +1,7 @@
 """Run the paper's simulation and write its figures, tables and numbers."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -9,21 +10,23 @@ import numpy as np
 
 from robotid._files import folder_beside, write_json
 from robotid._typing import Array, ProgressCallback, ignore_progress
-from robotid.paper import plots
-from robotid.paper.dynamics import PlanarDynamics, torque
+from robotid.paper.equations import PlanarDynamics, torque
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
 from robotid.paper.page import paper_page
 from robotid.paper.planar_2r import urdf_text
+from robotid.paper.plots import paper_figures
 from robotid.paper.procedure import LoopSettings
-from robotid.paper.random_motions import RandomRuns, random_runs
 from robotid.paper.study import (
     AMPLITUDE,
     CASES,
     DURATION,
     MODELS,
+    PROGRAM,
     ModelStudy,
     PaperSettings,
+    RandomRuns,
     paper_arm,
+    random_runs,
     study_model,
 )
 from robotid.regressor.base_parameters import structural_mapping
@@ -31,7 +34,6 @@ from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.svg import STYLE, svg_element
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
-from robotid.simulation.motions import ProgramMotion
 from robotid.versions import __version__
 from robotid.viewer.replays import Torques, replay
 
@@ -39,17 +41,6 @@ __all__ = ["run_paper"]
 
 _ENOUGH = 1e-4  # [-] relative error at which the simulation has converged
 _SAMPLES = 241  # of the replay
-_CAPTIONS = {
-    "figure_3a": "Figure 3(a). The program motion of link 1, (28)",
-    "figure_3b": "Figure 3(b). The program motion of link 2, (28)",
-    "figure_4a": "Figure 4(a). Control u1 (21) in successive iterations, and the program control",
-    "figure_4b": "Figure 4(b). Control u2 (21) in successive iterations, and the program control",
-    "figure_5": "Figure 5. The estimated parameters (24) over the iterations",
-    "convergence": "Proximity function (23) and parameter error over the iterations",
-    "disturbance": "Parameter error with disturbed torque and with noisy sensors",
-    "trajectories": "Iterations that random motions took to a relative error of 10⁻³",
-    "energy": "Energy gained in free motion",
-}
 
 
 def run_paper(
@@ -58,7 +49,7 @@ def run_paper(
     settings: PaperSettings | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Run the paper's simulation with its three models, and write what it gives.
+    """Run the paper's simulation with its three models and write it; return paper.json's content.
 
     Every file is made in a folder of its own inside the target and then put in place.
 
@@ -67,9 +58,6 @@ def run_paper(
             missing.
         settings: How much is simulated; the defaults if None.
         progress: Called with the part of the work, iterations done, at most, and their name.
-
-    Returns:
-        The content of paper.json.
 
     References:
         Tzvetkova, section VI.
@@ -89,7 +77,7 @@ def run_paper(
     content = _content(chosen, studies, near, exact, drift)
     content["inertial_vector"] = _inertial_vector(arm, physical)
     report("drawing", 0, 1, "pages")
-    _write(target, content, _figures(studies, near, drift), arm, physical)
+    _write(target, content, paper_figures(studies, near, drift), arm, physical)
     return content
 
 
@@ -101,15 +89,9 @@ def _trajectories(
     for k, name in enumerate(MODELS):
         rng = np.random.default_rng([settings.seed, k, int(reach > 0)])
         what = f"{name}, {settings.runs} motions from {where} the program"
-        dynamics, P = paper_arm(name)
+        counter = _counter(what, most, report)
         found[name] = random_runs(
-            dynamics,
-            P,
-            settings.runs,
-            most,
-            rng,
-            reach=reach,
-            progress=_counter(what, most, report),
+            *paper_arm(name), settings.runs, most, rng, reach=reach, progress=counter
         )
     return found
 
@@ -122,11 +104,6 @@ def _content(
     drift: EnergyDrift,
 ) -> dict[str, Any]:
     loop = LoopSettings()
-    others = {
-        case: {study.name: _case(study, case) for study in studies}
-        for case in CASES
-        if case != "clean"
-    }
     return {
         "schema_version": 1,
         "robotid": __version__,
@@ -145,13 +122,13 @@ def _content(
         },
         "models": {study.name: _model(study) for study in studies},
         "one_shot": {study.name: study.one_shot_error for study in studies},
-        **others,
+        **{case: {s.name: _case(s, case) for s in studies} for case in CASES if case != "clean"},
         "trajectories": {name: runs.to_dict() for name, runs in near.items()},
         "trajectories_on_program": {name: runs.to_dict() for name, runs in exact.items()},
-        "errata": [e.to_dict() for e in errata(np.random.default_rng(settings.seed))],
+        "errata": [asdict(e) for e in errata(np.random.default_rng(settings.seed))],
         "energy_drift": {
             "duration": float(drift.t[-1]),
-            "max_relative": {n: float(np.abs(drift.relative(n)).max()) for n in drift.energy},
+            "max_relative": {n: float(np.abs(E).max()) for n, E in drift.gained.items()},
         },
     }
 
@@ -223,26 +200,10 @@ def _inertial_vector(arm: RobotModel, study: ModelStudy) -> dict[str, Any]:
     }
 
 
-def _figures(
-    studies: list[ModelStudy], runs: Mapping[str, RandomRuns], drift: EnergyDrift
-) -> dict[str, Any]:
-    return {
-        "figure_3a": plots.figure_3(0),
-        "figure_3b": plots.figure_3(1),
-        "figure_4a": plots.figure_4(studies, 0),
-        "figure_4b": plots.figure_4(studies, 1),
-        "figure_5": plots.figure_5(studies),
-        "convergence": plots.convergence_figure(studies),
-        "disturbance": plots.disturbed_figure(studies),
-        "trajectories": plots.trajectories_figure(runs),
-        "energy": plots.energy_figure(drift),
-    }
-
-
 def _write(
     target: Path,
     content: Mapping[str, Any],
-    figures: Mapping[str, Any],
+    figures: Mapping[str, tuple[str, Any]],
     arm: RobotModel,
     study: ModelStudy,
 ) -> None:
@@ -252,11 +213,11 @@ def _write(
     with folder_beside(target) as beside:
         shown = {}
         with matplotlib.rc_context(STYLE):
-            for name, figure in figures.items():
+            for name, (caption, figure) in figures.items():
                 figure.savefig(beside / f"{name}.png", dpi=150, facecolor="white")
                 figure.set_layout_engine("none")  # it is laid out now
                 figure.savefig(beside / f"{name}.svg", facecolor="white", metadata={"Date": None})
-                shown[name] = (_CAPTIONS[name], svg_element(figure, _CAPTIONS[name], name))
+                shown[name] = (caption, svg_element(figure, caption, name))
         (beside / "planar_2r.urdf").write_text(urdf_text(), encoding="utf-8")
         _write_replay(arm, study, beside / "replay.html")
         (beside / "paper.html").write_text(paper_page(content, shown), encoding="utf-8")
@@ -266,7 +227,7 @@ def _write(
 def _write_replay(arm: RobotModel, study: ModelStudy, target: Path) -> None:
     """Write the replay of the program motion (28), with the torques of the estimates."""
     t = np.linspace(0.0, DURATION, _SAMPLES)
-    q, v, a = ProgramMotion(np.array(AMPLITUDE), DURATION).evaluate(t)
+    q, v, a = PROGRAM.evaluate(t)
     dynamics = PlanarDynamics("corrected")
     estimates = study.history.estimates[:, 0]
     last = len(estimates) - 1

@@ -1,4 +1,4 @@
-"""The paper's simulation: three models of its arm, each found from half of its parameters.
+"""The paper's simulation: three models of its arm, found on its program and on random motions.
 
 The paper leaves open where the robot starts. On the program exactly, the samples of a run stay so
 near one curve that 100 iterations leave 2 % of error; one degree beside it, the same procedure
@@ -7,12 +7,14 @@ reaches 1e-5. The simulation starts one degree off, and tells both.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.paper.dynamics import LinearPlant, PlanarDynamics, torque
+from robotid.paper.equations import LinearDynamics, LinearPlant, PlanarDynamics, torque
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
 from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
 from robotid.simulation.motions import ProgramMotion
@@ -22,10 +24,14 @@ __all__ = [
     "CASES",
     "DURATION",
     "MODELS",
+    "PROGRAM",
+    "TOLERANCE",
     "Case",
     "ModelStudy",
     "PaperSettings",
+    "RandomRuns",
     "paper_arm",
+    "random_runs",
     "study_model",
 ]
 
@@ -37,8 +43,12 @@ MODELS: dict[str, Form] = {
 }
 AMPLITUDE = (1.0, 1.5)  # [rad] of the program motion
 DURATION = 2.0  # [s]
+PROGRAM = ProgramMotion(np.array(AMPLITUDE), DURATION)
 _START = (np.pi / 180, 0.0)  # [rad] where the robot starts, from its program
 _EPS1 = 1e-9  # [N m / s^2] PRX below it is zero
+TOLERANCE = 1e-3  # [-] relative error at which a run has converged
+_DRAWN = ("amplitude", "duration", "gain", "guess", "offset")  # what is random of a run
+_STALLED = 1e-3  # [-] a smaller share of the error lost over ten iterations is none
 
 
 @dataclass(frozen=True)
@@ -140,7 +150,7 @@ class ModelStudy:
             Tzvetkova, (14); figure 4.
         """
         t = np.linspace(0.0, DURATION, points)
-        return t, torque(self.dynamics, *_program().evaluate(t), self.P)
+        return t, torque(self.dynamics, *PROGRAM.evaluate(t), self.P)
 
 
 def paper_arm(name: str) -> tuple[PlanarDynamics, Array]:
@@ -172,9 +182,6 @@ def study_model(
         settings: How much is simulated.
         progress: Called with the number of each iteration that is done.
 
-    Returns:
-        What it gave.
-
     References:
         Tzvetkova, section VI.
     """
@@ -184,7 +191,7 @@ def study_model(
     history = run_procedure(
         dynamics,
         plant,
-        _program(),
+        PROGRAM,
         np.tile(P / 2, (len(cases), 1)),
         settings=LoopSettings(
             iterations=settings.iterations, eps1=_EPS1, eps2=np.array([c.eps2 for c in cases])
@@ -197,7 +204,7 @@ def study_model(
     endless = LoopSettings(iterations=settings.longest, eps1=_EPS1)
     once = LoopSettings(iterations=1, method="one_shot")
     further, single = (
-        run_procedure(dynamics, plant, _program(), P[None] / 2, settings=s, offset=np.array(_START))
+        run_procedure(dynamics, plant, PROGRAM, P[None] / 2, settings=s, offset=np.array(_START))
         for s in (endless, once)
     )
     return ModelStudy(
@@ -210,12 +217,130 @@ def study_model(
     )
 
 
-def _program() -> ProgramMotion:
-    return ProgramMotion(np.array(AMPLITUDE), DURATION)
-
-
 def _influences(cases: list[Case], rng: np.random.Generator) -> Influences:
     share = np.array([[case.torque] for case in cases])
     is_noisy = np.array([[float(case.noise)] for case in cases])
     noise = {key: level * is_noisy for key, level in _NOISE.items()}
     return Influences(random_torque(share, rng), rng=rng, **noise)
+
+
+@dataclass(frozen=True)
+class RandomRuns:
+    """R random motions, and what became of the estimate on each.
+
+    Attributes:
+        amplitude: Of each motion (28), shape (R, n) [rad].
+        duration: Of each motion, shape (R,) [s].
+        gain: Bandwidth w of the control, alpha = 2 w and beta = w^2, shape (R,) [1/s].
+        guess: First guess, shape (R, c).
+        offset: Where the robot starts, from its program, shape (R, n) [rad].
+        errors: Relative error before the first iteration and after each, shape (L + 1, R).
+        history: What happened.
+    """
+
+    amplitude: Array
+    duration: Array
+    gain: Array
+    guess: Array
+    offset: Array
+    errors: Array
+    history: History
+
+    @property
+    def has_converged(self) -> NDArray[np.bool_]:
+        """Whether each run reached ``TOLERANCE``, shape (R,)."""
+        return np.asarray((self.errors < TOLERANCE).any(axis=0))
+
+    @property
+    def iterations(self) -> list[int]:
+        """Iterations that each converged run took."""
+        first = (self.errors < TOLERANCE).argmax(axis=0)
+        return [int(k) for k in first[self.has_converged]]
+
+    @property
+    def failures(self) -> list[dict[str, Any]]:
+        """Each run that did not converge: its number, why, the final error, and what it was."""
+        return [self._failure(int(r)) for r in np.flatnonzero(~self.has_converged)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the part of paper.json."""
+        return {
+            "runs": len(self.guess),
+            "converged": int(self.has_converged.sum()),
+            "tolerance": TOLERANCE,
+            "most_iterations": len(self.errors) - 1,
+            "iterations": self.iterations,
+            "failures": self.failures,
+        }
+
+    def _failure(self, r: int) -> dict[str, Any]:
+        return {
+            "run": r,
+            "reason": self._reason(r),
+            "relative_error": float(self.errors[-1, r]),
+            **{key: getattr(self, key)[r].tolist() for key in _DRAWN},
+        }
+
+    def _reason(self, r: int) -> str:
+        if self.history.lost[r]:
+            return f"the robot ran away from its program in iteration {self.history.lost[r]}"
+        reason = _course(self.errors[:, r])
+        if skipped := self.history.skipped[r]:
+            reason += f"; {skipped} updates were left out, as D(q, P^) was not positive definite"
+        return reason
+
+
+def random_runs(
+    dynamics: LinearDynamics,
+    P: Array,
+    runs: int,
+    iterations: int,
+    rng: np.random.Generator,
+    *,
+    reach: float = 0.05,
+    progress: Callable[[int], None] | None = None,
+) -> RandomRuns:
+    """Run the procedure on random motions, first guesses, gains and starts.
+
+    Each joint moves by 0.5 to 2 rad either way in 1 to 3 s; each parameter is guessed at 0.3 to
+    1.7 times its value; the bandwidth is 5 to 20 1/s.
+
+    Args:
+        dynamics: The model.
+        P: Its true parameters, shape (c,).
+        runs: Number R of motions.
+        iterations: Most iterations of each.
+        rng: Source of all that is random.
+        reach: How far beside the program the robot may start [rad].
+        progress: Called with the number of each iteration that is done.
+    """
+    n = dynamics.n_joints
+    amplitude = rng.uniform(0.5, 2.0, (runs, n)) * rng.choice([-1.0, 1.0], (runs, n))
+    duration, gain = rng.uniform(1.0, 3.0, runs), rng.uniform(5.0, 20.0, runs)
+    guess = P * rng.uniform(0.3, 1.7, (runs, len(P)))
+    offset = reach * rng.uniform(-1.0, 1.0, (runs, n))
+    history = run_procedure(
+        dynamics,
+        LinearPlant(dynamics, P),
+        ProgramMotion(amplitude, duration),
+        guess,
+        settings=LoopSettings(alpha=2 * gain, beta=gain**2, iterations=iterations),
+        offset=offset,
+        progress=progress,
+    )
+    errors = history.relative_error(P)
+    return RandomRuns(amplitude, duration, gain, guess, offset, errors, history)
+
+
+def _course(error: Array) -> str:
+    """Return why an error, shape (L + 1,), is not small at its end."""
+    count = len(error) - 1
+    lost = 1.0 - error[-1] / error[max(0, count - 10)]
+    if error[-1] > error[0]:
+        return f"the error grew, from {error[0]:.2g} to {error[-1]:.2g}"
+    if lost < _STALLED:
+        return f"stalled: the motion excites too little; an error of {error[-1]:.2g} is left"
+    return (
+        f"slow: an error of {error[-1]:.2g} is left after {count} iterations and falls by "
+        f"{100 * lost:.2g} % in ten"
+    )

@@ -10,6 +10,7 @@ from robotid._files import write_text
 from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
+from robotid.findings import listed
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -64,21 +65,18 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "remarks": remarks,
         "base_parameters": _base_parameters(results),
-        "settings": _differences([_settings(result) for result in results]),
+        "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
-        "versions": _differences([_versions(result) for result in results]),
+        "versions": _differences([r.get("versions", {"robotid": r["robotid"]}) for r in results]),
     }
 
 
 def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[str, Any]:
-    """Compare results and write the page.
+    """Compare results, write the page, and return what ``compare_results`` does.
 
     Args:
         paths: At least two result.json files.
         target: The HTML file to write; made beside it and then put in place.
-
-    Returns:
-        What ``compare_results`` returns.
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
@@ -109,20 +107,15 @@ def _require_same_mapping(
         if names:
             raise DataError(
                 f"{has} has {len(names)} base parameters that {lacks} has not: "
-                f"{_some(names)}; {what}"
+                f"{listed(names, 5)}; {what}"
             )
     changed = [name for name in ours if ours[name] != theirs[name]]
     if changed:
         name = changed[0]
         raise DataError(
             f"{len(changed)} base parameters stand for other sums in {first} and {second}: "
-            f"{_some(changed)}; {name} is {ours[name]} and {theirs[name]}; {what}"
+            f"{listed(changed, 5)}; {name} is {ours[name]} and {theirs[name]}; {what}"
         )
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return ", ".join(names[:5]) + more
 
 
 def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:
@@ -177,18 +170,13 @@ def _common_recordings(
 def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return error and RMSE of each joint, one entry per result; None where a joint has no rows."""
     joints = dict.fromkeys(joint for m in metrics for joint in m["per_joint"])
-    table = []
+    rows = []
     for joint in joints:
         cells = [m["per_joint"].get(joint, {}) for m in metrics]
-        table.append(
-            {
-                "joint": joint,
-                "unit": next(cell["unit"] for cell in cells if cell),
-                "relative_error_pct": [cell.get("relative_error_pct") for cell in cells],
-                "rmse": [cell.get("rmse") for cell in cells],
-            }
-        )
-    return table
+        row = {key: [cell.get(key) for cell in cells] for key in ("relative_error_pct", "rmse")}
+        unit = next(cell["unit"] for cell in cells if cell)
+        rows.append({"joint": joint, "unit": unit, **row})
+    return rows
 
 
 def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -214,10 +202,9 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | Non
     return (other["value"] - one["value"]) / combined if combined > 0 else None
 
 
-def _settings(result: Mapping[str, Any]) -> dict[str, str]:
-    """Return the settings of a job, flat; recordings stand among the inputs."""
-    chosen = {k: v for k, v in result["settings"].items() if k not in _FILES}
-    return _flat(chosen)
+def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a job; recordings stand among the inputs."""
+    return {k: v for k, v in result["settings"].items() if k not in _FILES}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -232,14 +219,10 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 def _plain(value: object) -> str:
     if isinstance(value, list):
-        return ", ".join(_plain(v) for v in value) or "none"
+        return listed(map(_plain, value))
     if isinstance(value, bool):
         return "true" if value else "false"
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _versions(result: Mapping[str, Any]) -> dict[str, str]:
-    return dict(result.get("versions", {"robotid": result["robotid"]}))
 
 
 def _differences(each: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
@@ -254,19 +237,10 @@ def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     found: dict[tuple[Any, ...], dict[str, Any]] = {}
     for k, result in enumerate(results):
         for entry in result["inputs"]:
-            role, window = entry.get("role", ""), (entry.get("start"), entry.get("end"))
-            row = found.setdefault(
-                (role, entry["sha256"] or entry["path"], *window),
-                {
-                    "role": role,
-                    "path": entry["path"],
-                    "sha256": entry["sha256"],
-                    "start": window[0],
-                    "end": window[1],
-                    "in": [False] * len(results),
-                },
-            )
-            row["in"][k] = True
+            where = {key: entry.get(key) for key in ("path", "sha256", "start", "end")}
+            row = {"role": entry.get("role", ""), **where, "in": [False] * len(results)}
+            what = (row["role"], row["sha256"] or row["path"], row["start"], row["end"])
+            found.setdefault(what, row)["in"][k] = True
     return sorted(found.values(), key=lambda row: all(row["in"]))
 
 
@@ -287,14 +261,13 @@ def _page(content: Mapping[str, Any]) -> str:
 
 
 def _verdicts(content: Mapping[str, Any]) -> str:
-    shown = "".join(
+    return "".join(
         f'<div class="verdict {result["verdict"]["status"]}"><p>{result["label"]}: '
         f"<strong>{escape(result['verdict']['status'])}</strong> "
         f"({escape(result['estimator'])}) {code(result['path']).html}</p>"
         f"<ul>{''.join(f'<li>{escape(r)}</li>' for r in result['verdict']['reasons'])}</ul></div>\n"
         for result in content["results"]
     )
-    return shown
 
 
 def _labels(content: Mapping[str, Any], unit: str = "") -> list[str]:
@@ -315,10 +288,10 @@ def _errors_section(content: Mapping[str, Any]) -> str:
         )
         for entry in content["validation"]
     ]
-    if not content["fitted_alike"]:
+    fitted, alike = content["fitted"], content["fitted_alike"]
+    if not alike:
         parts.append("<p>The results were fitted to other recordings: of the errors below each is "
                      "that of its own, and they are not comparable.</p>\n")  # fmt: skip
-    fitted, alike = content["fitted"], content["fitted_alike"]
     parts.append(_error_table("Fitted rows of each result", content, fitted, alike))
     return "".join(parts)
 

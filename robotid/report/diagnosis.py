@@ -1,36 +1,37 @@
-"""The report's sections that look behind the errors: residuals, friction, excitation."""
+"""The report's sections with plots, as HTML: residuals, friction, parameters, excitation."""
 
 from collections.abc import Sequence
 from html import escape
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robotid._html import code, figure, number, table
 from robotid._typing import Array
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.information import Information, information
 from robotid.identification.pipeline import Identification
-from robotid.report.plots import (
-    correlation_map,
-    plot_drives,
-    plot_friction,
-    plot_residual,
-    plot_singular,
-)
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
-from robotid.report.svg import svg_element
+from robotid.report.svg import (
+    INK,
+    PREDICTED,
+    RESIDUAL,
+    drawing,
+    legend,
+    plain_decades,
+    svg_element,
+)
 
-__all__ = [
-    "drive_figures",
-    "information_section",
-    "residual_section",
-]
+__all__ = ["body_figures", "drive_figures", "information_section", "residual_section"]
 
 _DOTS = 1200  # of one friction plot
 _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
 _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # a correlation worth naming
+_CELL = 11  # [px] of the correlation matrix
+_STEPS = 8  # shades of each sign in it
 
 
 def residual_section(found: Identification) -> str:
@@ -38,9 +39,6 @@ def residual_section(found: Identification) -> str:
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     evaluation = _shown(found)
     figures = "".join(
@@ -83,14 +81,25 @@ def drive_figures(found: Identification) -> str:
     return f'{curves}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
 
 
+def body_figures(found: Identification) -> str:
+    """Return the inertial parameters of each body with error bars, beside the URDF's.
+
+    Args:
+        found: The identification.
+    """
+    figures = []
+    for i, body in enumerate(found.model.layout.bodies):
+        title = f"Parameters of {body} with error bars, beside the URDF's"
+        svg = svg_element(_plot_body(found, i), title, f"body{i}")
+        figures.append(figure(f"<strong>{escape(body)}</strong>", svg))
+    return f'<div class="plots">\n{"".join(figures)}</div>\n'
+
+
 def information_section(found: Identification) -> str:
     """Return how much the data say: singular values, shares, correlations.
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
     said, names = information(found), found.mapping.base_names
     shares = np.round(100 * said.data_share).astype(int)
@@ -109,7 +118,7 @@ def information_section(found: Identification) -> str:
         else "<p>The data settle every base parameter by 99 % or more.</p>\n"
     )
     title = "Singular values of the regressor, columns scaled to unit norm"
-    plot = plot_singular(said.singular_values, found.wls.rank)
+    plot = _plot_singular(said.singular_values, found.wls.rank)
     singular = svg_element(plot, title, "singular")
     return (
         f"<p>Condition number {found.wls.condition:.3g}; singular values from "
@@ -141,7 +150,7 @@ def _residual_figure(e: Evaluation, row: int, name: str, unit: str) -> str:
     falls = f"falls below 0.2 after {step * dt * inside[0]:.2g} s" if len(inside) else "stays high"
     title = f"Spectrum and autocorrelation of the residual of {name}, which {falls}"
     cutoff = e.recording.signals.cutoff
-    plot = plot_residual(density, torque, correlation, step * dt, cutoff=cutoff, unit=unit)
+    plot = _plot_residual(density, torque, correlation, step * dt, cutoff=cutoff, unit=unit)
     caption = f"<strong>{escape(name)}</strong>: correlation {falls}"
     return figure(caption, svg_element(plot, title, f"residual{row}"))
 
@@ -163,7 +172,7 @@ def _friction_figures(found: Identification) -> str:
             continue
         v = evaluation.recording.trajectory.v[rows, row]
         units = ("m/s" if unit == "N" else "rad/s", unit)
-        plot = plot_friction(v, left[rows, row], friction[rows, row], units=units)
+        plot = _plot_friction(v, left[rows, row], friction[rows, row], units=units)
         title = f"Friction of {name} against speed, measured and identified"
         svg = svg_element(plot, title, f"friction{row}")
         figures.append(figure(f"<strong>{escape(name)}</strong>", svg))
@@ -180,7 +189,7 @@ def _drive_figure(found: Identification, term: str) -> str:
         label = f"{term} [{unit}]"
         title = f"{term} of each drive with error bars, beside the value before the fit"
         figures.append(
-            figure(label, svg_element(plot_drives(found, part, label), title, f"{term}{k}"))
+            figure(label, svg_element(_plot_drives(found, part, label), title, f"{term}{k}"))
         )
     return "".join(figures)
 
@@ -197,7 +206,7 @@ def _correlations(said: Information, names: Sequence[str]) -> str:
     ]
     strong = int((lower >= _STRONG).sum())
     title = f"Correlation of the errors of {len(names)} base parameters; {strong} pairs above 0.8"
-    image = correlation_map(said.correlation, names, title=title, key="correlation")
+    image = _correlation_map(said.correlation, names, title=title, key="correlation")
     caption = "Blue: errors rise together; orange: one rises as the other falls; full colour at 1."
     listed = (
         table(
@@ -213,3 +222,172 @@ def _correlations(said: Information, names: Sequence[str]) -> str:
         "known as a sum or a difference only: the motion does not tell them apart.</p>\n"
         f"{listed}{figure(caption, image)}"
     )
+
+
+def _plot_body(found: Identification, i: int) -> Any:  # noqa: ANN401
+    """Draw one body's parameters with bars, beside the URDF's, in units of the prior's spread."""
+    part = np.arange(10 * i, 10 * i + 10)
+    spread = found.prior_std[part]
+    scale = np.where(spread > 0, spread, 1.0)
+    y = np.arange(10)
+    with drawing(2.7) as figure:
+        axes = figure.subplots()
+        axes.plot(found.prior[part] / scale, y - 0.18, "o", mfc="none", mec=INK, ms=4.5,
+                  label="URDF")  # fmt: skip
+        _draw_identified(axes, found, part, y + 0.18, scale)
+        axes.set_yticks(y, [found.model.layout.names[k].rsplit(".", 1)[1] for k in part])
+        axes.set_xlabel("value in units of the prior's assumed spread")
+        axes.invert_yaxis()
+        axes.grid(visible=True, axis="x")
+        legend(axes, 0.98)
+        figure.subplots_adjust(left=0.11, right=0.99, top=0.91, bottom=0.16)
+    return figure
+
+
+def _plot_drives(found: Identification, part: NDArray[np.int_], label: str) -> Any:  # noqa: ANN401
+    """Draw one term of k drives with bars, their prior and its spread; part has shape (k,)."""
+    prior, value, spread = (x[part] for x in (found.prior, found.standard, found.prior_std))
+    y, height = np.arange(len(part)), 0.75 + 0.26 * len(part)
+    with drawing(height) as figure:
+        axes = figure.subplots()
+        axes.barh(y, 2 * spread, left=prior - spread, height=0.7, color=INK, alpha=0.1,
+                  label="prior ± spread")  # fmt: skip
+        axes.plot(prior, y, "|", color=INK, ms=8)
+        bars = _draw_identified(axes, found, part, y)
+        # a prior that says next to nothing must not press the values into a point
+        low, high = np.min([value - bars, prior], axis=0), np.max([value + bars, prior], axis=0)
+        margin = 0.08 * max(float(high.max() - low.min()), 1e-12)
+        axes.set_xlim(float(low.min()) - margin, float(high.max()) + margin)
+        axes.set_yticks(y, [found.model.layout.names[k].rsplit(".", 1)[0] for k in part])
+        axes.set_xlabel(label)
+        axes.invert_yaxis()
+        axes.grid(visible=True, axis="x")
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, borderpad=0, handlelength=1.2
+        )
+        figure.subplots_adjust(left=0.3, right=0.98, top=1.0 - 0.24 / height, bottom=0.42 / height)
+    return figure
+
+
+def _plot_residual(
+    density: tuple[Array, Array],
+    torque: tuple[Array, Array],
+    correlation: Array,
+    dt: float,
+    *,
+    cutoff: float | None,
+    unit: str,
+) -> Any:  # noqa: ANN401
+    """Draw amplitude spectra (frequencies [Hz], density [unit^2/Hz]) beside an autocorrelation."""
+    highest = np.inf if cutoff is None else 2.0 * cutoff
+    with drawing(2.4) as figure:
+        left, right = figure.subplots(1, 2)
+        for (f, S), colour, label in ((torque, INK, "torque"), (density, RESIDUAL, "residual")):
+            shown = (f > 0) & (f <= highest) & (S > 0)
+            alpha = 0.6 if colour == INK else 1.0
+            left.semilogy(
+                f[shown], np.sqrt(S[shown]), color=colour, alpha=alpha, lw=1.0, label=label
+            )
+        if cutoff is not None:
+            left.axvline(cutoff, color=INK, lw=0.6, ls=":")
+        plain_decades(left)
+        left.set(xlabel="frequency [Hz]", ylabel=f"density [{unit}/√Hz]")
+        legend(left, 0.96)
+        right.plot(dt * np.arange(len(correlation)), correlation, color=RESIDUAL, lw=1.0)
+        right.axhline(0.0, color=INK, lw=0.5)
+        if cutoff is not None:
+            right.axvline(1.0 / (2.0 * cutoff), color=INK, lw=0.6, ls=":")
+        right.set(xlabel="lag [s]", ylabel="autocorrelation", ylim=(-1.05, 1.05))
+        for axes in (left, right):
+            axes.grid(visible=True)
+            axes.margins(x=0.01)
+        figure.subplots_adjust(left=0.11, right=0.99, top=0.89, bottom=0.2, wspace=0.28)
+    return figure
+
+
+def _plot_friction(v: Array, left: Array, friction: Array, *, units: tuple[str, str]) -> Any:  # noqa: ANN401
+    """Draw the torque that inertia and gravity leave, and the friction found; shape (M,) each."""
+    with drawing(2.4, simplify=False) as figure:
+        axes = figure.subplots()
+        # a path of dots is a tenth of the size of as many markers
+        for y, colour, width, alpha, label in (
+            (left, INK, 1.6, 0.4, "torque left"),
+            (friction, PREDICTED, 2.2, 1.0, "friction and offset identified"),
+        ):
+            x = np.column_stack([v, v, np.full(len(v), np.nan)]).ravel()
+            dots = np.column_stack([y, y, np.full(len(y), np.nan)]).ravel()
+            axes.plot(x, dots, color=colour, alpha=alpha, lw=width, solid_capstyle="round")
+            axes.plot([], [], "o", ms=width + 1, color=colour, alpha=alpha, label=label)
+        axes.axhline(0.0, color=INK, lw=0.5)
+        axes.set(xlabel=f"speed [{units[0]}]", ylabel=f"friction [{units[1]}]")
+        axes.grid(visible=True)
+        legend(axes, 0.96)
+        figure.subplots_adjust(left=0.11, right=0.99, top=0.89, bottom=0.2)
+    return figure
+
+
+def _plot_singular(values: Array, rank: int) -> Any:  # noqa: ANN401
+    """Draw singular values, largest first; those that the data leave open in another colour."""
+    number = np.arange(1, len(values) + 1)
+    floor = float(values.max()) * 1e-17
+    with drawing(2.2) as figure:
+        axes = figure.subplots()
+        axes.semilogy(number[:rank], values[:rank], "o", color=PREDICTED, ms=3)
+        axes.semilogy(number[rank:], np.maximum(values[rank:], floor), "x", color=RESIDUAL, ms=4)
+        plain_decades(axes)
+        axes.set(xlabel="number of the direction", ylabel="singular value")
+        axes.grid(visible=True)
+        figure.subplots_adjust(left=0.11, right=0.99, top=0.96, bottom=0.21)
+    return figure
+
+
+def _correlation_map(correlation: Array, names: Sequence[str], *, title: str, key: str) -> str:
+    """Return the lower triangle of a correlation matrix as a map of squares, with names."""
+    size = len(names)
+    margin = 12 + 6 * (max(len(name) for name in names) + 4)
+    width, height = margin + _CELL * size + 4, _CELL * (size + 2)
+    step = np.rint(np.where(np.isfinite(correlation), correlation, 0.0) * _STEPS).astype(int)
+    parts = [
+        _cells(step, shade, margin)
+        for shade in range(-_STEPS, _STEPS + 1)
+        if shade and bool((np.tril(step, -1) == shade).any())
+    ]
+    labels = "".join(
+        f'<text x="{margin - 6}" y="{_CELL * (i + 1) - 2}" text-anchor="end">{escape(name)} '
+        f"{i + 1}</text>"
+        f'<text x="{margin + _CELL * i + 2}" y="{_CELL * (i + 1) - 2}">{i + 1}</text>'
+        for i, name in enumerate(names)
+    )
+    return (
+        f'<svg class="map" viewBox="0 0 {width} {height}" role="img" '
+        f'aria-labelledby="{key}-title" style="min-width: {width}px; max-width: {width}px">'
+        f'<title id="{key}-title">{escape(title)}</title>'
+        f'<g fill="currentColor" font-size="9" stroke="none">{labels}</g>{"".join(parts)}</svg>'
+    )
+
+
+def _draw_identified(
+    axes: Any,  # noqa: ANN401
+    found: Identification,
+    part: NDArray[np.int_],
+    y: Array,
+    scale: Array | float = 1.0,
+) -> Array:
+    """Draw the identified values at heights y, with bars of two standard errors; return these."""
+    error = found.standard_error[part]
+    bars: Array = np.where(np.isfinite(error), 2 * error, 0.0) / scale
+    axes.errorbar(
+        found.standard[part] / scale, y, xerr=bars, fmt="o", color=PREDICTED, ms=4, lw=1.2,
+        capsize=2.5, label="identified, ±2 standard errors",
+    )  # fmt: skip
+    return bars
+
+
+def _cells(step: NDArray[np.int_], shade: int, margin: int) -> str:
+    rows, columns = np.nonzero(np.tril(step, -1) == shade)
+    path = "".join(
+        f"M{margin + _CELL * j} {_CELL * i}h{_CELL - 1}v{_CELL - 1}h-{_CELL - 1}z"
+        for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
+    )
+    colour = "var(--predicted)" if shade > 0 else "var(--residual)"
+    return f'<path d="{path}" fill="{colour}" fill-opacity="{abs(shade) / _STEPS:.3f}"/>'

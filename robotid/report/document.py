@@ -13,22 +13,14 @@ from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
 from robotid.logs.settings import SignalSettings
 from robotid.report.diagnosis import (
+    body_figures,
     drive_figures,
     information_section,
     residual_section,
 )
-from robotid.report.plots import plot_body, plot_torque
+from robotid.report.plots import plot_torque
 from robotid.report.svg import svg_element
-from robotid.report.tables import (
-    base_table,
-    consistency_section,
-    drive_table,
-    input_table,
-    open_section,
-    settings_tables,
-    standard_table,
-    version_table,
-)
+from robotid.report.tables import tables
 from robotid.versions import __version__
 
 __all__ = ["write_report"]
@@ -57,23 +49,21 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
+    made = tables(identification)
     sections = {
         "errors": ("Prediction errors", _errors(identification)),
         "torques": ("Torques over time", _torques(identification)),
         "residuals": ("What the residuals hold", residual_section(identification)),
-        "drives": (
-            "Drive parameters",
-            drive_figures(identification) + drive_table(identification),
-        ),
-        "base": ("Base parameters", base_table(identification)),
-        "standard": ("Standard parameters", _standard(identification)),
-        "consistency": ("Physical consistency", consistency_section(identification)),
+        "drives": ("Drive parameters", drive_figures(identification) + made["drives"]),
+        "base": ("Base parameters", made["base"]),
+        "standard": ("Standard parameters", _standard(identification) + made["standard"]),
+        "consistency": ("Physical consistency", made["consistency"]),
         "information": ("Excitation and correlation", information_section(identification)),
-        "open": ("What the data do not determine", open_section(identification)),
+        "open": ("What the data do not determine", made["open"]),
         "warnings": ("Warnings and notes", _warnings(identification, findings)),
-        "settings": ("Settings", settings_tables(identification)),
-        "inputs": ("Inputs", input_table(identification)),
-        "versions": ("Versions", version_table()),
+        "settings": ("Settings", made["settings"]),
+        "inputs": ("Inputs", made["inputs"]),
+        "versions": ("Versions", made["versions"]),
     }
     title = f"{identification.model.name}: identified parameters"
     return write_text(page(title, _summary(identification), sections), target)
@@ -117,7 +107,7 @@ def _names(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _errors(found: Identification) -> str:
-    tables = [
+    parts = [
         _error_table(
             f"{e.recording.name}: not fitted", found, e.metrics["estimate"], e.metrics["wls"]
         )
@@ -125,12 +115,12 @@ def _errors(found: Identification) -> str:
     ]
     count = len(found.fitted)
     fitted = "All fitted rows together" if count > 1 else f"{_names(found.fitted)}: fitted"
-    tables.append(_error_table(fitted, found, found.metrics(), found.metrics("wls")))
+    parts.append(_error_table(fitted, found, found.metrics(), found.metrics("wls")))
     return (
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
         "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
         "without drive parameters, of its gravity torque alone, and of predicting zero.</p>\n"
-        + "".join(tables)
+        + "".join(parts)
     )
 
 
@@ -225,16 +215,11 @@ def _torque_figure(
 
 
 def _standard(found: Identification) -> str:
-    figures = ""
-    for i, body in enumerate(found.model.layout.bodies):
-        title = f"Parameters of {body} with error bars, beside the URDF's"
-        svg = svg_element(plot_body(found, i), title, f"body{i}")
-        figures += figure(f"<strong>{escape(body)}</strong>", svg)
     return (
         "<p>One of many sets with the same torque: the data fix the base parameters only, the "
         "rest follows the URDF. Source: data, where the standard error is below 30 % of the "
         "spread assumed before the fit; prior, above 90 %; mixed between.</p>\n"
-        f'<div class="plots">\n{figures}</div>\n{standard_table(found)}'
+        + body_figures(found)
     )
 
 
@@ -249,7 +234,7 @@ def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
     if not findings and not notes:
         return "<p>None.</p>\n"
     every = [*findings, *notes]
-    tables = ""
+    html = ""
     for severity, title in _SEVERITIES.items():
         rows = [
             [code(f.code), text(f.message, flag=severity == "error"), code(f.where)]
@@ -257,5 +242,5 @@ def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
             if f.severity == severity
         ]
         if rows:
-            tables += table(f"{title}: {len(rows)}", ["code", "message", "about"], rows)
-    return tables
+            html += table(f"{title}: {len(rows)}", ["code", "message", "about"], rows)
+    return html

@@ -9,7 +9,16 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["INK", "PREDICTED", "RESIDUAL", "STYLE", "drawing", "plain_decades", "svg_element"]
+__all__ = [
+    "INK",
+    "PREDICTED",
+    "RESIDUAL",
+    "STYLE",
+    "drawing",
+    "legend",
+    "plain_decades",
+    "svg_element",
+]
 
 # Matplotlib writes each of these colours into the SVG; there it becomes one of the page's own
 #: Colour of text and axes; in a page it becomes the colour of the page's text.
@@ -62,6 +71,16 @@ def drawing(height: float, *, simplify: bool = True) -> Iterator[Any]:
         yield Figure(figsize=(6.4, height))
 
 
+def legend(axes: Any, height: float) -> None:  # noqa: ANN401
+    """Draw a legend above the plot, from its left edge.
+
+    Args:
+        axes: Axes of Matplotlib, drawn in.
+        height: Where it stands, as a share of the height of the axes.
+    """
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=2, borderpad=0)
+
+
 def plain_decades(axes: Any) -> None:  # noqa: ANN401
     """Write the decades of a logarithmic axis as plain numbers: a page has no formulas.
 
@@ -84,9 +103,6 @@ def svg_element(figure: Any, title: str, key: str) -> str:  # noqa: ANN401
         figure: A figure of Matplotlib, drawn in ``STYLE``.
         title: What it shows, for those who cannot see it.
         key: A word that no other plot on the page has.
-
-    Returns:
-        An ``<svg>`` element.
     """
     import matplotlib
 

@@ -1,4 +1,4 @@
-"""The report's tables and lists: parameters, consistency, what is open, settings, inputs."""
+"""The report's tables as HTML: parameters, consistency, what is open, settings, inputs."""
 
 from collections.abc import Sequence
 from html import escape
@@ -8,21 +8,13 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid._html import Cell, code, number, percent, table, text
+from robotid.findings import listed
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import Identification
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 
-__all__ = [
-    "base_table",
-    "consistency_section",
-    "drive_table",
-    "input_table",
-    "open_section",
-    "settings_tables",
-    "standard_table",
-    "version_table",
-]
+__all__ = ["tables"]
 
 _METRICS = {
     "euclidean": "each parameter over its own spread (euclidean)",
@@ -35,44 +27,44 @@ _CHOSEN = {
 }
 
 
-def drive_table(found: Identification) -> str:
-    """Return the table of the drive parameters.
+def tables(found: Identification) -> dict[str, str]:
+    """Return the tables by the section that they stand in.
 
     Args:
         found: The identification.
-
-    Returns:
-        HTML.
     """
-    first = found.model.layout.n_inertial
-    names = found.model.layout.drive_names
-    if not names:
+    return {
+        "drives": _drive_table(found),
+        "base": _base_table(found),
+        "standard": _standard_table(found),
+        "consistency": _consistency_section(found),
+        "open": _open_section(found),
+        "settings": _settings_tables(found),
+        "inputs": _input_table(found),
+        "versions": _version_table(),
+    }
+
+
+def _drive_table(found: Identification) -> str:
+    """Return the table of the drive parameters."""
+    layout, sources = found.model.layout, found.sources
+    if not layout.drive_names:
         return "<p>None was identified.</p>\n"
-    sources = found.sources
     rows = [
         [
-            code(name),
+            code(layout.names[i]),
             *_value(found.standard[i], found.standard_error[i]),
-            text(unit),
+            text(layout.units[i]),
             text(sources[i]),
         ]
-        for i, (name, unit) in enumerate(
-            zip(names, found.model.layout.units[first:], strict=True), start=first
-        )
+        for i in range(layout.n_inertial, len(layout.names))
     ]
     headers = ["parameter", "value", "standard error", "relative %", "unit", "from"]
     return table("Armature, friction and torque offset", headers, rows)
 
 
-def base_table(found: Identification) -> str:
-    """Return the table of the base parameters.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML.
-    """
+def _base_table(found: Identification) -> str:
+    """Return the table of the base parameters."""
     mapping, units = found.mapping, found.model.layout.units
     rows = [
         [code(name), *_value(found.base[k], found.base_error[k]), text(units[i]), code(expression)]
@@ -88,15 +80,8 @@ def base_table(found: Identification) -> str:
     )
 
 
-def standard_table(found: Identification) -> str:
-    """Return the table of the inertial parameters of the bodies.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML.
-    """
+def _standard_table(found: Identification) -> str:
+    """Return the table of the inertial parameters of the bodies."""
     layout = found.model.layout
     rows = [
         [
@@ -113,15 +98,8 @@ def standard_table(found: Identification) -> str:
     return table("Standard parameters of the bodies", headers, rows)
 
 
-def consistency_section(found: Identification) -> str:
-    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML.
-    """
+def _consistency_section(found: Identification) -> str:
+    """Return masses and pseudo-inertias, before and after; then prior, bounds and mass matrix."""
     layout = found.model.layout
     before, after = (
         pseudo_inertia(pi[: layout.n_inertial]) for pi in (found.prior, found.standard)
@@ -151,15 +129,8 @@ def consistency_section(found: Identification) -> str:
     )
 
 
-def open_section(found: Identification) -> str:
-    """Return what the data do not determine.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML.
-    """
+def _open_section(found: Identification) -> str:
+    """Return what the data do not determine."""
     wls, layout = found.wls, found.model.layout
     kept = [n for n, source in zip(layout.names, found.sources, strict=True) if source == "prior"]
     return (
@@ -211,28 +182,22 @@ def _combinations(found: Identification) -> str:
     )
 
 
-def settings_tables(found: Identification) -> str:
-    """Return the tables of the settings, as used.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML.
-    """
+def _settings_tables(found: Identification) -> str:
+    """Return the tables of the settings, as used."""
     model = found.model
-    gravity = ", ".join(f"{g:g}" for g in np.asarray(model.pin_model.gravity.linear).tolist())
     settings = found.estimator.to_dict()
-    pairs = {"estimator": settings.pop("name")}
-    pairs |= {key.replace("_", " "): str(value) for key, value in settings.items()}
-    pairs["solver"] = f"{found.estimate.message} ({found.estimate.n_iter} iterations)"
-    pairs["drive terms"] = ", ".join(model.layout.terms) or "none"
-    pairs["gravity [m/s²]"] = gravity
-    pairs["base"] = "floating" if model.free_flyer else "fixed"
-    pairs["joints"] = ", ".join(model.joints)
-    pairs["locked joints"] = ", ".join(f"{k} = {v:g}" for k, v in model.locked.items()) or "none"
+    pairs = {
+        "estimator": settings.pop("name"),
+        **{key.replace("_", " "): str(value) for key, value in settings.items()},
+        "solver": f"{found.estimate.message} ({found.estimate.n_iter} iterations)",
+        "drive terms": listed(model.layout.terms),
+        "gravity [m/s²]": listed(f"{g:g}" for g in model.pin_model.gravity.linear.tolist()),
+        "base": "floating" if model.free_flyer else "fixed",
+        "joints": listed(model.joints),
+        "locked joints": listed(f"{k} = {v:g}" for k, v in model.locked.items()),
+    }
     for coupling in model.layout.couplings:
-        ratios = ", ".join(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
+        ratios = listed(f"{joint} × {ratio:g}" for joint, ratio in coupling.ratios)
         pairs[f"coupling {coupling.name}"] = ratios
     rows = [[text(key), text(value)] for key, value in pairs.items()]
     headers = ["log", "filter", "rate Hz", "velocity", "trim s", "least speed", "gap s"]
@@ -242,15 +207,8 @@ def settings_tables(found: Identification) -> str:
     )
 
 
-def input_table(found: Identification) -> str:
-    """Return the table of the files that were read.
-
-    Args:
-        found: The identification.
-
-    Returns:
-        HTML.
-    """
+def _input_table(found: Identification) -> str:
+    """Return the table of the files that were read."""
     urdf = found.model.tree.path
     rows = [[text("URDF"), code(urdf), *[number(None)] * 5, code(_sha256(urdf))]]
     for role, evaluations in (("fitted", found.fitted), ("validation", found.validation)):
@@ -259,12 +217,8 @@ def input_table(found: Identification) -> str:
     return table("Files read", headers, rows)
 
 
-def version_table() -> str:
-    """Return the table of the versions that ran.
-
-    Returns:
-        HTML.
-    """
+def _version_table() -> str:
+    """Return the table of the versions that ran."""
     rows = [[text(name), code(version)] for name, version in versions().items()]
     return table("Versions that ran", ["what", "version"], rows)
 

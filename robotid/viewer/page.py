@@ -9,10 +9,9 @@ from typing import Any
 
 from robotid._html import scaffold
 
-__all__ = ["frame", "page"]
+__all__ = ["page"]
 
 _ASSETS = Path(__file__).parent / "assets"
-_SPEEDS = (0.1, 0.25, 0.5, 1, 2, 5, 10)
 
 
 def page(data: Mapping[str, Any]) -> str:
@@ -20,9 +19,6 @@ def page(data: Mapping[str, Any]) -> str:
 
     Args:
         data: ``title``, ``notes``, ``live`` and what replay.js draws, in plain finite values.
-
-    Returns:
-        The HTML.
     """
     title = f"{data['title']}: {'live' if data['live'] else 'replay'}"
     notes = " ".join(f"<p>{escape(note)}</p>" for note in data["notes"])
@@ -43,23 +39,6 @@ def page(data: Mapping[str, Any]) -> str:
     )
 
 
-def frame(html: str, title: str, height: int) -> str:
-    """Return a page as an element for another one, as a notebook shows it.
-
-    Args:
-        html: The page.
-        title: What a screen reader calls it.
-        height: Its height [px].
-
-    Returns:
-        An iframe that holds the page; its scripts reach nothing outside.
-    """
-    return (
-        f'<iframe title="{escape(title)}" sandbox="allow-scripts" srcdoc="{escape(html)}" '
-        f'style="width: 100%; height: {height}px; border: 0"></iframe>'
-    )
-
-
 @cache
 def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
@@ -73,11 +52,10 @@ def _viewer() -> str:
     return viewer.read_text(encoding="utf-8")
 
 
-def _speeds() -> str:
-    options = (f'<option value="{s}"{" selected" * (s == 1)}>{s}×</option>' for s in _SPEEDS)
-    return "".join(options)
-
-
+_OPTIONS = "".join(
+    f'<option value="{s}"{" selected" * (s == 1)}>{s}×</option>'
+    for s in (0.1, 0.25, 0.5, 1, 2, 5, 10)
+)
 _BODY = f"""\
 <main aria-label="3-D view">
 <div id="meshcat-pane" role="img" aria-label="the robot in motion"></div>
@@ -97,7 +75,7 @@ half the torque's rms.</p>
 <div id="track"><input type="range" id="time" min="0" max="1" step="any" value="0"
  aria-label="time"></div>
 <output id="clock"></output>
-<label>speed <select id="speed">{_speeds()}</select></label>
+<label>speed <select id="speed">{_OPTIONS}</select></label>
 <label><input type="checkbox" id="loop" checked> loop</label>
 </div>
 <ul id="marks" aria-label="events" hidden></ul>

@@ -7,6 +7,7 @@ with what it shows, so that no process, no socket and no port is opened.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
-from robotid.viewer.page import frame, page
-from robotid.viewer.scene import coordinates, mass_marks, packed, robot_scene
+from robotid.viewer.page import page
+from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
 
 __all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay"]
 
@@ -111,7 +112,11 @@ class Replay:
         return write_text(self.html, target)
 
     def _repr_html_(self) -> str:
-        return frame(self.html, f"{self.data['title']}: replay", 620)
+        # its scripts reach nothing outside
+        return (
+            f'<iframe title="{escape(self.data["title"])}: replay" sandbox="allow-scripts" '
+            f'srcdoc="{escape(self.html)}" style="width: 100%; height: 620px; border: 0"></iframe>'
+        )
 
 
 def replay(
@@ -157,13 +162,14 @@ def replay(
     if ghost is not None:
         _check(ghost[1], ghost[2], rate)
         second = _moved(model, ghost[1], ghost[2], rate)
-    scene = robot_scene(model)
     gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     start = float(t[0])
     lead = [f"0 s is {start:.3f} s of the log."] if abs(start) > 1e-9 else []
+    scene = robot_scene(model)
     data = _data(
         model,
-        scene.content,
+        scene,
+        [q] if ghost is None else [q, ghost[2]],
         motion=_packed_motion(*moved),
         ghost=None if second is None else {"label": ghost[0], **_packed_motion(*second)},  # type: ignore[index]
         masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
@@ -174,7 +180,6 @@ def replay(
             for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
         ],
         notes=[*notes, *lead, *(f"{note}." for note in scene.notes)],
-        view=_view(model, scene.corners, [q] if ghost is None else [q, ghost[2]]),
     )
     return Replay(data)
 
@@ -196,20 +201,18 @@ def live_page(
         gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
     """
     empty = np.zeros((0, 0))
-    scene = robot_scene(model)
-    torques = Torques(np.zeros(0), np.zeros((0, model.n_rows)), {"predicted": empty})
     return page(
         _data(
             model,
-            scene.content,
+            robot_scene(model),
+            [q],
             motion=_packed_motion(np.zeros(0), empty),
             ghost=None,
             masses=[mass_marks(model, masses, "URDF")],
-            torques=_torque_rows(model, torques),
+            torques=_torque_rows(model, ["measured", "predicted"]),
             bands={"names": list(names), "units": list(units), "t": None, "values": None},
             marks=[],
             notes=[],
-            view=_view(model, scene.corners, [q]),
             live=True,
         )
     )
@@ -217,12 +220,14 @@ def live_page(
 
 def _data(
     model: RobotModel,
-    scene: Mapping[str, Any],
+    scene: Scene,
+    motions: Sequence[Array],
     *,
     live: bool = False,
     **content: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    return {"title": model.name, "live": live, "scene": scene, **content}
+    view = _view(model, scene.corners, motions)
+    return {"title": model.name, "live": live, "scene": scene.content, **content, "view": view}
 
 
 def _check(t: Array, q: Array, rate: float) -> None:
@@ -276,18 +281,17 @@ def _packed_motion(t: Array, q: Array) -> dict[str, Any]:
 
 def _torque_data(model: RobotModel, torques: Torques, start: float) -> dict[str, Any]:
     series = [torques.measured, *torques.predicted.values()]
-    wanted = (len(torques.t), model.n_rows)
-    for label, values in zip(["measured", *torques.predicted], series, strict=True):
+    labels, wanted = ["measured", *torques.predicted], (len(torques.t), model.n_rows)
+    for label, values in zip(labels, series, strict=True):
         if values.shape != wanted:
             raise DataError(f"torques {label!r} have shape {values.shape}, wanted {wanted}")
     t, values = _plotted(torques.t - start, np.hstack(series))
-    return {**_torque_rows(model, torques), "t": packed(t), "values": packed(values)}
+    return {**_torque_rows(model, labels), "t": packed(t), "values": packed(values)}
 
 
-def _torque_rows(model: RobotModel, torques: Torques) -> dict[str, Any]:
+def _torque_rows(model: RobotModel, labels: Sequence[str]) -> dict[str, Any]:
     """Return who is plotted, without times and values: joints, not the rows of a free base."""
-    first = model.n_rows - len(model.joints)
-    if first:
+    if model.n_rows > len(model.joints):
         raise DataError("the base floats; torques are shown of robots with a fixed base")
     tree = model.pin_model
     return {
@@ -295,7 +299,7 @@ def _torque_rows(model: RobotModel, torques: Torques) -> dict[str, Any]:
             {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
             for name, unit in zip(model.joints, model.row_units, strict=True)
         ],
-        "labels": ["measured", *torques.predicted],
+        "labels": labels,
         "t": None,
         "values": None,
     }

@@ -12,9 +12,9 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.robot.meshes import Shape, Surface, find_mesh, read_shapes, read_surfaces, thin
 from robotid.robot.model import RobotModel
-from robotid.viewer.ellipsoids import ellipsoids
+from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["Scene", "coordinates", "mass_marks", "packed", "robot_scene"]
+__all__ = ["Ellipsoid", "Scene", "coordinates", "ellipsoids", "mass_marks", "packed", "robot_scene"]
 
 _TRIANGLES = 24_000  # of all meshes together: about 1 MB in the page
 _LINK, _JOINT, _BASE = "#9aa7b4", "#e07b1f", "#4a5560"
@@ -40,6 +40,25 @@ class Scene:
     corners: tuple[Array, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """The mass of a body as a solid.
+
+    Attributes:
+        mass: Mass [kg].
+        com: Centre of mass in the body's frame, shape (3,) [m]; None without mass.
+        semi_axes: Lengths of the semi-axes, shape (3,) [m]; None if no solid has this inertia.
+        rotation: Directions of the axes as columns, a rotation, shape (3, 3).
+        fault: Why there is no solid, in words; empty if there is one.
+    """
+
+    mass: float
+    com: Array | None
+    semi_axes: Array | None
+    rotation: Array
+    fault: str
+
+
 def robot_scene(model: RobotModel) -> Scene:
     """Return the nodes and the parts of a robot.
 
@@ -48,9 +67,6 @@ def robot_scene(model: RobotModel) -> Scene:
 
     Args:
         model: The robot.
-
-    Returns:
-        The scene.
     """
     tree = model.pin_model
     library, notes = _Library(model), []
@@ -121,6 +137,23 @@ def mass_marks(model: RobotModel, pi: Array, label: str) -> dict[str, Any]:
     }
 
 
+def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
+    """Return the equimomental ellipsoid of each body.
+
+    The second moments about the centre of mass, Sigma_c = Sigma - m c c', are those of a solid
+    ellipsoid of even density whose semi-axes have the lengths sqrt(5 s_i / m), s_i the
+    eigenvalues of Sigma_c.
+
+    Args:
+        pi: Inertial parameters of the bodies, shape (10 bodies,), SI units.
+
+    References:
+        Wensing, Kim, Slotine (2018), Linear matrix inequalities for physically consistent
+        inertial parameter identification, section IV.
+    """
+    return tuple(_ellipsoid(J) for J in pseudo_inertia(pi))
+
+
 def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
     """Return an array for the page: base64 of little-endian numbers, 32 bits each.
 
@@ -134,6 +167,20 @@ def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
     array = np.ascontiguousarray(values, dtype=kind)
     data = base64.b64encode(array.tobytes()).decode("ascii")
     return {"kind": kind, "shape": list(array.shape), "data": data}
+
+
+def _ellipsoid(J: Array) -> Ellipsoid:
+    m = float(J[3, 3])
+    if not m > 0:
+        return Ellipsoid(m, None, None, np.eye(3), "no mass" if m == 0 else "negative mass")
+    c = J[:3, 3] / m
+    s, axes = np.linalg.eigh(J[:3, :3] - m * np.outer(c, c))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    rounding = 1e-12 * float(np.trace(J[:3, :3]))
+    if s[0] < -rounding:
+        return Ellipsoid(m, c, None, np.eye(3), "no solid has this inertia")
+    return Ellipsoid(m, c, np.sqrt(5.0 * np.maximum(s, 0.0) / m), axes, "")
 
 
 class _Library:

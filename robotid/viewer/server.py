@@ -8,9 +8,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Self
 
-__all__ = [
-    "LivePage",
-]
+__all__ = ["LivePage"]
 
 _KEPT = 20_000  # messages that a page opened late still gets
 _ALIVE = 10.0  # [s] between signs of life when there is nothing to tell
@@ -25,13 +23,14 @@ class LivePage:
 
     Attributes:
         url: Address of the page.
+        page: The page, as it is sent.
 
     Raises:
         OSError: If the port is taken.
     """
 
     def __init__(self, html: str, port: int = 0) -> None:
-        self._html = html.encode()
+        self.page = html.encode()
         self._messages: deque[str] = deque(maxlen=_KEPT)
         self._sent, self._over = 0, False
         self._news = threading.Condition()
@@ -51,11 +50,6 @@ class LivePage:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def page(self) -> bytes:
-        """The page, as it is sent."""
-        return self._html
 
     def send(self, message: Mapping[str, Any]) -> None:
         """Tell every page, those opened later too.

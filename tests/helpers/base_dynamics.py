@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from robotid._typing import Array
-from robotid.paper.dynamics import LinearDynamics
+from robotid.paper.equations import LinearDynamics
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel

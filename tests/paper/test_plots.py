@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from robotid.paper import plots
-from robotid.paper.study import MODELS, PaperSettings, study_model
+from robotid.paper.errata import energy_drift
+from robotid.paper.plots import paper_figures
+from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
 from robotid.simulation.motions import ProgramMotion
 
 
@@ -13,18 +14,26 @@ def studies():
     return [study_model(name, PaperSettings(iterations=3, longest=1)) for name in MODELS]
 
 
-def test_figure_3_is_the_program_of_its_joint():
+@pytest.fixture(scope="module")
+def figures(studies):
+    rng = np.random.default_rng(0)
+    runs = {name: random_runs(*paper_arm(name), 2, 1, rng) for name in MODELS}
+    made = paper_figures(studies, runs, energy_drift(duration=0.1))
+    return {name: figure for name, (_, figure) in made.items()}
+
+
+def test_figure_3_is_the_program_of_its_joint(figures):
     t = np.linspace(0.0, 2.0, 201)
     parts = ProgramMotion(np.array([1.0, 1.5]), 2.0).evaluate(t)
     for joint in (0, 1):
-        for axes, part in zip(plots.figure_3(joint).axes, parts, strict=True):
+        for axes, part in zip(figures[f"figure_3{'ab'[joint]}"].axes, parts, strict=True):
             wanted = np.column_stack([t, part[:, joint]])
             np.testing.assert_allclose(axes.lines[0].get_xydata(), wanted)
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-def test_figure_4_is_the_control_of_its_joint_by_iterations(studies, joint):
-    axes = plots.figure_4(studies, joint).axes
+def test_figure_4_is_the_control_of_its_joint_by_iterations(studies, figures, joint):
+    axes = figures[f"figure_4{'ab'[joint]}"].axes
     for upper, lower, study in zip(axes[:3], axes[3:], studies, strict=True):
         u = study.history.torques[:, :, 0, joint]
         assert upper.get_title() == study.name
@@ -36,8 +45,8 @@ def test_figure_4_is_the_control_of_its_joint_by_iterations(studies, joint):
         np.testing.assert_array_equal(upper.lines[-1].get_ydata(), program)
 
 
-def test_figure_5_is_each_parameter_beside_its_true_value(studies):
-    for axes, study in zip(plots.figure_5(studies).axes, studies, strict=True):
+def test_figure_5_is_each_parameter_beside_its_true_value(studies, figures):
+    for axes, study in zip(figures["figure_5"].axes, studies, strict=True):
         for i, name in enumerate(study.dynamics.names):
             estimate, true = axes.lines[2 * i : 2 * i + 2]
             assert estimate.get_label() == name
@@ -45,8 +54,8 @@ def test_figure_5_is_each_parameter_beside_its_true_value(studies):
             np.testing.assert_array_equal(true.get_ydata(), [study.P[i]] * 2)
 
 
-def test_convergence_shows_prx_and_both_errors(studies):
-    left, right = plots.convergence_figure(studies).axes
+def test_convergence_shows_prx_and_both_errors(studies, figures):
+    left, right = figures["convergence"].axes
     for k, study in enumerate(studies):
         np.testing.assert_array_equal(left.lines[k].get_ydata(), study.history.prx[:, 0])
         np.testing.assert_array_equal(right.lines[2 * k].get_ydata(), study.errors())
@@ -54,8 +63,8 @@ def test_convergence_shows_prx_and_both_errors(studies):
         np.testing.assert_array_equal(on_program, study.errors("on_program"))
 
 
-def test_disturbed_errors_are_those_of_their_case(studies):
+def test_disturbed_errors_are_those_of_their_case(studies, figures):
     cases = ("clean", "disturbed", "noisy", "noisy_dead_zone")
-    for axes, study in zip(plots.disturbed_figure(studies).axes, studies, strict=True):
+    for axes, study in zip(figures["disturbance"].axes, studies, strict=True):
         for line, case in zip(axes.lines, cases, strict=True):
             np.testing.assert_array_equal(line.get_ydata(), study.errors(case))

@@ -7,13 +7,14 @@ from helpers.synthetic import truth
 
 from robotid.exceptions import DataError, RankDeficientError, SettingsError
 from robotid.paper import planar_2r
-from robotid.paper.dynamics import (
+from robotid.paper.equations import (
+    Bounds,
     LinearPlant,
     PlanarDynamics,
     mass_matrix,
+    recursive_update,
     smallest_eigenvalue,
 )
-from robotid.paper.formulas import Bounds, recursive_update
 from robotid.paper.procedure import Influences, LoopSettings, random_torque, run_procedure
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel

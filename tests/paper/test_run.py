@@ -7,16 +7,15 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from robotid.cli import main
 from robotid.exceptions import SettingsError
 from robotid.paper import run as paper
 from robotid.paper.errata import energy_drift, errata
 from robotid.paper.planar_2r import PAPER_PARAMETERS
-from robotid.paper.plots import figure_3
-from robotid.paper.random_motions import random_runs
 from robotid.paper.run import run_paper
-from robotid.paper.study import MODELS, PaperSettings, paper_arm, study_model
+from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
 
 FIGURES = ["figure_3a", "figure_3b", "figure_4a", "figure_4b", "figure_5", "convergence"]
 FIGURES += ["disturbance", "trajectories", "energy"]
@@ -98,7 +97,7 @@ def test_a_failure_leaves_no_half_written_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(paper, "paper_page", fail)
     monkeypatch.setattr(paper, "energy_drift", lambda: energy_drift(duration=0.1))
-    monkeypatch.setattr(paper, "_figures", lambda *_: {"figure_3a": figure_3(0)})
+    monkeypatch.setattr(paper, "paper_figures", lambda *_: {"figure_3a": ("3", Figure())})
     with pytest.raises(OSError, match="disk full"):
         run_paper(tmp_path, settings=PaperSettings(iterations=1, longest=1, runs=1, patience=1))
     assert list(tmp_path.iterdir()) == []
@@ -146,20 +145,20 @@ def test_the_errata_make_the_torques_differ_as_worked_out_by_hand():
     found = {e.where: e for e in errata(np.random.default_rng(0))}
     assert len(found) == 4
     # h = 3 s2 + 0.1 c2 <= 3.002: C122 and C112 together miss 2 h v2 (v1 + v2) <= 3.002 * 400
-    assert 1000 < found["(26)"].anywhere < 3.002 * 400
+    assert 1000 < found["(26)"].max_torque_difference < 3.002 * 400
     # column 4 is off by s2 (v1^2 + v2^2) <= 200, times p3 = 3
-    assert 500 < found["G, column 4"].anywhere < 600
+    assert 500 < found["G, column 4"].max_torque_difference < 600
     # p4 of (27) is 2 instead of 3, times s2 v^2 <= 100
-    assert 95 < found["(27), p4"].anywhere < 100
+    assert 95 < found["(27), p4"].max_torque_difference < 100
     for erratum in found.values():
-        assert 1.0 < erratum.on_program < erratum.anywhere
+        assert 1.0 < erratum.max_torque_difference_on_program < erratum.max_torque_difference
 
 
 def test_only_the_physical_arm_keeps_its_energy():
     drift = energy_drift(duration=4.0, dt=4e-3)
-    assert np.abs(drift.relative("physical")).max() < 1e-9  # error of the integration
-    assert np.abs(drift.relative("printed")).max() > 0.2
-    assert np.abs(drift.relative("corrected")).max() > 0.1  # p3 != p4
+    assert np.abs(drift.gained["physical"]).max() < 1e-9  # error of the integration
+    assert np.abs(drift.gained["printed"]).max() > 0.2
+    assert np.abs(drift.gained["corrected"]).max() > 0.1  # p3 != p4
 
 
 def test_random_runs_tell_every_failure(rng):
@@ -194,7 +193,7 @@ def test_each_kind_of_failure_has_its_reason(change, reason, rng):
     runs = random_runs(dynamics, P, 1, 1, rng)
     errors = np.array(change.pop("errors", [0.5, 0.4]))[:, None]
     history = replace(runs.history, **{key: np.array([x]) for key, x in change.items()})
-    found = replace(runs, errors=errors, history=history).failures()
+    found = replace(runs, errors=errors, history=history).failures
     assert [failure["reason"] for failure in found] == [reason]
 
 

@@ -236,12 +236,26 @@ def test_a_notebook_s_frame_plays(browser, ur5, tmp_path):
         assert [e for e in seen.errors if "sandbox" not in e] == []
 
 
+# the command as it is, but the page is told nothing after 6 s of the log until a file is there
+HELD = """
+import pathlib, runpy, time
+from robotid.viewer.server import LivePage
+send = LivePage.send
+def held(self, message):
+    while message.get("t", 0.0) > 6.0 and not pathlib.Path("go on").exists():
+        time.sleep(0.02)
+    send(self, message)
+LivePage.send = held
+runpy.run_module("robotid", run_name="__main__", alter_sys=True)
+"""
+
+
 def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, panda, tmp_path):
     log = payload_log(panda, np.random.default_rng(0), duration=12.0, at=10.0)
     write_log(log, tmp_path / "log.csv")
     words = ["track", str(panda.tree.path), "log.csv", "--joints", ",".join(panda.joints)]
     run = subprocess.Popen(
-        [sys.executable, "-m", "robotid", *words, "--out", "out", "--serve", "--speed", "3"],
+        [sys.executable, "-c", HELD, *words, "--out", "out", "--serve", "--speed", "3"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
@@ -249,11 +263,13 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pan
         address = run.stderr.readline().split()[1]
         assert address.startswith("http://127.0.0.1:")
         with visit(browser, address) as seen:
-            until(seen, "replay.clock.time > 1.5")
+            until(seen, "replay.clock.time > 1.5", 120.0)
             assert seen.page.locator("#state").inner_text() == "live"
             early = seen.page.evaluate("replay.clock.time")
-            until(seen, f"replay.clock.time > {early + 1}")
-            until(seen, "document.getElementById('state').textContent.includes('finished')")
+            assert early <= 6.0
+            (tmp_path / "go on").touch()
+            until(seen, f"replay.clock.time > {early + 1}", 120.0)
+            until(seen, "document.getElementById('state').textContent.includes('finished')", 120.0)
             # the page shows the last pose of the log
             assert seen.page.evaluate("replay.clock.time") == pytest.approx(12.0, abs=0.05)
             data = panda.pin_model.createData()
@@ -265,7 +281,7 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pan
             assert seen.requests == [f"{address}events"]
         assert (tmp_path / "out" / "track.json").is_file()
         run.send_signal(signal.SIGINT)
-        assert run.wait(10) == 0
+        assert run.wait(60) == 0
         assert "Traceback" not in run.stderr.read()
         assert "step change at" in run.stdout.read()
     finally:

@@ -2,7 +2,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from robotid.viewer.ellipsoids import ellipsoids
+from robotid.viewer.scene import ellipsoids
 
 
 def test_the_ellipsoid_of_a_solid_ellipsoid_is_itself(rng):

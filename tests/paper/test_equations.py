@@ -1,0 +1,193 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.base_dynamics import BaseDynamics
+from helpers.synthetic import truth
+
+from robotid.exceptions import DataError, RankDeficientError, SettingsError
+from robotid.paper import planar_2r
+from robotid.paper.equations import (
+    Bounds,
+    LinearPlant,
+    PlanarDynamics,
+    mass_matrix,
+    one_shot,
+    proximity,
+    recursive_update,
+    reference_acceleration,
+    smallest_eigenvalue,
+    torque,
+)
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.simulation.plant import RobotPlant
+
+
+@pytest.fixture(scope="module")
+def arm(ur5):
+    return BaseDynamics(ur5, structural_mapping(ur5))
+
+
+def states(rng, count, n):
+    return rng.uniform(-np.pi, np.pi, (count, n)), *rng.uniform(-3, 3, (2, count, n))
+
+
+def test_mass_matrix_from_base_parameters_is_pinocchios_crba(arm, ur5, rng):
+    pi = ur5.standard_parameters()
+    q, _, _ = states(rng, 10, 6)
+    data = ur5.pin_model.createData()
+    for D, q_k in zip(mass_matrix(arm, q, arm.mapping.to_base(pi)), q, strict=True):
+        M = pin.crba(ur5.pin_model, data, q_k)
+        np.testing.assert_allclose(D, np.triu(M) + np.triu(M, 1).T, atol=1e-12)
+
+
+def test_armature_counts_and_friction_does_not(arm, ur5, rng):
+    pi = truth(ur5)  # all drive terms are there
+    q, _, _ = states(rng, 5, 6)
+    plant = RobotPlant(ur5, pi)
+    for D, q_k in zip(mass_matrix(arm, q, arm.mapping.to_base(pi)), q, strict=True):
+        np.testing.assert_allclose(D, plant.mass_matrix(q_k), atol=1e-11)
+
+
+def test_a_linear_plant_moves_as_the_robot_does(arm, ur5, rng):
+    pi = truth(ur5)
+    q, v, u = states(rng, 10, 6)
+    v += 0.5 * np.sign(v)  # away from 0, where the plant's friction is smooth
+    ours = LinearPlant(arm, arm.mapping.to_base(pi)).acceleration(q, v, 20 * u)
+    # wrist inertias of 0.1 kg m^2 multiply rounding of 50 N m
+    np.testing.assert_allclose(ours, RobotPlant(ur5, pi).acceleration(q, v, 20 * u), rtol=1e-9)
+
+
+@pytest.mark.parametrize("form", list(planar_2r.PARAMETER_NAMES))
+def test_planar_dynamics_are_those_of_the_closed_form(form, rng):
+    dynamics = PlanarDynamics(form)
+    P = rng.normal(size=len(dynamics.names))
+    q, v, a = states(rng, 20, 2)
+    D, u = mass_matrix(dynamics, q, P), torque(dynamics, q, v, a, P)
+    for k in range(20):
+        column = [planar_2r.regressor(q[k], 0 * e, e, form=form) @ P for e in np.eye(2)]
+        np.testing.assert_allclose(D[k].T, column, atol=1e-13)
+        one = planar_2r.regressor(q[k], v[k], a[k], form=form) @ P
+        np.testing.assert_allclose(u[k], one, atol=1e-12)
+
+
+def test_each_run_may_have_its_own_parameters(rng):
+    dynamics, P = PlanarDynamics(), rng.normal(size=(3, 4))
+    q, v, a = states(rng, 3, 2)
+    together = torque(dynamics, q, v, a, P), mass_matrix(dynamics, q, P)
+    for r in range(3):
+        one = slice(r, r + 1)
+        alone = torque(dynamics, q[one], v[one], a[one], P[r]), mass_matrix(dynamics, q[one], P[r])
+        np.testing.assert_allclose(together[0][one], alone[0], atol=1e-13)
+        np.testing.assert_allclose(together[1][one], alone[1], atol=1e-13)
+
+
+def test_acceleration_solves_the_dynamics(rng):
+    dynamics, P = PlanarDynamics("printed"), planar_2r.PAPER_PARAMETERS
+    q, v, u = states(rng, 20, 2)
+    a = LinearPlant(dynamics, P).acceleration(q, v, u)
+    np.testing.assert_allclose(torque(dynamics, q, v, a, P), u, atol=1e-12)
+
+
+def test_smallest_eigenvalue_is_that_of_each_matrix():
+    D = np.array([np.diag([3.0, 2.0]), [[2.0, 1.0], [1.0, 2.0]]])
+    np.testing.assert_allclose(smallest_eigenvalue(D), [2.0, 1.0], rtol=1e-14)
+
+
+def test_a_floating_base_is_refused(ur5):
+    floating = RobotModel.from_urdf(ur5.tree.path, free_flyer=True, terms=())
+    with pytest.raises(DataError, match=r"^a robot with a floating base cannot be simulated"):
+        RobotPlant(floating, floating.standard_parameters())
+
+
+def test_plant_parameters_of_another_length_are_named(ur5):
+    with pytest.raises(DataError, match=r"^pi has shape \(60,\), wanted \(84,\)$"):
+        RobotPlant(ur5, ur5.standard_parameters()[:60])
+
+
+# --- control, proximity, update ---------------------------------------------------------------
+
+
+def test_proximity_is_the_gradient_of_the_criterion(rng):
+    Psi, P, u, h = rng.normal(size=(2, 5)), rng.normal(size=5), rng.normal(size=2), 1e-6
+
+    def J(P):  # (3)
+        return 0.5 * np.sum((u - Psi @ P) ** 2)
+
+    slopes = [(J(P + h * e) - J(P - h * e)) / (2 * h) for e in np.eye(5)]
+    # J is quadratic: central differences are exact but for rounding, 1e-16 / h
+    np.testing.assert_allclose(proximity(Psi, P, u), slopes, atol=1e-8)
+
+
+def test_only_the_corrected_proximity_vanishes_at_the_truth(rng):
+    Psi, P = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 5))
+    u = np.einsum("rnc,rc->rn", Psi, P)
+    np.testing.assert_allclose(proximity(Psi, P, u), 0.0, atol=1e-14)
+    printed = proximity(Psi, P, u, sign="printed")
+    np.testing.assert_allclose(printed, 2 * np.einsum("rnc,rn->rc", Psi, u), rtol=1e-13)
+    assert np.abs(printed).max() > 1.0
+
+
+def test_deviation_and_reference_are_equations_15_and_20(rng):
+    q, v, a, q_pr, v_pr, a_pr = rng.normal(size=(6, 4))
+    q_star = reference_acceleration(q, v, (q_pr, v_pr, a_pr), np.array(20.0), np.array(100.0))
+    np.testing.assert_allclose(q_star, a_pr - 20 * (v - v_pr) - 100 * (q - q_pr))
+    eta = a - a_pr + 20 * (v - v_pr) + 100 * (q - q_pr)
+    np.testing.assert_allclose(a - q_star, eta, atol=1e-12)
+
+
+def test_an_update_is_equation_24(rng):
+    P, Psi, eta = rng.normal(size=5), rng.normal(size=(2, 5)), rng.normal(size=2)
+    wanted = P - 1.7 / np.trace(Psi @ Psi.T) * Psi.T @ eta
+    found = recursive_update(P, Psi, eta, np.array(1.7), np.array(True))
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"is_open": np.array(False)}, "PRX is zero"),
+        ({"eps2": 1e9}, "the sample is small"),
+        ({"sigma": np.array(-0.1)}, "D is not positive definite"),
+    ],
+)
+def test_an_update_is_left_out_where(change, why, rng):
+    P, Psi, eta = rng.normal(size=5), rng.normal(size=(2, 5)), rng.normal(size=2)
+    arguments = {"sigma": np.array(1.0), "is_open": np.array(True), **change}
+    found = recursive_update(P, Psi, eta, **arguments)
+    np.testing.assert_array_equal(found, P, err_msg=why)
+
+
+def test_one_shot_finds_the_truth_from_any_guess(rng):
+    G, P, P_hat = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=5)
+    # G_* with G P = G_* P^: any matrix, moved along P^ so that the torques agree
+    G_star = rng.normal(size=(40, 5))
+    G_star += np.outer(G @ P - G_star @ P_hat, P_hat) / (P_hat @ P_hat)
+    np.testing.assert_allclose(one_shot(G, G_star, P_hat, "abcde"), P, rtol=1e-12)
+
+
+def test_one_shot_names_what_the_motion_leaves_open(rng):
+    G = rng.normal(size=(40, 4))
+    G[:, 3] = 2 * G[:, 1]
+    with pytest.raises(RankDeficientError, match=r"excite 3 of 4 .* undetermined: \['b', 'd'\]"):
+        one_shot(G, G, np.ones(4), "abcd")
+
+
+def test_bounds_project_onto_their_box():
+    bounds = Bounds(np.array([0.0, -1.0]), np.array([2.0, np.inf]))
+    found = bounds.project(np.array([[3.0, -5.0], [1.0, 7.0]]))
+    np.testing.assert_array_equal(found, [[2.0, -1.0], [1.0, 7.0]])
+
+
+def test_bounds_that_hold_nothing_are_refused():
+    with pytest.raises(DataError, match=r"^bounds of parameter 1 are 2.0 to 1.0: an empty set$"):
+        Bounds(np.array([0.0, 2.0]), np.array([1.0, 1.0]))
+    with pytest.raises(
+        DataError, match=r"^bounds have shapes \(2,\) and \(3,\), wanted one \(c,\)"
+    ):
+        Bounds(np.zeros(2), np.ones(3))
+
+
+def test_an_unknown_sign_is_named():
+    with pytest.raises(SettingsError, match=r"^sign is 'plus', wanted 'corrected' or 'printed'$"):
+        proximity(np.ones((2, 3)), np.ones(3), np.ones(2), sign="plus")
