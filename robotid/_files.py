@@ -59,14 +59,11 @@ def folder_beside(target: Path) -> Iterator[Path]:
 
 
 def write_text(text: str, target: str | Path) -> Path:
-    """Write a page, whole or not at all.
+    """Write a page, whole or not at all, and return its path.
 
     Args:
         text: Its content.
         target: The file.
-
-    Returns:
-        Path of the file.
 
     Raises:
         DataError: If its folder does not exist.
@@ -96,9 +93,6 @@ def file_sha256(path: str | Path) -> str:
 
     Args:
         path: The file, or the folder of a bag.
-
-    Returns:
-        64 hexadecimal digits.
     """
     source = Path(path)
     if source.is_dir():

@@ -27,9 +27,6 @@ def text(value: str, *, flag: bool = False) -> Cell:
     Args:
         value: The text, not escaped yet; one of a few words is kept on one line.
         flag: Whether it is shown as a fault.
-
-    Returns:
-        The cell.
     """
     return Cell(escape(value), "flag" if flag else "text" if len(value) < 24 else "")
 
@@ -39,9 +36,6 @@ def code(value: str) -> Cell:
 
     Args:
         value: The text, not escaped yet.
-
-    Returns:
-        The cell.
     """
     # long names and formulas may break behind a dot, an underscore or a slash, not elsewhere
     html = escape(value)
@@ -56,9 +50,6 @@ def number(value: float | None, spec: str = ".4g") -> Cell:
     Args:
         value: The number; None and non-finite ones are shown as a dash.
         spec: How it is written.
-
-    Returns:
-        The cell.
     """
     if value is None or not math.isfinite(value):
         return Cell("–", "number")
@@ -70,9 +61,6 @@ def percent(value: float | None) -> Cell:
 
     Args:
         value: The percentage; None and non-finite ones are shown as a dash.
-
-    Returns:
-        The cell.
     """
     if value is not None and value >= 1000:
         return number(value, ".0f")
@@ -85,16 +73,13 @@ def table(
     rows: Sequence[Sequence[Cell]],
     foot: Sequence[Cell] = (),
 ) -> str:
-    """Return a table in a box of its own, which scrolls where the page is narrow.
+    """Return the HTML of a table in a box of its own, which scrolls where the page is narrow.
 
     Args:
         caption: What it shows.
         headers: Heads of the columns.
         rows: Cells; the first of each row is its head.
         foot: Cells of a last row that sums up, if any.
-
-    Returns:
-        HTML.
     """
     first = rows[0] if rows else [Cell("")] * len(headers)
     kinds = ["number" if cell.kind == "number" else "text" for cell in first]
@@ -113,30 +98,24 @@ def table(
 
 
 def figure(caption: str, svg: str, *, single: bool = False) -> str:
-    """Return a figure, which scrolls where the page is narrow, by keys too.
+    """Return the HTML of a figure, which scrolls where the page is narrow, by keys too.
 
     Args:
         caption: What it shows, HTML.
         svg: The ``<svg>`` element.
         single: Whether it stands alone and is kept from filling the page.
-
-    Returns:
-        HTML.
     """
     kind = ' class="single"' if single else ""
     return f'<figure{kind} tabindex="0"><figcaption>{caption}</figcaption>{svg}</figure>\n'
 
 
 def page(title: str, header: str, sections: Mapping[str, tuple[str, str]]) -> str:
-    """Return a page to read: its header, links to its sections, the sections.
+    """Return the HTML of a page to read: its header, links to its sections, the sections.
 
     Args:
         title: Title of the window, not escaped yet.
         header: HTML of the header.
         sections: Title and HTML of each section by its id.
-
-    Returns:
-        HTML.
     """
     links = "".join(f'<a href="#{key}">{head}</a> ' for key, (head, _) in sections.items())
     body = "".join(
@@ -153,16 +132,13 @@ def page(title: str, header: str, sections: Mapping[str, tuple[str, str]]) -> st
 
 
 def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
-    """Return a whole document, which fetches nothing that its policy does not allow.
+    """Return the HTML of a document, which fetches nothing that its policy does not allow.
 
     Args:
         title: Title of the window, not escaped yet.
         head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
         body: HTML of the body.
         policy: What the page may do beside having styles, as a content security policy.
-
-    Returns:
-        HTML.
     """
     # the policy keeps the page offline whatever a name in it might hold
     return (

@@ -70,9 +70,6 @@ def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
         default: Its value if none is stated, or a function that returns it.
         text: What it is, with its unit.
         about: The other attributes of ``Key``.
-
-    Returns:
-        The field.
     """
     metadata = {"key": Key(text, **about)}
     if isinstance(default, dict) or callable(default):
@@ -137,9 +134,6 @@ class Settings:
 
         Args:
             table: The table, of keys and types of the ``schema``.
-
-        Returns:
-            The settings.
 
         Raises:
             SettingsError: If a value is not usable.

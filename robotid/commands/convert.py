@@ -51,9 +51,6 @@ def convert(
         joints: Names of the joints to write; all that are found if None.
         source: Which topic or group, names of joints in the file, meaning of effort.
 
-    Returns:
-        What was written.
-
     Raises:
         DataError: If the file cannot be read, has no time, or does not hold a joint.
         MissingDependencyError: If a package that reads or writes a format is not installed.

@@ -169,10 +169,7 @@ class Job(Settings):
             )
 
     def model(self) -> "RobotModel":
-        """Return the robot.
-
-        Returns:
-            The model with the job's joints, gravity and drive terms.
+        """Return the robot, with the job's joints, gravity and drive terms.
 
         Raises:
             ModelError: If the URDF cannot be used, or a joint is not in it.
@@ -191,14 +188,11 @@ class Job(Settings):
         )
 
     def read(self, entry: LogEntry, model: "RobotModel") -> "Log":
-        """Return one log of the job.
+        """Return one log of the job, of the model's joints in its order.
 
         Args:
             entry: Which log.
             model: The job's robot.
-
-        Returns:
-            The log, of the model's joints in its order.
 
         Raises:
             DataError: If the file cannot be used.
@@ -208,14 +202,11 @@ class Job(Settings):
         return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
 
     def lay_out(self, entry: LogEntry, model: "RobotModel") -> "tuple[LogLayout, Table]":
-        """Return which columns of a log's file are read, before any is.
+        """Return which columns of a log's file are read, before any is, and the opened file.
 
         Args:
             entry: Which log.
             model: The job's robot.
-
-        Returns:
-            The layout and the opened file.
 
         Raises:
             DataError: If the file cannot be used.
@@ -242,9 +233,6 @@ def read_job(path: str | Path) -> Job:
         path: The TOML file; paths in it are relative to it, and ``$NAME`` in them is filled in
             from the environment.
 
-    Returns:
-        The job.
-
     Raises:
         SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
     """
@@ -265,9 +253,6 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
         table: The keys of a job file.
         where: Name of its source, for errors.
         folder: Folder that paths in it are relative to.
-
-    Returns:
-        The job.
 
     Raises:
         SettingsError: If a key or a value is wrong.

@@ -30,7 +30,7 @@ def survey_logs(
     *groups: Sequence[LogEntry],
     refuse: Callable[[LogEntry, DataError], None] | None = None,
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
-    """Return logs of a job ready to be read.
+    """Return the logs of each group of a job's, ready to be read.
 
     They are kept in memory if all their files together have no more rows than may be; files of
     formats that are only read whole count as nothing. Otherwise each is cut into pieces of a fixed
@@ -41,9 +41,6 @@ def survey_logs(
         model: The robot whose joints are read.
         groups: The logs: those to fit, those kept apart.
         refuse: Called with a log that cannot be used, and why; if None, the error is raised.
-
-    Returns:
-        The logs of each group.
 
     Raises:
         DataError: If a file cannot be used.
@@ -74,13 +71,10 @@ def survey_logs(
 
 
 def examine(job: Job) -> tuple[Finding, ...]:
-    """Examine the logs of a job.
+    """Examine the logs of a job; the findings have errors first.
 
     Args:
         job: The job. A log that cannot be read gives a finding, not an error.
-
-    Returns:
-        The findings, errors first.
 
     Raises:
         ModelError: If the URDF cannot be used.
@@ -100,16 +94,13 @@ def examine(job: Job) -> tuple[Finding, ...]:
 def examine_logs(
     job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], kept: Sequence[SurveyedLog]
 ) -> tuple[Finding, ...]:
-    """Examine logs that were surveyed: their windows, and the joints that the job holds still.
+    """Examine surveyed logs: the joints that the job holds still, then the logs' windows.
 
     Args:
         job: The job.
         model: Its robot.
         fitted: Its logs to fit.
         kept: Its logs kept apart.
-
-    Returns:
-        The findings, held joints first.
 
     Raises:
         SettingsError: If a setting does not fit a log.
@@ -132,9 +123,6 @@ def checkpoint_inputs(job: Job) -> dict[str, Any]:
 
     Args:
         job: The job.
-
-    Returns:
-        Settings, versions and files.
 
     Raises:
         OSError: If a file does not exist.

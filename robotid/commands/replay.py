@@ -50,13 +50,10 @@ class Findings:
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
-    """Read results to show.
+    """Read results to show; a result is called by its folder.
 
     Args:
         paths: Each a result.json, a track.json, or a folder with one or both.
-
-    Returns:
-        What they hold; a result is called by its folder.
 
     Raises:
         DataError: If a file cannot be used, or there are two tracks.
@@ -92,9 +89,6 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
         urdf: The URDF to show.
         log: The log to play.
 
-    Returns:
-        The job: it says which joints move and how logs are read.
-
     Raises:
         SettingsError: If the settings in the file cannot be used, or there is none.
     """
@@ -107,15 +101,12 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
 
 
 def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
-    """Return the replay of a log.
+    """Return the replay of a log: the page, to be written.
 
     Args:
         job: The robot, its one log, and how logs are read.
         findings: What to show beside it.
         ghost: A second log, of a designed or a simulated motion, to show as a ghost.
-
-    Returns:
-        The page.
 
     Raises:
         DataError: If a log or a result cannot be used.

@@ -33,15 +33,12 @@ _RATE = 25.0  # [Hz] messages per second of the log
 def run_track(
     job: Job, folder: str | Path | None, *, observer: Observer | None = None
 ) -> dict[str, Any]:
-    """Track the one log of a job; write the history and track.json.
+    """Track the one log of a job, write the history and track.json, return what that holds.
 
     Args:
         job: The robot, the log and the signals' settings.
         folder: Where to write; made if it is missing. Nothing is written if None.
         observer: Called after each sample with its row of the log and the identifier.
-
-    Returns:
-        The content of track.json.
 
     Raises:
         DataError: If the log cannot be used.
@@ -146,7 +143,7 @@ def serve_track(
     finished: Callable[[dict[str, Any]], None] | None = None,
     linger: bool = True,
 ) -> dict[str, Any]:
-    """Track the one log of a job and show it in a live page as it goes.
+    """Track the one log of a job, show it in a live page as it goes, return as ``run_track``.
 
     Args:
         job: The robot, the log and the signals' settings.
@@ -156,9 +153,6 @@ def serve_track(
         announce: Called with the address of the page.
         finished: Called with the content of track.json when the log has ended.
         linger: Whether the page is served on after the end, until KeyboardInterrupt.
-
-    Returns:
-        The content of track.json.
 
     Raises:
         DataError: If the log cannot be used.

@@ -78,9 +78,6 @@ def make_estimator(
         mapping: Standard to base parameters.
         prior: What is known before the data.
 
-    Returns:
-        The estimator.
-
     Raises:
         SettingsError: If constraints contradict each other or do not fit the robot.
     """
@@ -134,9 +131,6 @@ def consistent_fit(
         mapping: Standard to base parameters.
         prior: What is known before the data.
 
-    Returns:
-        The estimator.
-
     Raises:
         SettingsError: If constraints contradict each other or do not fit the robot.
     """
@@ -172,9 +166,6 @@ def make_constraints(
         bounds: The constraints as a job states them.
         geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
             the body; boxes stated in ``com`` go before them.
-
-    Returns:
-        The constraints.
     """
     com = dict(geometry)
     for name, (low, high) in bounds.boxes.items():
