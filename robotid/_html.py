@@ -68,10 +68,7 @@ def percent(value: float | None) -> Cell:
 
 
 def table(
-    caption: str,
-    headers: Sequence[str],
-    rows: Sequence[Sequence[Cell]],
-    foot: Sequence[Cell] = (),
+    caption: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]], foot: Sequence[Cell] = ()
 ) -> str:
     """Return the HTML of a table in a box of its own, which scrolls where the page is narrow.
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robotid._settings import table_in
 from robotid.exceptions import SettingsError
 
 if TYPE_CHECKING:
@@ -251,8 +252,5 @@ def _stated(options: argparse.Namespace, flags: Sequence[str]) -> dict[str, Any]
         if value is None:
             continue
         *tables, key = _FLAGS[flag][0].split(".")
-        inside = table
-        for name in tables:
-            inside = inside.setdefault(name, {})
-        inside[key] = _READ[flag](value, flag) if flag in _READ else value
+        table_in(table, tables)[key] = _READ[flag](value, flag) if flag in _READ else value
     return table

@@ -28,6 +28,7 @@ __all__ = [
 ]
 
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
+_FROM_ZERO = Range("x >= 0", lambda x: x >= 0)
 
 
 @dataclass(frozen=True)
@@ -151,12 +152,12 @@ class EstimatorSettings(Settings):
     @property
     def words(self) -> str:
         """What the estimator is."""
-        return dict(self.keys())["name"].text
+        return self.paths()["name"].text
 
     @property
     def loss(self) -> str:
         """The loss of rows that fit badly, "none" if they count as the others."""
-        return "none"
+        return str(getattr(self, "robust", "none"))
 
     @property
     def is_robust(self) -> bool:
@@ -166,7 +167,7 @@ class EstimatorSettings(Settings):
     @property
     def bounds(self) -> ConstraintSettings:
         """The bounds beside physical consistency."""
-        return ConstraintSettings()
+        return ConstraintSettings(**getattr(self, "constraints", {}))
 
 
 def _called(name: str, words: str) -> Any:  # noqa: ANN401
@@ -178,10 +179,6 @@ class RobustSettings(EstimatorSettings):
     """Settings of estimators that can count rows less that fit badly."""
 
     robust: str = setting("none", "loss of rows that fit badly", among=("none", "huber", "tukey"))
-
-    @property
-    def loss(self) -> str:
-        return self.robust
 
 
 @dataclass(frozen=True, init=False)
@@ -220,10 +217,6 @@ class BoundedSettings(EstimatorSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         _ = self.bounds
-
-    @property
-    def bounds(self) -> ConstraintSettings:
-        return ConstraintSettings(**self.constraints)
 
 
 @dataclass(frozen=True, init=False)
@@ -287,9 +280,7 @@ class LogCholeskySettings(ConsistentSettings):
         "log_cholesky", "the consistent fit without a cone, in log-Cholesky parameters"
     )
     starts: int = setting(
-        0,
-        "random starts beside the one from the cone programme",
-        within=Range("x >= 0", lambda x: x >= 0),
+        0, "random starts beside the one from the cone programme", within=_FROM_ZERO
     )
     seed: int = setting(0, "seed of the random starts")
 
@@ -312,9 +303,7 @@ class KalmanSettings(RecursiveSettings):
 
     name: str = _called("kalman", "a Kalman filter over the samples")
     walk: float = setting(
-        0.0,
-        "random walk per sample, as a share of the prior's spread [-]",
-        within=Range("x >= 0", lambda x: x >= 0),
+        0.0, "random walk per sample, as a share of the prior's spread [-]", within=_FROM_ZERO
     )
     gate: float | bool = setting(
         1 - 1e-7,
