@@ -10,15 +10,10 @@ __all__ = ["Cell", "code", "figure", "number", "page", "percent", "scaffold", "t
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell of a table.
+    """One cell of a table."""
 
-    Attributes:
-        html: Its content, already escaped.
-        kind: Class of its style: "" for prose, "text" for short words, "number", "code" or "flag".
-    """
-
-    html: str
-    kind: str = ""
+    html: str  # already escaped
+    kind: str = ""  # of its style: "" for prose, "text" for short words, "number", "code", "flag"
 
 
 def text(value: str, *, flag: bool = False) -> Cell:

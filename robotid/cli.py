@@ -7,16 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from robotid.commands.console import (
-    print_comparison,
-    print_conversion,
+    print_content,
     print_error,
     print_files,
-    print_findings,
-    print_inspection,
-    print_paper,
-    print_result,
-    print_track,
-    print_validation,
     shown_log,
     terminal_progress,
 )
@@ -78,13 +71,15 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
 
 def _show(
-    content: dict[str, Any], options: argparse.Namespace, show: Callable[[dict[str, Any]], None]
+    content: dict[str, Any], options: argparse.Namespace, command: str, files: Sequence[str] = ()
 ) -> None:
-    """Print what a command found: as JSON, or in words."""
+    """Print what a command found and which files it wrote, or its JSON alone."""
     if options.json:
         print(json.dumps(content, allow_nan=False))
-    else:
-        show(content)
+        return
+    print_content(command, content)
+    if files:
+        print_files(options.out, files)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -92,7 +87,7 @@ def _demo(options: argparse.Namespace) -> None:
 
     print("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
     identification, result, truth = run_demo(options.out)
-    print_result(result)
+    print_content("identify", result)
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
     print(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
@@ -106,7 +101,10 @@ def _paper(options: argparse.Namespace) -> None:
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
     with terminal_progress(quiet=options.json, force=options.progress) as progress:
         result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
-    _show(result, options, lambda found: print_paper(found, options.out))
+    _show(result, options, "paper")
+    if not options.json:
+        files = "paper.html, paper.json, replay.html, figures as PNG and SVG"
+        print(f"\nwritten to {options.out}: {files}")
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -114,7 +112,7 @@ def _inspect(options: argparse.Namespace) -> None:
     from robotid.exceptions import ModelError
 
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
-    _show(content, options, print_inspection)
+    _show(content, options, "inspect")
     if content["structure"] is None:
         raise ModelError(f"no model can be built from {options.urdf}; see the findings")
 
@@ -128,9 +126,7 @@ def _identify(options: argparse.Namespace) -> None:
     with terminal_progress(quiet=options.json, force=options.progress) as progress:
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
         _, result = run_job(job, options.out, plan=plan)
-    _show(result, options, print_result)
-    if not options.json:
-        print_files(options.out, [*result["outputs"].values(), "result.json"])
+    _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
 
 
 def _track(options: argparse.Namespace) -> None:
@@ -144,7 +140,7 @@ def _track(options: argparse.Namespace) -> None:
 
 
 def _show_track(found: dict[str, Any], options: argparse.Namespace) -> None:
-    _show(found, options, lambda content: print_track(content, options.out))
+    _show(found, options, "track", [found["history"], "track.json"])
 
 
 def _replay(options: argparse.Namespace) -> None:
@@ -188,14 +184,14 @@ def _doctor(options: argparse.Namespace) -> int:
 
     job = job_from_flags(options)
     findings = examine(job)
-    _show(findings_to_dict(findings), options, print_findings)
+    _show(findings_to_dict(findings), options, "doctor")
     return 1 if alarming(findings, job.ignore) else 0
 
 
 def _validate(options: argparse.Namespace) -> None:
     from robotid.commands.validate import validate_result
 
-    _show(validate_result(options.result, options.logs), options, print_validation)
+    _show(validate_result(options.result, options.logs), options, "validate")
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -205,7 +201,7 @@ def _compare(options: argparse.Namespace) -> None:
         content = write_comparison(options.results, options.out)
     else:
         content = compare_results(options.results)
-    _show(content, options, print_comparison)
+    _show(content, options, "compare")
     if options.out and not options.json:
         print(f"\nwritten to {options.out}")
 
@@ -219,7 +215,7 @@ def _convert(options: argparse.Namespace) -> None:
     joints = options.joints.split(",") if options.joints else None
     source = LogSource(**source_settings(options))
     done = convert(options.log, options.out, joints=joints, source=source)
-    _show(asdict(done), options, print_conversion)
+    _show(asdict(done), options, "convert")
 
 
 #: What each command is for, and what runs it.

@@ -3,7 +3,7 @@
 import logging
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,20 +13,7 @@ if TYPE_CHECKING:
 
     from robotid._typing import ProgressCallback
 
-__all__ = [
-    "print_comparison",
-    "print_conversion",
-    "print_error",
-    "print_files",
-    "print_findings",
-    "print_inspection",
-    "print_paper",
-    "print_result",
-    "print_track",
-    "print_validation",
-    "shown_log",
-    "terminal_progress",
-]
+__all__ = ["print_content", "print_error", "print_files", "shown_log", "terminal_progress"]
 
 
 def print_error(error: BaseException, words: str = "") -> None:
@@ -77,44 +64,24 @@ class _EachOnce(logging.Handler):
             print(f"robotid: {text}", file=sys.stderr)
 
 
-def print_result(result: dict[str, Any]) -> None:
-    """Print what an identification found.
+def print_content(command: str, content: dict[str, Any]) -> None:
+    """Print what a command found.
 
     Args:
-        result: The content of result.json.
+        command: Its name.
+        content: What it prints with ``--json``.
     """
-    from robotid.identification.summary import error_lines, verdict_lines
-
-    structure, wls = result["structure"], result["wls"]
-    print(
-        f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
-        f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
-        f"total mass {result['consistency']['total_mass']:.2f} kg"
-    )
-    _print_lines("fitted recordings", *error_lines(result["identification"], wls["identification"]))
-    for ours, theirs in zip(result["validation"], wls["validation"], strict=True):
-        _print_lines(f"kept apart: {ours['log']}", *error_lines(ours, theirs))
-    for warning in result["warnings"]:
-        _print_lines(f"{warning['code']}: {warning['message']}")
-    _print_lines(*verdict_lines(result["verdict"]))
-
-
-def print_validation(found: dict[str, Any]) -> None:
-    """Print how well a result predicts other logs.
-
-    Args:
-        found: What ``robotid validate --json`` prints.
-    """
-    from robotid.identification.summary import error_lines, verdict_lines
-
-    print(f"predicted with {found['predicted_with']}")
-    for recording in found["validation"]:
-        _print_lines(recording["log"], *error_lines(recording))
-    _print_lines(*verdict_lines(found["verdict"]))
-
-
-def _print_lines(*lines: str) -> None:
-    print("\n" + "\n".join(lines))
+    prints: Mapping[str, Callable[[dict[str, Any]], None]] = {
+        "paper": _print_paper,
+        "inspect": _print_inspection,
+        "identify": _print_result,
+        "track": _print_track,
+        "doctor": _print_findings,
+        "validate": _print_validation,
+        "compare": _print_comparison,
+        "convert": _print_conversion,
+    }
+    prints[command](content)
 
 
 def print_files(folder: str, names: Sequence[str]) -> None:
@@ -127,142 +94,6 @@ def print_files(folder: str, names: Sequence[str]) -> None:
     print(f"\nwritten to {folder}:")
     for name in names:
         print(f"  {Path(folder) / name}")
-
-
-def print_inspection(content: dict[str, Any]) -> None:
-    """Print what a URDF holds.
-
-    Args:
-        content: What ``robotid inspect --json`` prints.
-    """
-    print(f"{content['robot']}: joints {', '.join(content['joints'])}")
-    if content["structure"]:
-        s = content["structure"]
-        print(
-            f"{s['standard']} standard inertial parameters, {s['base_inertial']} base; with drives "
-            f"{s['base']}"
-        )
-        for group in content["base_groups"]:
-            print(f"  {group}")
-    for finding in content["findings"]:
-        where = finding.get("link") or finding.get("joint") or ""
-        print(f"{finding['severity']}: {finding['code']} {where}: {finding['message']}")
-
-
-def print_comparison(content: dict[str, Any]) -> None:
-    """Print several results side by side.
-
-    Args:
-        content: What ``robotid compare --json`` prints.
-    """
-    from robotid.identification.summary import cell
-
-    labels = [result["label"] for result in content["results"]]
-    for result in content["results"]:
-        verdict = result["verdict"]["status"]
-        print(f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}")
-    for remark in content["remarks"]:
-        print(f"  - {remark}")
-    for entry in content["validation"]:
-        print(f"\nkept apart: {entry['log']}, error %")
-        _print_columns(entry["per_joint"], labels)
-    alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
-    print(f"\nfitted recordings of each, error %{alike}")
-    _print_columns(content["fitted"], labels)
-    print("\nbase parameters; last columns: difference to A over the combined standard error")
-    width = max(len(entry["name"]) for entry in content["base_parameters"])
-    heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
-    print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
-    for entry in content["base_parameters"]:
-        cells = "".join(f"{value:10.4g}" for value in entry["values"])
-        cells += "".join(cell(value, 10) for value in entry["differences"])
-        print(f"  {entry['name']:{width}}{cells}")
-    for key in ("settings", "versions"):
-        for row in content[key]:
-            print(f"{key}: {row['name']}: {' | '.join(value or '-' for value in row['values'])}")
-    for row in content["inputs"]:
-        if not all(row["in"]):
-            read = ", ".join(label for label, has in zip(labels, row["in"], strict=True) if has)
-            print(f"only {read} read {row['path']} ({row['role']})")
-
-
-def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
-    from robotid.identification.summary import cell
-
-    width = max(len(entry["joint"]) for entry in per_joint)
-    print(f"  {'joint':{width}}" + "".join(f"{label:>9}" for label in labels))
-    for entry in per_joint:
-        cells = "".join(cell(value, 9) for value in entry["relative_error_pct"])
-        print(f"  {entry['joint']:{width}}{cells}")
-
-
-def print_track(found: dict[str, Any], folder: str) -> None:
-    """Print what a tracker saw, and which files it wrote.
-
-    Args:
-        found: What ``robotid track --json`` prints.
-        folder: Where the files are.
-    """
-    converged = found["converged_at"]
-    when = "not converged" if converged is None else f"converged at {converged:.2f} s"
-    print(
-        f"{found['robot']}: {found['samples']} samples, estimate {1e3 * found['delay']:.0f} ms "
-        f"behind, {when}, excitation {found['excitation']:.2f}"
-    )
-    for change in found["changes"]:
-        load = change["payload"]
-        print(
-            f"step change at {change['onset']:.2f} s, flagged at {change['flagged']:.2f} s; as a "
-            f"load on {load['body']}: {load['mass']:.2f} +- {load['std_error']:.2f} kg"
-        )
-    for entry in found["base_parameters"]:
-        print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
-    print_files(folder, [found["history"], "track.json"])
-
-
-def print_findings(content: dict[str, Any]) -> None:
-    """Print what the doctor found, errors first.
-
-    Args:
-        content: What ``robotid doctor --json`` prints.
-    """
-    for severity in ("error", "warning", "note"):
-        for finding in content["findings"]:
-            if finding["severity"] == severity:
-                print(f"{severity}: {finding['code']}: {finding['message']}")
-
-
-def print_conversion(done: dict[str, Any]) -> None:
-    """Print what a conversion wrote.
-
-    Args:
-        done: What ``robotid convert --json`` prints.
-    """
-    print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
-    print(f"  columns {', '.join(done['columns'])}")
-    if done["ignored"]:
-        print(f"  not of a joint, left out: {', '.join(done['ignored'])}")
-
-
-def print_paper(result: dict[str, Any], folder: str) -> None:
-    """Print what the paper's simulation came to, and which files it wrote.
-
-    Args:
-        result: The content of paper.json.
-        folder: Where the files are.
-    """
-    columns = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
-    print("relative error of the parameters; the last three columns at the end")
-    print("  model       start   after 1   at end   " + "  ".join(columns.values()) + "   NA")
-    for name, model in result["models"].items():
-        errors = model["relative_error"]
-        ends = [result[case][name]["relative_error"][-1] for case in columns]
-        cells = [errors[0], errors[1], errors[-1], *ends]
-        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
-    print("\nrandom motions that converged to 1e-3")
-    for name, found in result["trajectories"].items():
-        print(f"  {name:10} {found['converged']} of {found['runs']}")
-    print(f"\nwritten to {folder}: paper.html, paper.json, replay.html, figures as PNG and SVG")
 
 
 @contextmanager
@@ -313,3 +144,135 @@ def terminal_progress(
             )
 
         yield show
+
+
+def _print_result(result: dict[str, Any]) -> None:
+    from robotid.identification.summary import error_lines, verdict_lines
+
+    structure, wls = result["structure"], result["wls"]
+    print(
+        f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
+        f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
+        f"total mass {result['consistency']['total_mass']:.2f} kg"
+    )
+    _print_lines("fitted recordings", *error_lines(result["identification"], wls["identification"]))
+    for ours, theirs in zip(result["validation"], wls["validation"], strict=True):
+        _print_lines(f"kept apart: {ours['log']}", *error_lines(ours, theirs))
+    for warning in result["warnings"]:
+        _print_lines(f"{warning['code']}: {warning['message']}")
+    _print_lines(*verdict_lines(result["verdict"]))
+
+
+def _print_validation(found: dict[str, Any]) -> None:
+    from robotid.identification.summary import error_lines, verdict_lines
+
+    print(f"predicted with {found['predicted_with']}")
+    for recording in found["validation"]:
+        _print_lines(recording["log"], *error_lines(recording))
+    _print_lines(*verdict_lines(found["verdict"]))
+
+
+def _print_lines(*lines: str) -> None:
+    print("\n" + "\n".join(lines))
+
+
+def _print_inspection(content: dict[str, Any]) -> None:
+    print(f"{content['robot']}: joints {', '.join(content['joints'])}")
+    if content["structure"]:
+        s = content["structure"]
+        print(
+            f"{s['standard']} standard inertial parameters, {s['base_inertial']} base; with drives "
+            f"{s['base']}"
+        )
+        for group in content["base_groups"]:
+            print(f"  {group}")
+    for finding in content["findings"]:
+        where = finding.get("link") or finding.get("joint") or ""
+        print(f"{finding['severity']}: {finding['code']} {where}: {finding['message']}")
+
+
+def _print_comparison(content: dict[str, Any]) -> None:
+    from robotid.identification.summary import cell
+
+    labels = [result["label"] for result in content["results"]]
+    for result in content["results"]:
+        verdict = result["verdict"]["status"]
+        print(f"{result['label']}  {verdict:7} {result['estimator']:10} {result['path']}")
+    for remark in content["remarks"]:
+        print(f"  - {remark}")
+    for entry in content["validation"]:
+        print(f"\nkept apart: {entry['log']}, error %")
+        _print_columns(entry["per_joint"], labels)
+    alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
+    print(f"\nfitted recordings of each, error %{alike}")
+    _print_columns(content["fitted"], labels)
+    print("\nbase parameters; last columns: difference to A over the combined standard error")
+    width = max(len(entry["name"]) for entry in content["base_parameters"])
+    heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
+    print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
+    for entry in content["base_parameters"]:
+        cells = "".join(f"{value:10.4g}" for value in entry["values"])
+        cells += "".join(cell(value, 10) for value in entry["differences"])
+        print(f"  {entry['name']:{width}}{cells}")
+    for key in ("settings", "versions"):
+        for row in content[key]:
+            print(f"{key}: {row['name']}: {' | '.join(value or '-' for value in row['values'])}")
+    for row in content["inputs"]:
+        if not all(row["in"]):
+            read = ", ".join(label for label, has in zip(labels, row["in"], strict=True) if has)
+            print(f"only {read} read {row['path']} ({row['role']})")
+
+
+def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
+    from robotid.identification.summary import cell
+
+    width = max(len(entry["joint"]) for entry in per_joint)
+    print(f"  {'joint':{width}}" + "".join(f"{label:>9}" for label in labels))
+    for entry in per_joint:
+        cells = "".join(cell(value, 9) for value in entry["relative_error_pct"])
+        print(f"  {entry['joint']:{width}}{cells}")
+
+
+def _print_track(found: dict[str, Any]) -> None:
+    converged = found["converged_at"]
+    when = "not converged" if converged is None else f"converged at {converged:.2f} s"
+    print(
+        f"{found['robot']}: {found['samples']} samples, estimate {1e3 * found['delay']:.0f} ms "
+        f"behind, {when}, excitation {found['excitation']:.2f}"
+    )
+    for change in found["changes"]:
+        load = change["payload"]
+        print(
+            f"step change at {change['onset']:.2f} s, flagged at {change['flagged']:.2f} s; as a "
+            f"load on {load['body']}: {load['mass']:.2f} +- {load['std_error']:.2f} kg"
+        )
+    for entry in found["base_parameters"]:
+        print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
+
+
+def _print_findings(content: dict[str, Any]) -> None:
+    for severity in ("error", "warning", "note"):
+        for finding in content["findings"]:
+            if finding["severity"] == severity:
+                print(f"{severity}: {finding['code']}: {finding['message']}")
+
+
+def _print_conversion(done: dict[str, Any]) -> None:
+    print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
+    print(f"  columns {', '.join(done['columns'])}")
+    if done["ignored"]:
+        print(f"  not of a joint, left out: {', '.join(done['ignored'])}")
+
+
+def _print_paper(result: dict[str, Any]) -> None:
+    columns = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
+    print("relative error of the parameters; the last three columns at the end")
+    print("  model       start   after 1   at end   " + "  ".join(columns.values()) + "   NA")
+    for name, model in result["models"].items():
+        errors = model["relative_error"]
+        ends = [result[case][name]["relative_error"][-1] for case in columns]
+        cells = [errors[0], errors[1], errors[-1], *ends]
+        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
+    print("\nrandom motions that converged to 1e-3")
+    for name, found in result["trajectories"].items():
+        print(f"  {name:10} {found['converged']} of {found['runs']}")

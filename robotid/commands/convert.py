@@ -18,21 +18,13 @@ _WHOLE = LogSource()
 
 @dataclass(frozen=True)
 class Conversion:
-    """What a conversion wrote.
-
-    Attributes:
-        path: The file written.
-        samples: Number of its rows.
-        columns: Its columns, of standard names.
-        joints: The joints they are of.
-        ignored: Columns of the file read that are no joint's quantity.
-    """
+    """What a conversion wrote."""
 
     path: str
     samples: int
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # of standard names
     joints: tuple[str, ...]
-    ignored: tuple[str, ...]
+    ignored: tuple[str, ...]  # columns of the file read that are no joint's quantity
 
 
 def convert(

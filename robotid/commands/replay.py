@@ -28,17 +28,11 @@ __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "st
 
 @dataclass(frozen=True)
 class Findings:
-    """What identifications and a tracker found, as read from their files.
+    """What identifications and a tracker found, as read from their files."""
 
-    Attributes:
-        results: Contents of result.json, by label.
-        track: Content of a track.json; None if there is none.
-        folder: Folder of the track.json, which its history is in.
-    """
-
-    results: Mapping[str, Mapping[str, Any]]
-    track: Mapping[str, Any] | None = None
-    folder: Path | None = None
+    results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
+    track: Mapping[str, Any] | None = None  # content of a track.json
+    folder: Path | None = None  # folder of the track.json, which its history is in
 
     @property
     def settings(self) -> Mapping[str, Any] | None:

@@ -1,6 +1,7 @@
 """Validation of a written result on other logs, and whether it shows a prediction."""
 
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,7 @@ def _fitted_logs(
     missing = [
         e.path.name for e, there in zip(job.identification, is_there, strict=True) if not there
     ]
-    entries = [e for e, there in zip(job.identification, is_there, strict=True) if there]
-    (surveyed,) = survey_logs(job, model, entries)
+    (surveyed,) = survey_logs(job, model, list(compress(job.identification, is_there)))
     return [look for log in surveyed for look in log.looks], missing
 
 
@@ -96,13 +96,8 @@ def _verdict(
         file_sha256(log.path) in hashes or any(_share(a, b) for a in log.looks for b in fitted)
         for log in kept
     ]
-    new = [e for e, is_refitted in zip(evaluations, again, strict=True) if not is_refitted]
-    looks = [
-        look
-        for log, refitted in zip(kept, again, strict=True)
-        if not refitted
-        for look in log.looks
-    ]
+    is_new = [not is_refitted for is_refitted in again]
+    looks = [look for log in compress(kept, is_new) for look in log.looks]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
     found = [
         finding
@@ -113,17 +108,13 @@ def _verdict(
     stated = result["verdict"]
     return judge(
         Metrics({}, 0.0),
-        {e.recording.name: e.metrics["estimate"] for e in new},
+        {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
         undetermined=result["structure"]["undetermined"],
         is_consistent=result["consistency"]["is_consistent"],
         joints=model.joints,
         alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
-        refitted=[
-            e.recording.name
-            for e, is_refitted in zip(evaluations, again, strict=True)
-            if is_refitted
-        ],
+        refitted=[e.recording.name for e in compress(evaluations, again)],
     )
 
 

@@ -50,21 +50,13 @@ _FOLDS = 6  # held out in turn by prior_weight = "cv"
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known before the data.
+    """What is known before the data."""
 
-    Attributes:
-        pi: Standard parameters of the URDF, shape (p,).
-        spread: How far they may plausibly be wrong, shape (p,).
-        share: Share of the rows that count as independent [-].
-        sigma: Noise level of each joint, shape (n,) [N m or N].
-        stretches: Factors of the stretches of the fitted logs, to choose a weight with.
-    """
-
-    pi: Array
-    spread: Array
-    share: float
-    sigma: Array
-    stretches: tuple[Factors, ...] = ()
+    pi: Array  # (p,) standard parameters of the URDF
+    spread: Array  # (p,) how far they may plausibly be wrong
+    share: float  # of the rows that count as independent [-]
+    sigma: Array  # (n,) noise level of each joint [N m or N]
+    stretches: tuple[Factors, ...] = ()  # of the fitted logs, to choose a weight with
 
 
 def make_estimator(
