@@ -77,15 +77,16 @@ def write_text(text: str, target: str | Path) -> Path:
 
 
 def write_json(content: Mapping[str, Any], target: str | Path) -> None:
-    """Write JSON beside its target, then put it in place.
+    """Write JSON, whole or not at all.
 
     Args:
         content: What to write; non-finite numbers are refused.
         target: The file.
+
+    Raises:
+        DataError: If its folder does not exist.
     """
-    text = json.dumps(content, indent=1, allow_nan=False)
-    with written_whole(target) as beside:
-        beside.write_text(text + "\n", encoding="utf-8")
+    write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
 
 
 def file_sha256(path: str | Path) -> str:

@@ -4,8 +4,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
 __all__ = ["Cell", "code", "figure", "number", "page", "percent", "scaffold", "table", "text"]
+
+_STYLE = Path(__file__).with_name("_page.css").read_text(encoding="utf-8")
+_TONES = "\n" + Path(__file__).with_name("_tones.css").read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -148,65 +152,3 @@ def _row(cells: Sequence[Cell]) -> str:
     first, *others = cells
     head = f'<th scope="row" class="{first.kind}">{first.html}</th>'
     return f"<tr>{head}{''.join(f'<td class={c.kind!r}>{c.html}</td>' for c in others)}</tr>\n"
-
-
-_TONES = """
-:root { --page: #fff; --text: #1c2126; --quiet: #5b6570; --line: #d5dae0; --soft: #f3f5f7;
-  --predicted: #0b63c5; --residual: #b4500f; --good: #1a7f37; --usable: #9a6700; --poor: #c21f2c; }
-@media (prefers-color-scheme: dark) { :root { --page: #14181c; --text: #e3e7eb; --quiet: #9aa5b0;
-  --line: #353d46; --soft: #1d2328; --predicted: #3f9bff; --residual: #f2a065; --good: #56c271;
-  --usable: #e0b040; --poor: #ff7b7f; } }
-* { box-sizing: border-box; }
-"""
-_STYLE = """\
-body { margin: 0; background: var(--page); color: var(--text);
-  font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 72rem; margin: 0 auto; padding: 1.5rem 1rem 4rem; }
-h1 { font-size: 1.75rem; line-height: 1.2; margin: 0 0 1rem; }
-h1, h2, h3, p, li { overflow-wrap: anywhere; }
-h2 { font-size: 1.25rem; margin: 2.5rem 0 .75rem; padding-top: .75rem;
-  border-top: 1px solid var(--line); }
-h3 { font-size: 1rem; margin: 1.5rem 0 .5rem; }
-p, ul { margin: .5rem 0; max-width: 48rem; }
-.skip { position: absolute; left: -100vw; } .skip:focus { left: .5rem; top: .5rem; z-index: 1;
-  padding: .5rem .75rem; background: var(--page); }
-:focus-visible { outline: .15rem solid var(--predicted); outline-offset: .1rem; }
-main:focus { outline: none; }
-nav { font-size: .875rem; } nav a { margin-right: 1rem; white-space: nowrap; }
-a { color: var(--predicted); }
-.verdict { border-left: .4rem solid var(--tone); background: var(--soft); padding: .75rem 1rem;
-  margin: 1rem 0; } .verdict strong { color: var(--tone); font-size: 1.25rem; }
-.verdict p, .verdict ul { margin: .25rem 0; } .verdict ul { padding-left: 1.25rem; }
-.good { --tone: var(--good); } .usable { --tone: var(--usable); } .poor { --tone: var(--poor); }
-.note { color: var(--quiet); font-size: .875rem; }
-.scroll { overflow-x: auto; margin: .75rem 0 1.25rem; }
-table { border-collapse: collapse; font-size: .875rem; line-height: 1.35; }
-caption { text-align: left; font-weight: 600; padding: 0 0 .4rem; }
-th, td { padding: .28rem .75rem .28rem 0; text-align: left; vertical-align: top;
-  border-bottom: 1px solid var(--line); font-weight: 400; min-width: 3.5rem; }
-thead th { color: var(--quiet); vertical-align: bottom; border-bottom-width: 2px; }
-tfoot th, tfoot td { font-weight: 600; }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-td.number, th.number { padding-left: .5rem; }
-.code { font-family: ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace;
-  font-size: .8125rem; }
-td.code { min-width: 15rem; } tbody th, .text { white-space: nowrap; }
-td.flag { color: var(--poor); font-weight: 600; }
-.plots { display: grid; gap: .5rem 1.5rem;
-  grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); }
-figure { margin: 0; min-width: 0; overflow-x: auto; }
-figcaption { font-size: .875rem; overflow-wrap: anywhere; }
-figure svg { display: block; width: 100%; min-width: 26rem; height: auto; color: var(--text); }
-figure.single { max-width: 40rem; } figure svg.map { width: auto; max-width: none; }
-@media (min-width: 40rem) { tbody th wbr { display: none; } }
-@page { margin: 14mm; }
-@media print { :root { --page: #fff; --text: #000; --quiet: #444; --line: #bbb; --soft: #f3f5f7;
-  --predicted: #0b63c5; --residual: #b4500f; --good: #1a7f37; --usable: #9a6700; --poor: #c21f2c; }
-  body { font-size: 10pt; } main { max-width: none; padding: 0; }
-  nav, .skip { display: none; }
-  .scroll, figure { overflow: visible; } table { font-size: 8pt; } .code { font-size: 7pt; }
-  td.code { min-width: 8rem; } .plots { grid-template-columns: 1fr 1fr; }
-  figure svg, figure svg.map { min-width: 0 !important; max-width: 100% !important; }
-  figure, tr { break-inside: avoid; }
-  h2, h3, caption { break-after: avoid; } }
-"""

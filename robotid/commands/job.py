@@ -26,13 +26,7 @@ _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
     for name, term in TERMS.items()
 }
-
-
-def _dump_path(path: Path) -> str:
-    return str(path.resolve())
-
-
-_FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": _dump_path}
+_FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": lambda path: str(path.resolve())}
 
 
 def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:

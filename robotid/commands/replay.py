@@ -32,15 +32,13 @@ class Findings:
 
     results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
     track: Mapping[str, Any] | None = None  # content of a track.json
-    folder: Path | None = None  # folder of the track.json, which its history is in
+    folder: Path = Path()  # of the track.json, which its history is in
 
     @property
     def settings(self) -> Mapping[str, Any] | None:
         """The job that the first of them ran, None without any."""
-        for content in (*self.results.values(), self.track):
-            if content is not None:
-                return dict(content["settings"])
-        return None
+        found = [content for content in (*self.results.values(), self.track) if content]
+        return dict(found[0]["settings"]) if found else None
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
@@ -71,7 +69,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             results[label] = read_result(file)
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
-    folder, content = tracks[0] if tracks else (None, None)
+    folder, content = tracks[0] if tracks else (Path(), None)
     return Findings(results, content, folder)
 
 
@@ -123,7 +121,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         torques=torques,
         masses={"URDF": prior, **vectors} if vectors else None,
         ghost=second,
-        bands=None if findings.track is None else _bands(findings),
+        bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=[*_payloads(findings.track), *_contacts(torques, model)],
         notes=[f"Motion: {entry.path.name}."],
     )
@@ -196,19 +194,16 @@ def _sure(torque: Array, mask: Array) -> Array:
     return np.where(mask, torque, np.nan)
 
 
-def _bands(findings: Findings) -> Bands:
-    track, folder = findings.track, findings.folder
-    if track is None or folder is None:
-        raise DataError("there is no track to show")
+def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     table = open_table(folder / track["history"], LogSource())
     entries = track["base_parameters"]
     names = [entry["name"] for entry in entries]
-    wanted = ("time", *names, *(f"{name}.std_error" for name in names))
+    errors = [f"{name}.std_error" for name in names]
+    wanted = ["time", *names, *errors]
     missing = [name for name in wanted if name not in table.names]
     if missing:
         raise DataError(f"{track['history']} has no column {missing[0]!r}; track the log again")
-    errors = [f"{name}.std_error" for name in names]
-    columns = table.read(["time", *names, *errors])
+    columns = table.read(wanted)
     return Bands(
         t=columns["time"],
         names=names,
