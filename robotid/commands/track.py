@@ -81,6 +81,13 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
     model, mapping = identifier.model, identifier.mapping
     converged = np.flatnonzero(found.converged)
     last = identifier.reading
+    columns = {
+        "name": mapping.base_names,
+        "expression": mapping.expressions,
+        "value": last.theta.tolist(),
+        "std_error": last.std_error.tolist(),
+        "unit": [model.layout.units[i] for i in mapping.independent],
+    }
     return {
         "schema_version": _SCHEMA,
         "robotid": __version__,
@@ -98,21 +105,7 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
         "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
         "base_parameters": [
-            {
-                "name": name,
-                "expression": expression,
-                "value": float(value),
-                "std_error": float(error),
-                "unit": model.layout.units[i],
-            }
-            for name, expression, value, error, i in zip(
-                mapping.base_names,
-                mapping.expressions,
-                last.theta,
-                last.std_error,
-                mapping.independent,
-                strict=True,
-            )
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ],
         "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
         "history": history,
