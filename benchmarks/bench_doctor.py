@@ -26,8 +26,8 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
 
-from robotid.commands.doctor import examine
 from robotid.commands.job import Job, LogEntry, read_job
+from robotid.commands.logs import examine
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.formats import write_columns
 from robotid.logs.settings import SignalSettings

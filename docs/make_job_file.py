@@ -1,7 +1,7 @@
 """Write docs/job_file.md from the fields of the settings: ``python docs/make_job_file.py``."""
 
 import math
-from dataclasses import MISSING, fields
+from dataclasses import MISSING
 from pathlib import Path
 
 from robotid.commands.job import Job, LogEntry
@@ -93,8 +93,8 @@ def page():
 
 
 def keys(kind):
-    """Yield each field of a table with what it says of itself."""
-    return [(field, field.metadata["key"]) for field in fields(kind)]
+    """Return each field of a table with what it says of itself."""
+    return [(field, key) for field, key, _ in kind.entries()]
 
 
 def estimators():
@@ -102,7 +102,7 @@ def estimators():
     yield "| `name` | estimator |\n|---|---|"
     for name, kind in ESTIMATORS.items():
         default = ", the default" if name == "consistent" else ""
-        yield f"| `{name}`{default} | {dict(kind.keys())['name'].text} |"
+        yield f"| `{name}`{default} | {kind.paths()['name'].text} |"
     yield "\nEach has settings of its own; one of another estimator is refused.\n"
     yield "| key | default | of | meaning |\n|---|---|---|---|"
     said = {}

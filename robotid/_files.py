@@ -59,14 +59,11 @@ def folder_beside(target: Path) -> Iterator[Path]:
 
 
 def write_text(text: str, target: str | Path) -> Path:
-    """Write a page, whole or not at all.
+    """Write a page, whole or not at all, and return its path.
 
     Args:
         text: Its content.
         target: The file.
-
-    Returns:
-        Path of the file.
 
     Raises:
         DataError: If its folder does not exist.
@@ -80,15 +77,16 @@ def write_text(text: str, target: str | Path) -> Path:
 
 
 def write_json(content: Mapping[str, Any], target: str | Path) -> None:
-    """Write JSON beside its target, then put it in place.
+    """Write JSON, whole or not at all.
 
     Args:
         content: What to write; non-finite numbers are refused.
         target: The file.
+
+    Raises:
+        DataError: If its folder does not exist.
     """
-    text = json.dumps(content, indent=1, allow_nan=False)
-    with written_whole(target) as beside:
-        beside.write_text(text + "\n", encoding="utf-8")
+    write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
 
 
 def file_sha256(path: str | Path) -> str:
@@ -96,9 +94,6 @@ def file_sha256(path: str | Path) -> str:
 
     Args:
         path: The file, or the folder of a bag.
-
-    Returns:
-        64 hexadecimal digits.
     """
     source = Path(path)
     if source.is_dir():

@@ -5,27 +5,30 @@ the settings in result.json all come from these fields.
 """
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
-from inspect import isfunction
 from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
-__all__ = ["NOT_NEGATIVE", "POSITIVE", "Key", "Range", "Settings", "check_keys", "setting"]
+__all__ = [
+    "NOT_NEGATIVE",
+    "POSITIVE",
+    "Key",
+    "Range",
+    "Settings",
+    "check_keys",
+    "setting",
+    "table_in",
+]
 
 
 @dataclass(frozen=True)
 class Range:
-    """Which values a setting may have.
+    """Which values a setting may have."""
 
-    Attributes:
-        words: The range in words, as an error names it.
-        holds: Returns whether a value is in it.
-    """
-
-    words: str
+    words: str  # as an error names it
     holds: Callable[[Any], bool]
 
 
@@ -35,26 +38,17 @@ NOT_NEGATIVE = Range("0 or a positive number", lambda x: x >= 0)
 
 @dataclass(frozen=True)
 class Key:
-    """What a field says of itself.
+    """What a field says of itself."""
 
-    Attributes:
-        text: What the setting is, with its unit.
-        among: The words that it may be.
-        within: The range of its numbers.
-        at: Where a job file has it, tables and key with dots between; the field's name if empty.
-        reads: What a job file holds there: types, a table of keys, [a table], or a function that
-            returns it; what the annotation says if None.
-        load: Makes the value from what a job file holds.
-        dump: Makes what result.json holds from the value.
-    """
-
-    text: str
-    among: Sequence[str] = ()
-    within: Range | None = None
-    at: str = ""
+    text: str  # what the setting is, with its unit
+    among: Sequence[str] = ()  # the words that it may be
+    within: Range | None = None  # the range of its numbers
+    at: str = ""  # where a job file has it, with dots between; the field's name if empty
+    # what a job file holds there: types, a table of keys, or [a table]; what the annotation says
+    # if None
     reads: Any = None
-    load: Callable[[Any], Any] | None = None
-    dump: Callable[[Any], Any] | None = None
+    load: Callable[[Any], Any] | None = None  # makes the value from what a job file holds
+    dump: Callable[[Any], Any] | None = None  # makes what result.json holds from the value
 
     @property
     def words(self) -> str:
@@ -67,17 +61,13 @@ def setting(default: Any, text: str, **about: Any) -> Any:  # noqa: ANN401
     """Declare a setting, as a field of a ``Settings``.
 
     Args:
-        default: Its value if none is stated, or a function that returns it.
+        default: Its value if none is stated; MISSING if it must be.
         text: What it is, with its unit.
         about: The other attributes of ``Key``.
-
-    Returns:
-        The field.
     """
     metadata = {"key": Key(text, **about)}
-    if isinstance(default, dict) or callable(default):
-        factory = default.copy if isinstance(default, dict) else default
-        return field(default_factory=factory, metadata=metadata)
+    if isinstance(default, dict):
+        return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
@@ -95,40 +85,31 @@ class Settings:
         cls.__doc__ = "\n".join([f"{cls.__doc__}\n\nAttributes:", *lines])
 
     def __post_init__(self) -> None:
-        for name, key in self.keys():
-            *table, last = (key.at or name).split(".")
-            where = ".".join(table) or self._table
-            prefix = f"{where}: " if where else ""
-            _check_value(getattr(self, name), key, f"{prefix}{last}")
+        for f, key, (*tables, last) in self.entries():
+            where = ".".join(tables) or self._table
+            _check_value(getattr(self, f.name), key, f"{where}: {last}" if where else last)
 
     @classmethod
-    def keys(cls) -> Iterator[tuple[str, Key]]:
-        """Yield the name of each field, and what it says of itself."""
-        for f in fields(cls):
-            yield f.name, f.metadata["key"]
+    def entries(cls) -> list[tuple[Field[Any], Key, list[str]]]:
+        """Return each field, what it says of itself, and its path in a job file."""
+        about = [(f, f.metadata["key"]) for f in fields(cls)]
+        return [(f, key, (key.at or f.name).split(".")) for f, key in about]
 
     @classmethod
     def schema(cls) -> dict[str, Any]:
         """Return the keys that a job file may have here: a type or types, a table, or [a table]."""
         found: dict[str, Any] = {}
-        for f in fields(cls):
-            key = f.metadata["key"]
-            *tables, last = (key.at or f.name).split(".")
-            inside = found
-            for table in tables:
-                inside = inside.setdefault(table, {})
-            inside[last] = _read_type(f.type if key.reads is None else key.reads)
+        for f, key, (*tables, last) in cls.entries():
+            table_in(found, tables)[last] = _read_type(f.type if key.reads is None else key.reads)
         return found
 
     @classmethod
     def paths(cls) -> dict[str, Key]:
         """Return what each key says of itself, those of tables inside with a dot between."""
         found: dict[str, Key] = {}
-        for f in fields(cls):
-            key = f.metadata["key"]
-            at = key.at or f.name
+        for f, key, path in cls.entries():
             inside = f.type.paths() if _is_table(f.type) else {"": key}
-            found |= {f"{at}.{last}".strip("."): inner for last, inner in inside.items()}
+            found |= {".".join([*path, last]).strip("."): inner for last, inner in inside.items()}
         return found
 
     @classmethod
@@ -138,35 +119,39 @@ class Settings:
         Args:
             table: The table, of keys and types of the ``schema``.
 
-        Returns:
-            The settings.
-
         Raises:
             SettingsError: If a value is not usable.
         """
         given = {}
-        for f in fields(cls):
-            key, inside = f.metadata["key"], table
-            *tables, last = (key.at or f.name).split(".")
+        for f, key, (*tables, last) in cls.entries():
+            inside = table
             for name in tables:
                 inside = inside.get(name, {})
             if last in inside:
-                given[f.name] = _load(inside[last], f, last)
+                given[f.name] = _load(inside[last], key, f.type, last)
         return cls(**given)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as plain values, in the shape of the job file; none is left out."""
         found: dict[str, Any] = {}
-        for name, key in self.keys():
-            value = getattr(self, name)
-            *tables, last = (key.at or name).split(".")
-            inside = found
-            for table in tables:
-                inside = inside.setdefault(table, {})
+        for f, key, (*tables, last) in self.entries():
+            inside, value = table_in(found, tables), getattr(self, f.name)
             plain = _plain(value) if key.dump is None else key.dump(value)
             if plain is not None:
                 inside[last] = plain
         return found
+
+
+def table_in(table: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return a table inside tables, made if it is missing.
+
+    Args:
+        table: The outermost.
+        names: Its name in each, from the outside.
+    """
+    for name in names:
+        table = table.setdefault(name, {})
+    return table
 
 
 def check_keys(
@@ -211,19 +196,18 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
 
 
 def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
-    if value is None:
+    if value is None or not (key.among or key.within):
         return
-    words = f"one of {listed(key.among)}" if key.among else ""
-    if key.within is not None:
-        words = f"{key.within.words} or {words}" if words else key.within.words
-    is_right = not words
-    if isinstance(value, str):
-        is_right = is_right or value in key.among
-    elif key.within is not None:
-        is_right, words = key.within.holds(value), key.within.words
+    words = [f"one of {listed(key.among)}"] if key.among else []
+    if key.within is None:
+        is_right = value in key.among
+    elif isinstance(value, str):
+        is_right, words = value in key.among, [key.within.words, *words]
+    else:
+        is_right, words = key.within.holds(value), [key.within.words]
     if not is_right:
         shown = repr(value) if isinstance(value, str) else value
-        raise SettingsError(f"{name} is {shown}, wanted {words}")
+        raise SettingsError(f"{name} is {shown}, wanted {' or '.join(words)}")
 
 
 _NUMBER = (int, float)
@@ -245,8 +229,6 @@ def _read_type(kind: Any) -> Any:  # noqa: ANN401
     """Return what a job file holds where a field is annotated so."""
     if isinstance(kind, dict | list | tuple):
         return kind
-    if isfunction(kind):
-        return kind()
     if _is_table(kind):
         return kind.schema()
     origin, inner = get_origin(kind), get_args(kind)
@@ -261,8 +243,7 @@ def _read_type(kind: Any) -> Any:  # noqa: ANN401
     return _NUMBER if kind is float else (kind,)
 
 
-def _load(value: Any, about: Field[Any], name: str) -> Any:  # noqa: ANN401
-    key, kind = about.metadata["key"], about.type
+def _load(value: Any, key: Key, kind: Any, name: str) -> Any:  # noqa: ANN401
     if key.load is not None:
         return key.load(value)
     if _is_table(kind):

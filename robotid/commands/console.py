@@ -1,22 +1,19 @@
-"""Results as text on a terminal."""
+"""Results, errors and progress as text on a terminal."""
 
 import logging
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "print_comparison",
-    "print_error",
-    "print_files",
-    "print_inspection",
-    "print_result",
-    "print_validation",
-    "shown_log",
-]
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+    from robotid._typing import ProgressCallback
+
+__all__ = ["print_content", "print_error", "print_files", "shown_log", "terminal_progress"]
 
 
 def print_error(error: BaseException, words: str = "") -> None:
@@ -37,9 +34,6 @@ def shown_log(*, is_verbose: bool) -> Iterator[None]:
 
     Args:
         is_verbose: Whether to show what is merely worth knowing, too.
-
-    Yields:
-        Nothing.
     """
     logger, handler = logging.getLogger("robotid"), _EachOnce()
     level = logger.level
@@ -70,12 +64,89 @@ class _EachOnce(logging.Handler):
             print(f"robotid: {text}", file=sys.stderr)
 
 
-def print_result(result: dict[str, Any]) -> None:
-    """Print what an identification found.
+def print_content(command: str, content: dict[str, Any]) -> None:
+    """Print what a command found.
 
     Args:
-        result: The content of result.json.
+        command: Its name.
+        content: What it prints with ``--json``.
     """
+    prints: Mapping[str, Callable[[dict[str, Any]], None]] = {
+        "paper": _print_paper,
+        "inspect": _print_inspection,
+        "identify": _print_result,
+        "track": _print_track,
+        "doctor": _print_findings,
+        "validate": _print_validation,
+        "compare": _print_comparison,
+        "convert": _print_conversion,
+    }
+    prints[command](content)
+
+
+def print_files(folder: str, names: Sequence[str]) -> None:
+    """Print which files were written.
+
+    Args:
+        folder: Where.
+        names: Their names.
+    """
+    print(f"\nwritten to {folder}:")
+    for name in names:
+        print(f"  {Path(folder) / name}")
+
+
+@contextmanager
+def terminal_progress(
+    *, quiet: bool = False, force: bool = False
+) -> "Iterator[ProgressCallback | None]":
+    """Show progress on the standard error stream while the context lasts, if it is a terminal.
+
+    Args:
+        quiet: Show none even on a terminal, as beside JSON.
+        force: Show it in any case.
+
+    Yields:
+        What to call with the name of the work, units done, units in all and their name; None if
+        nothing is shown. A new name begins a new bar.
+    """
+    if not force and (quiet or not sys.stderr.isatty()):
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True, force_terminal=True if force else None)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %  {task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    tasks: dict[str, TaskID] = {}
+    first: dict[str, int] = {}
+    with Progress(*columns, console=console, transient=True) as bars:
+
+        def show(what: str, done: int, total: int, unit: str) -> None:
+            if what not in tasks:
+                for finished in tasks.values():
+                    bars.remove_task(finished)
+                tasks.clear()
+                tasks[what] = bars.add_task(what, total=total, completed=done, rate="")
+                first[what] = done
+            task = bars.tasks[0]
+            elapsed = task.elapsed or 0.0
+            made = done - first[what]
+            rate = made / elapsed if elapsed > 0 else 0.0
+            words = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            bars.update(
+                tasks[what], completed=done, total=total, rate=f"{words} {unit}/s" if made else ""
+            )
+
+        yield show
+
+
+def _print_result(result: dict[str, Any]) -> None:
     from robotid.identification.summary import error_lines, verdict_lines
 
     structure, wls = result["structure"], result["wls"]
@@ -92,12 +163,7 @@ def print_result(result: dict[str, Any]) -> None:
     _print_lines(*verdict_lines(result["verdict"]))
 
 
-def print_validation(found: dict[str, Any]) -> None:
-    """Print how well a result predicts other logs.
-
-    Args:
-        found: What ``robotid validate --json`` prints.
-    """
+def _print_validation(found: dict[str, Any]) -> None:
     from robotid.identification.summary import error_lines, verdict_lines
 
     print(f"predicted with {found['predicted_with']}")
@@ -110,24 +176,7 @@ def _print_lines(*lines: str) -> None:
     print("\n" + "\n".join(lines))
 
 
-def print_files(folder: str, names: Sequence[str]) -> None:
-    """Print which files were written.
-
-    Args:
-        folder: Where.
-        names: Their names.
-    """
-    print(f"\nwritten to {folder}:")
-    for name in names:
-        print(f"  {Path(folder) / name}")
-
-
-def print_inspection(content: dict[str, Any]) -> None:
-    """Print what a URDF holds.
-
-    Args:
-        content: What ``robotid inspect --json`` prints.
-    """
+def _print_inspection(content: dict[str, Any]) -> None:
     print(f"{content['robot']}: joints {', '.join(content['joints'])}")
     if content["structure"]:
         s = content["structure"]
@@ -142,12 +191,7 @@ def print_inspection(content: dict[str, Any]) -> None:
         print(f"{finding['severity']}: {finding['code']} {where}: {finding['message']}")
 
 
-def print_comparison(content: dict[str, Any]) -> None:
-    """Print several results side by side.
-
-    Args:
-        content: What ``robotid compare --json`` prints.
-    """
+def _print_comparison(content: dict[str, Any]) -> None:
     from robotid.identification.summary import cell
 
     labels = [result["label"] for result in content["results"]]
@@ -187,3 +231,48 @@ def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -
     for entry in per_joint:
         cells = "".join(cell(value, 9) for value in entry["relative_error_pct"])
         print(f"  {entry['joint']:{width}}{cells}")
+
+
+def _print_track(found: dict[str, Any]) -> None:
+    converged = found["converged_at"]
+    when = "not converged" if converged is None else f"converged at {converged:.2f} s"
+    print(
+        f"{found['robot']}: {found['samples']} samples, estimate {1e3 * found['delay']:.0f} ms "
+        f"behind, {when}, excitation {found['excitation']:.2f}"
+    )
+    for change in found["changes"]:
+        load = change["payload"]
+        print(
+            f"step change at {change['onset']:.2f} s, flagged at {change['flagged']:.2f} s; as a "
+            f"load on {load['body']}: {load['mass']:.2f} +- {load['std_error']:.2f} kg"
+        )
+    for entry in found["base_parameters"]:
+        print(f"  {entry['name']:32} {entry['value']:10.4g} +- {entry['std_error']:.2g}")
+
+
+def _print_findings(content: dict[str, Any]) -> None:
+    for severity in ("error", "warning", "note"):
+        for finding in content["findings"]:
+            if finding["severity"] == severity:
+                print(f"{severity}: {finding['code']}: {finding['message']}")
+
+
+def _print_conversion(done: dict[str, Any]) -> None:
+    print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
+    print(f"  columns {', '.join(done['columns'])}")
+    if done["ignored"]:
+        print(f"  not of a joint, left out: {', '.join(done['ignored'])}")
+
+
+def _print_paper(result: dict[str, Any]) -> None:
+    columns = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
+    print("relative error of the parameters; the last three columns at the end")
+    print("  model       start   after 1   at end   " + "  ".join(columns.values()) + "   NA")
+    for name, model in result["models"].items():
+        errors = model["relative_error"]
+        ends = [result[case][name]["relative_error"][-1] for case in columns]
+        cells = [errors[0], errors[1], errors[-1], *ends]
+        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
+    print("\nrandom motions that converged to 1e-3")
+    for name, found in result["trajectories"].items():
+        print(f"  {name:10} {found['converged']} of {found['runs']}")

@@ -18,21 +18,13 @@ _WHOLE = LogSource()
 
 @dataclass(frozen=True)
 class Conversion:
-    """What a conversion wrote.
-
-    Attributes:
-        path: The file written.
-        samples: Number of its rows.
-        columns: Its columns, of standard names.
-        joints: The joints they are of.
-        ignored: Columns of the file read that are no joint's quantity.
-    """
+    """What a conversion wrote."""
 
     path: str
     samples: int
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # of standard names
     joints: tuple[str, ...]
-    ignored: tuple[str, ...]
+    ignored: tuple[str, ...]  # columns of the file read that are no joint's quantity
 
 
 def convert(
@@ -52,9 +44,6 @@ def convert(
         joints: Names of the joints to write; all that are found if None.
         source: Which topic or group, names of joints in the file, meaning of effort.
 
-    Returns:
-        What was written.
-
     Raises:
         DataError: If the file cannot be read, has no time, or does not hold a joint.
         MissingDependencyError: If a package that reads or writes a format is not installed.
@@ -65,7 +54,7 @@ def convert(
     for joint in joints or ():
         if joint not in by_joint:
             raise DataError(
-                f"{file.name} has no joint {joint!r}; joints found: {list(by_joint)}"
+                f"{file.name} has no joint {joint!r}; joints found: {listed(by_joint)}"
                 f"{suggestion(joint, by_joint)}"
             )
     kept = tuple(by_joint) if joints is None else tuple(joints)

@@ -1,26 +1,17 @@
-"""Flags of the command line: those that describe a job, those of the work, and the job itself."""
+"""The flags of each command, and the job that a command line names or describes."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robotid._settings import table_in
 from robotid.exceptions import SettingsError
 
 if TYPE_CHECKING:
     from robotid.commands.job import Job
 
-__all__ = [
-    "add_job_flags",
-    "add_log_flags",
-    "add_progress_flags",
-    "add_source_flags",
-    "add_verbose_flag",
-    "add_work_flags",
-    "job_from_flags",
-    "refuse_log_flags",
-    "source_settings",
-]
+__all__ = ["add_flags", "job_from_flags", "refuse_log_flags", "source_settings"]
 
 
 def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -49,10 +40,7 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--gain": ("torque.gains", {"metavar": "JOINT=N_M_PER_A", "action": "append"}),
     "--rate": ("signals.rate", {"metavar": "HZ", "type": float}),
     "--cutoff": ("signals.cutoff", {"metavar": "HZ"}),
-    "--friction": (
-        "model.friction",
-        {"metavar": "MODEL", "help": "none, viscous or viscous+coulomb"},
-    ),
+    "--friction": ("model.friction", {"metavar": "MODEL"}),
     "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
     "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
     "--time-unit": ("units.time", {"metavar": "UNIT"}),
@@ -68,106 +56,140 @@ _READ: Mapping[str, Callable[[Any, str], Any]] = {
     "--gain": _pairs,
     "--cutoff": _cutoff,
 }
+_LOG = tuple(flag for flag in _FLAGS if flag != "--estimator")
 _SOURCE = ("--topic", "--effort", "--stamp")
 
 
-def add_job_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say what a job file says, to a command that takes either.
+def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
+    """Add the flags of a command.
 
     Args:
-        parser: Parser of the command.
+        parser: Its parser.
+        command: Its name.
     """
+    add = parser.add_argument
+    match command:
+        case "demo":
+            _add_out(parser, "robotid-demo")
+        case "paper":
+            _add_out(parser, "robotid-paper")
+            _add_json(parser, "paper.json")
+            add("--quick", action="store_true", help="few iterations and motions: a try-out")
+            _add_progress(parser)
+        case "inspect":
+            add("urdf", metavar="URDF")
+            add("--free-flyer", action="store_true", help="the base floats")
+            _add_json(parser)
+        case "identify":
+            _add_job(parser, "result.json")
+            _add_out(parser, "robotid-out")
+            _add_work(parser)
+            _add_progress(parser)
+        case "doctor":
+            _add_job(parser)
+        case "track":
+            _add_robot_and_log(parser)
+            _add_out(parser, "robotid-track")
+            _add_json(parser, "track.json")
+            _add_settings(parser.add_argument_group("the log"), _LOG)
+            _add_verbose(parser)
+            _add_serve(parser, "show it in the browser while it runs, in true time")
+        case "replay":
+            _add_robot_and_log(parser)
+            results = "result.json, track.json or their folder"
+            add("results", nargs="*", metavar="RESULT", help=results)
+            add("--html", metavar="FILE", help="page to write; default: replay.html")
+            add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+            _add_serve(parser, "track the log again, in true time, and show it as it goes")
+            group = parser.add_argument_group("the log, unless a RESULT says it")
+            _add_settings(group, _LOG)
+        case "validate":
+            add("result", metavar="RESULT.json")
+            add("logs", nargs="+", metavar="LOG")
+            _add_json(parser)
+        case "compare":
+            add("results", nargs="+", metavar="RESULT.json")
+            add("--out", metavar="FILE.html", help="page to write")
+            _add_json(parser)
+        case "convert":
+            add("log", metavar="IN", help="a log of any format, or a bag's folder")
+            add("out", metavar="OUT", help="file to write; its suffix says the format")
+            add("--joints", metavar="A,B,...", help="joints to write; default: all")
+            _add_settings(parser, _SOURCE)
+            _add_json(parser)
+
+
+def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    parser.add_argument("--out", default=folder, metavar="DIR", help="folder to write to")
+
+
+def _add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
+    parser.add_argument("--json", action="store_true", help=f"print {what}")
+
+
+def _add_verbose(parser: argparse.ArgumentParser) -> None:
+    words = "say on stderr what is chosen, and why"
+    parser.add_argument("--verbose", action="store_true", help=words)
+
+
+def _add_progress(parser: argparse.ArgumentParser) -> None:
+    words = "show progress on stderr although it is no terminal, or beside --json"
+    parser.add_argument("--progress", action="store_true", help=words)
+
+
+def _add_robot_and_log(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", metavar="URDF")
+    parser.add_argument("logs", nargs=1, metavar="LOG")
+
+
+def _add_serve(parser: argparse.ArgumentParser, words: str) -> None:
+    parser.add_argument("--serve", nargs="?", const=0, type=int, metavar="PORT", help=words)
+    speed = "of --serve; 0: as fast as it can"
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help=speed)
+
+
+def _add_job(parser: argparse.ArgumentParser, json_: str = "one JSON object") -> None:
+    """Add a job file, or the flags that say what it says."""
     from robotid.identification.settings import ESTIMATORS
 
+    parser.add_argument("source", metavar="JOB.toml | URDF")
+    parser.add_argument("logs", nargs="*", metavar="LOG", help="logs to fit")
+    _add_json(parser, json_)
     flags = parser.add_argument_group("instead of a job file, with URDF LOG [LOG ...]")
     flags.add_argument("--validate", nargs="+", metavar="LOG", help="logs kept apart")
     names = f"which estimator: consistent (default), {', '.join(ESTIMATORS)}"
     flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help=names)
-    add_log_flags(flags)
+    _add_settings(flags, _LOG)
+    _add_verbose(parser)
 
 
-def add_log_flags(flags: "argparse._ArgumentGroup") -> None:
-    """Add the flags that say how logs of a robot are read.
-
-    Args:
-        flags: Group that they go to.
-    """
-    _add(flags, [flag for flag in _FLAGS if flag != "--estimator"])
-
-
-def add_source_flags(flags: "argparse._ActionsContainer") -> None:
-    """Add the flags that say where in a log file the signals are.
-
-    Args:
-        flags: Parser or group that they go to.
-    """
-    _add(flags, _SOURCE)
-
-
-def _add(flags: "argparse._ActionsContainer", wanted: Sequence[str]) -> None:
-    """Add flags; what they are for is said by the keys of the job file."""
+def _add_settings(flags: "argparse._ActionsContainer", wanted: Sequence[str]) -> None:
+    """Add flags of settings; what they are for is said by the keys of the job file."""
     from robotid.commands.job import Job
 
     keys = Job.paths()
     for flag in wanted:
         at, about = _FLAGS[flag]
-        help_ = keys[at].words if at in keys else about["help"]
-        flags.add_argument(flag, **(about | {"help": help_}))
+        words = keys[at].words if at in keys else "none, viscous or viscous+coulomb"
+        flags.add_argument(flag, **about, help=words)
 
 
-def add_work_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say who reduces long logs; they never change a result.
-
-    Args:
-        parser: Parser of the command.
-    """
+def _add_work(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say who reduces long logs; they never change a result."""
     flags = parser.add_argument_group("long logs; the result has the same bits in any case")
-    flags.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="worker processes; default: that of the job file, else one per core for long logs",
-    )
-    flags.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a Dask cluster, as tcp://host:8786"
-    )
-    flags.add_argument(
-        "--resume", action="store_true", help="go on from where an interrupted run in --out ended"
-    )
-
-
-def add_progress_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that shows progress where it is not shown by itself.
-
-    Args:
-        parser: Parser of the command.
-    """
-    parser.add_argument(
-        "--progress",
-        action="store_true",
-        help="show progress on stderr although it is no terminal, or beside --json",
-    )
-
-
-def add_verbose_flag(parser: argparse.ArgumentParser) -> None:
-    """Add the flag that shows what the library logs.
-
-    Args:
-        parser: Parser of the command.
-    """
-    parser.add_argument(
-        "--verbose", action="store_true", help="say on stderr what is chosen, and why"
-    )
+    words = "worker processes; default: that of the job file, else one per core for long logs"
+    flags.add_argument("--workers", type=int, metavar="N", help=words)
+    words = "of a Dask cluster, as tcp://host:8786"
+    flags.add_argument("--scheduler", metavar="ADDRESS", help=words)
+    words = "go on from where an interrupted run in --out ended"
+    flags.add_argument("--resume", action="store_true", help=words)
 
 
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of a ``LogSource`` that were given.
+    """Return the settings of a ``LogSource`` that were given, by name.
 
     Args:
-        options: The flags, those of ``add_source_flags`` among them.
-
-    Returns:
-        The settings by name.
+        options: The flags of the command "convert".
     """
     return dict(_stated(options, _SOURCE).get("log", {}))
 
@@ -176,10 +198,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
     """Return the job that a command line names or describes.
 
     Args:
-        options: The flags, those of ``add_job_flags`` among them.
-
-    Returns:
-        The job.
+        options: The flags of the command.
 
     Raises:
         SettingsError: If a job file is given with flags, or a flag is not usable.
@@ -210,7 +229,7 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
     """Refuse the flags that say how logs are read.
 
     Args:
-        options: The flags, those of ``add_log_flags`` among them.
+        options: The flags of the command.
         why: What is in their place.
 
     Raises:
@@ -233,8 +252,5 @@ def _stated(options: argparse.Namespace, flags: Sequence[str]) -> dict[str, Any]
         if value is None:
             continue
         *tables, key = _FLAGS[flag][0].split(".")
-        inside = table
-        for name in tables:
-            inside = inside.setdefault(name, {})
-        inside[key] = _READ[flag](value, flag) if flag in _READ else value
+        table_in(table, tables)[key] = _READ[flag](value, flag) if flag in _READ else value
     return table

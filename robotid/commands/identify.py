@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import folder_beside, write_json
-from robotid.commands.checkpoint_inputs import checkpoint_inputs
-from robotid.commands.doctor import examine_logs
 from robotid.commands.job import Job
-from robotid.commands.logs import survey_logs
+from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.doctor.diagnosis import alarming
 from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError

@@ -3,47 +3,33 @@
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import Key, Range, Settings, check_keys, setting
+from robotid._settings import Range, Settings, check_keys, setting
 from robotid.exceptions import SettingsError
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
+from robotid.logs.data import Log
+from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.table import Table
+from robotid.robot.drives import DRIVE_TERMS, TERMS, friction_models
+from robotid.robot.parameters import Coupling
 
 if TYPE_CHECKING:
-    from robotid.logs.data import Log
-    from robotid.logs.read import LogLayout
-    from robotid.logs.table import Table
     from robotid.robot.model import RobotModel
-    from robotid.robot.parameters import Coupling
 
 __all__ = ["Job", "LogEntry", "job_from_settings", "read_job"]
 
-
-def _absolute(path: Path) -> str:
-    return str(path.resolve())
-
-
-def _default_terms() -> tuple[str, ...]:
-    from robotid.robot.drives import DRIVE_TERMS
-
-    return DRIVE_TERMS
-
-
-def _model_keys() -> dict[str, Any]:
-    from robotid.robot.drives import TERMS
-
-    return {
-        "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
-        for name, term in TERMS.items()
-    }
+_MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
+    "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
+    for name, term in TERMS.items()
+}
+_FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": lambda path: str(path.resolve())}
 
 
 def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
-    from robotid.robot.drives import TERMS, friction_models
-
     friction, models = table.get("friction", "viscous+coulomb"), friction_models()
     if friction not in models:
         raise SettingsError(f"friction is {friction!r}, wanted one of {list(models)}")
@@ -55,16 +41,12 @@ def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
-    from robotid.robot.drives import TERMS, friction_models
-
     chosen = tuple(term for term in terms if TERMS[term].is_friction)
     friction = next(name for name, model in friction_models().items() if model == chosen)
-    return {key: friction if key == "friction" else key in terms for key in _model_keys()}
+    return {key: friction if key == "friction" else key in terms for key in _MODEL_KEYS}
 
 
-def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> "tuple[Coupling, ...]":
-    from robotid.robot.parameters import Coupling
-
+def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]:
     for table in tables:
         for joint, ratio in table["ratios"].items():
             if isinstance(ratio, bool) or not isinstance(ratio, int | float):
@@ -75,7 +57,7 @@ def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> "tuple[Coupling, ...
     )
 
 
-def _dump_couplings(couplings: "Sequence[Coupling]") -> list[dict[str, Any]]:
+def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
     return [{"name": coupling.name, "ratios": dict(coupling.ratios)} for coupling in couplings]
 
 
@@ -83,9 +65,7 @@ def _dump_couplings(couplings: "Sequence[Coupling]") -> list[dict[str, Any]]:
 class LogEntry(Settings):
     """One log of a job."""
 
-    path: Path = field(
-        metadata={"key": Key("the file", at="log", reads=(str,), load=Path, dump=_absolute)}
-    )
+    path: Path = setting(MISSING, "the file", at="log", **_FILE)
     start: float | None = setting(None, "start of the window in the log's own time [s]")
     end: float | None = setting(None, "end of the window [s]")
 
@@ -94,9 +74,7 @@ class LogEntry(Settings):
 class Job(Settings):
     """Everything that is needed to run an identification."""
 
-    urdf: Path = field(
-        metadata={"key": Key("the URDF file", reads=(str,), load=Path, dump=_absolute)}
-    )
+    urdf: Path = setting(MISSING, "the URDF file", **_FILE)
     joints: tuple[str, ...] | None = setting(
         None, "joints to identify, in order; all movable ones if not stated"
     )
@@ -110,17 +88,17 @@ class Job(Settings):
     )
     signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
     terms: tuple[str, ...] = setting(
-        _default_terms,
+        DRIVE_TERMS,
         "drive terms to identify",
         at="model",
-        reads=_model_keys,
+        reads=_MODEL_KEYS,
         load=_load_terms,
         dump=_dump_terms,
     )
     gains: Mapping[str, float] = setting(
         {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
     )
-    couplings: "tuple[Coupling, ...]" = setting(
+    couplings: tuple[Coupling, ...] = setting(
         (),
         "drives that turn with several joints, each with a name and its ratios by joint [-]",
         at="coupling",
@@ -169,10 +147,7 @@ class Job(Settings):
             )
 
     def model(self) -> "RobotModel":
-        """Return the robot.
-
-        Returns:
-            The model with the job's joints, gravity and drive terms.
+        """Return the robot, with the job's joints, gravity and drive terms.
 
         Raises:
             ModelError: If the URDF cannot be used, or a joint is not in it.
@@ -190,38 +165,28 @@ class Job(Settings):
             couplings=self.couplings,
         )
 
-    def read(self, entry: LogEntry, model: "RobotModel") -> "Log":
-        """Return one log of the job.
+    def read(self, entry: LogEntry, model: "RobotModel") -> Log:
+        """Return one log of the job, of the model's joints in its order.
 
         Args:
             entry: Which log.
             model: The job's robot.
 
-        Returns:
-            The log, of the model's joints in its order.
-
         Raises:
             DataError: If the file cannot be used.
         """
-        from robotid.logs.read import read_log
-
         return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
 
-    def lay_out(self, entry: LogEntry, model: "RobotModel") -> "tuple[LogLayout, Table]":
-        """Return which columns of a log's file are read, before any is.
+    def lay_out(self, entry: LogEntry, model: "RobotModel") -> tuple[LogLayout, Table]:
+        """Return which columns of a log's file are read, before any is, and the opened file.
 
         Args:
             entry: Which log.
             model: The job's robot.
 
-        Returns:
-            The layout and the opened file.
-
         Raises:
             DataError: If the file cannot be used.
         """
-        from robotid.logs.read import lay_out
-
         return lay_out(entry.path, **self._reading(model))
 
     def _reading(self, model: "RobotModel") -> dict[str, Any]:
@@ -241,9 +206,6 @@ def read_job(path: str | Path) -> Job:
     Args:
         path: The TOML file; paths in it are relative to it, and ``$NAME`` in them is filled in
             from the environment.
-
-    Returns:
-        The job.
 
     Raises:
         SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
@@ -265,9 +227,6 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
         table: The keys of a job file.
         where: Name of its source, for errors.
         folder: Folder that paths in it are relative to.
-
-    Returns:
-        The job.
 
     Raises:
         SettingsError: If a key or a value is wrong.

@@ -1,20 +1,27 @@
-"""The logs of a job: each file opened once, and read at once or in pieces."""
+"""The logs of a job: each opened once, examined, and told from others by what made them."""
 
 from collections.abc import Callable, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
+from robotid.doctor.diagnosis import alarming, diagnose
+from robotid.doctor.locked_joints import check_locked
 from robotid.exceptions import DataError
+from robotid.findings import Finding, by_severity
 from robotid.identification.survey import SurveyedLog, survey_log
 from robotid.logs.read import LogLayout
 from robotid.logs.table import Table
 from robotid.robot.model import RobotModel
+from robotid.versions import code_versions
 
-__all__ = ["survey_logs"]
+__all__ = ["checkpoint_inputs", "examine", "examine_logs", "survey_logs"]
 
 _PIECES = 8  # pieces that the rows in memory are cut into: smoothing a piece takes some room
 _SHORTEST = 256  # rows of a piece
+_NO_MATTER = ("validation", "estimator", "output", "doctor")  # to the reductions of the logs
 
 
 def survey_logs(
@@ -23,7 +30,7 @@ def survey_logs(
     *groups: Sequence[LogEntry],
     refuse: Callable[[LogEntry, DataError], None] | None = None,
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
-    """Return logs of a job ready to be read.
+    """Return the logs of each group of a job's, ready to be read.
 
     They are kept in memory if all their files together have no more rows than may be; files of
     formats that are only read whole count as nothing. Otherwise each is cut into pieces of a fixed
@@ -34,9 +41,6 @@ def survey_logs(
         model: The robot whose joints are read.
         groups: The logs: those to fit, those kept apart.
         refuse: Called with a log that cannot be used, and why; if None, the error is raised.
-
-    Returns:
-        The logs of each group.
 
     Raises:
         DataError: If a file cannot be used.
@@ -64,6 +68,84 @@ def survey_logs(
         return tuple(logs)
 
     return tuple(survey(entries) for entries in groups)
+
+
+def examine(job: Job) -> tuple[Finding, ...]:
+    """Examine the logs of a job; the findings have errors first.
+
+    Args:
+        job: The job. A log that cannot be read gives a finding, not an error.
+
+    Raises:
+        ModelError: If the URDF cannot be used.
+        SettingsError: If a setting does not fit, or a code to ignore is unknown.
+    """
+    alarming([], job.ignore)
+    model = job.model()
+    refused: list[Finding] = []
+
+    def refuse(entry: LogEntry, error: DataError) -> None:
+        refused.append(Finding(error.code, "error", entry.path.name, str(error)))
+
+    fitted, kept = survey_logs(job, model, job.identification, job.validation, refuse=refuse)
+    return by_severity([*refused, *examine_logs(job, model, fitted, kept)])
+
+
+def examine_logs(
+    job: Job, model: RobotModel, fitted: Sequence[SurveyedLog], kept: Sequence[SurveyedLog]
+) -> tuple[Finding, ...]:
+    """Examine surveyed logs: the joints that the job holds still, then the logs' windows.
+
+    Args:
+        job: The job.
+        model: Its robot.
+        fitted: Its logs to fit.
+        kept: Its logs kept apart.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
+    """
+    findings: list[Finding] = []
+    for log in (*fitted, *kept):
+        name = Path(log.path).name
+        findings += check_locked(model, log.held, name, job.locked)
+        if len(log.windows) > 1:  # the windows have no notes of their own
+            notes = log.head.notes
+            findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
+    first, second = ([look for log in logs for look in log.looks] for logs in (fitted, kept))
+    return (*findings, *diagnose(model, first, second, job.signals))
+
+
+def checkpoint_inputs(job: Job) -> dict[str, Any]:
+    """Return all that determines what the logs of a job come down to, as plain values.
+
+    A log is told from others by path, size and time of change: hashing it takes as long as reading.
+
+    Args:
+        job: The job.
+
+    Raises:
+        OSError: If a file does not exist.
+    """
+    settings = {key: value for key, value in job.to_dict().items() if key not in _NO_MATTER}
+    settings["reduction"] = {"rows_in_memory": job.rows_in_memory}
+    return {
+        "versions": code_versions(),
+        "settings": settings,
+        "urdf_sha256": file_sha256(job.urdf),
+        "logs": [_identity(entry.path) for entry in job.identification],
+    }
+
+
+def _identity(path: Path) -> dict[str, Any]:
+    """Return size [bytes] and time of change [ns] of a file, or of each file of a folder."""
+    whole = path.resolve()
+    files = sorted(p for p in whole.rglob("*") if p.is_file()) if whole.is_dir() else [whole]
+    found = {}
+    for file in files:
+        about = file.stat()
+        found[str(file)] = {"size": about.st_size, "changed": about.st_mtime_ns}
+    return found
 
 
 def _open(job: Job, model: RobotModel, path: Path) -> tuple[LogLayout, Table] | DataError:

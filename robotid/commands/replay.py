@@ -28,35 +28,24 @@ __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "st
 
 @dataclass(frozen=True)
 class Findings:
-    """What identifications and a tracker found, as read from their files.
+    """What identifications and a tracker found, as read from their files."""
 
-    Attributes:
-        results: Contents of result.json, by label.
-        track: Content of a track.json; None if there is none.
-        folder: Folder of the track.json, which its history is in.
-    """
-
-    results: Mapping[str, Mapping[str, Any]]
-    track: Mapping[str, Any] | None = None
-    folder: Path | None = None
+    results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
+    track: Mapping[str, Any] | None = None  # content of a track.json
+    folder: Path = Path()  # of the track.json, which its history is in
 
     @property
     def settings(self) -> Mapping[str, Any] | None:
         """The job that the first of them ran, None without any."""
-        for content in (*self.results.values(), self.track):
-            if content is not None:
-                return dict(content["settings"])
-        return None
+        found = [content for content in (*self.results.values(), self.track) if content]
+        return dict(found[0]["settings"]) if found else None
 
 
 def read_findings(paths: Sequence[str | Path]) -> Findings:
-    """Read results to show.
+    """Read results to show; a result is called by its folder.
 
     Args:
         paths: Each a result.json, a track.json, or a folder with one or both.
-
-    Returns:
-        What they hold; a result is called by its folder.
 
     Raises:
         DataError: If a file cannot be used, or there are two tracks.
@@ -80,7 +69,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             results[label] = read_result(file)
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
-    folder, content = tracks[0] if tracks else (None, None)
+    folder, content = tracks[0] if tracks else (Path(), None)
     return Findings(results, content, folder)
 
 
@@ -91,9 +80,6 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
         findings: At least one result or track.
         urdf: The URDF to show.
         log: The log to play.
-
-    Returns:
-        The job: it says which joints move and how logs are read.
 
     Raises:
         SettingsError: If the settings in the file cannot be used, or there is none.
@@ -107,15 +93,12 @@ def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
 
 
 def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = None) -> Replay:
-    """Return the replay of a log.
+    """Return the replay of a log: the page, to be written.
 
     Args:
         job: The robot, its one log, and how logs are read.
         findings: What to show beside it.
         ghost: A second log, of a designed or a simulated motion, to show as a ghost.
-
-    Returns:
-        The page.
 
     Raises:
         DataError: If a log or a result cannot be used.
@@ -138,7 +121,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         torques=torques,
         masses={"URDF": prior, **vectors} if vectors else None,
         ghost=second,
-        bands=None if findings.track is None else _bands(findings),
+        bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=[*_payloads(findings.track), *_contacts(torques, model)],
         notes=[f"Motion: {entry.path.name}."],
     )
@@ -211,19 +194,16 @@ def _sure(torque: Array, mask: Array) -> Array:
     return np.where(mask, torque, np.nan)
 
 
-def _bands(findings: Findings) -> Bands:
-    track, folder = findings.track, findings.folder
-    if track is None or folder is None:
-        raise DataError("there is no track to show")
+def _bands(track: Mapping[str, Any], folder: Path) -> Bands:
     table = open_table(folder / track["history"], LogSource())
     entries = track["base_parameters"]
     names = [entry["name"] for entry in entries]
-    wanted = ("time", *names, *(f"{name}.std_error" for name in names))
+    errors = [f"{name}.std_error" for name in names]
+    wanted = ["time", *names, *errors]
     missing = [name for name in wanted if name not in table.names]
     if missing:
         raise DataError(f"{track['history']} has no column {missing[0]!r}; track the log again")
-    errors = [f"{name}.std_error" for name in names]
-    columns = table.read(["time", *names, *errors])
+    columns = table.read(wanted)
     return Bands(
         t=columns["time"],
         names=names,

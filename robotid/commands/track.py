@@ -33,15 +33,12 @@ _RATE = 25.0  # [Hz] messages per second of the log
 def run_track(
     job: Job, folder: str | Path | None, *, observer: Observer | None = None
 ) -> dict[str, Any]:
-    """Track the one log of a job; write the history and track.json.
+    """Track the one log of a job, write the history and track.json, return what that holds.
 
     Args:
         job: The robot, the log and the signals' settings.
         folder: Where to write; made if it is missing. Nothing is written if None.
         observer: Called after each sample with its row of the log and the identifier.
-
-    Returns:
-        The content of track.json.
 
     Raises:
         DataError: If the log cannot be used.
@@ -84,6 +81,13 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
     model, mapping = identifier.model, identifier.mapping
     converged = np.flatnonzero(found.converged)
     last = identifier.reading
+    columns = {
+        "name": mapping.base_names,
+        "expression": mapping.expressions,
+        "value": last.theta.tolist(),
+        "std_error": last.std_error.tolist(),
+        "unit": [model.layout.units[i] for i in mapping.independent],
+    }
     return {
         "schema_version": _SCHEMA,
         "robotid": __version__,
@@ -101,21 +105,7 @@ def _summary(found: Track, job: Job, log: Log, history: str) -> dict[str, Any]:
         "excitation": last.excitation,
         "sigma": dict(zip(model.row_names, last.sigma.tolist(), strict=True)),
         "base_parameters": [
-            {
-                "name": name,
-                "expression": expression,
-                "value": float(value),
-                "std_error": float(error),
-                "unit": model.layout.units[i],
-            }
-            for name, expression, value, error, i in zip(
-                mapping.base_names,
-                mapping.expressions,
-                last.theta,
-                last.std_error,
-                mapping.independent,
-                strict=True,
-            )
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ],
         "changes": [_change(identifier, index) for index in range(len(identifier.changes))],
         "history": history,
@@ -146,7 +136,7 @@ def serve_track(
     finished: Callable[[dict[str, Any]], None] | None = None,
     linger: bool = True,
 ) -> dict[str, Any]:
-    """Track the one log of a job and show it in a live page as it goes.
+    """Track the one log of a job, show it in a live page as it goes, return as ``run_track``.
 
     Args:
         job: The robot, the log and the signals' settings.
@@ -156,9 +146,6 @@ def serve_track(
         announce: Called with the address of the page.
         finished: Called with the content of track.json when the log has ended.
         linger: Whether the page is served on after the end, until KeyboardInterrupt.
-
-    Returns:
-        The content of track.json.
 
     Raises:
         DataError: If the log cannot be used.

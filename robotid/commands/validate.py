@@ -1,6 +1,7 @@
 """Validation of a written result on other logs, and whether it shows a prediction."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
     (kept,) = survey_logs(job, model, entries)
     _, evaluations = evaluate_logs((), kept, parameters, prior)
-    fitted, missing = _fitted_logs(job, source, result)
-    verdict = _verdict(job, source, result, evaluations, kept, fitted, missing)
+    verdict = _verdict(job, source, result, evaluations, kept)
     return {
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
@@ -62,22 +62,15 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
 
 
 def _fitted_logs(
-    job: Job, model: RobotModel, result: Mapping[str, Any]
+    job: Job, model: RobotModel, hashes: Collection[str]
 ) -> tuple[list[Log], list[str]]:
     """Return the logs that were fitted, windows of long ones, and names of those that are gone."""
-    hashes = _hashes(result)
     is_there = [e.path.exists() and file_sha256(e.path) in hashes for e in job.identification]
     missing = [
         e.path.name for e, there in zip(job.identification, is_there, strict=True) if not there
     ]
-    entries = [e for e, there in zip(job.identification, is_there, strict=True) if there]
-    (surveyed,) = survey_logs(job, model, entries)
+    (surveyed,) = survey_logs(job, model, list(compress(job.identification, is_there)))
     return [look for log in surveyed for look in log.looks], missing
-
-
-def _hashes(result: Mapping[str, Any]) -> set[str]:
-    """Return the SHA-256 of the files that were fitted."""
-    return {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
 
 
 def _verdict(
@@ -86,22 +79,16 @@ def _verdict(
     result: Mapping[str, Any],
     evaluations: Sequence[Evaluation],
     kept: Sequence[SurveyedLog],
-    fitted: Sequence[Log],
-    missing: Sequence[str],
 ) -> Verdict:
     """Return the verdict on logs that may be fitted ones, faulty, or of a motion seen before."""
-    hashes = _hashes(result)
+    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    fitted, missing = _fitted_logs(job, model, hashes)
     again = [
         file_sha256(log.path) in hashes or any(_share(a, b) for a in log.looks for b in fitted)
         for log in kept
     ]
-    new = [e for e, is_refitted in zip(evaluations, again, strict=True) if not is_refitted]
-    looks = [
-        look
-        for log, refitted in zip(kept, again, strict=True)
-        if not refitted
-        for look in log.looks
-    ]
+    is_new = [not is_refitted for is_refitted in again]
+    looks = [look for log in compress(kept, is_new) for look in log.looks]
     names = list(dict.fromkeys(Path(log.path).name for log in looks))
     found = [
         finding
@@ -112,17 +99,13 @@ def _verdict(
     stated = result["verdict"]
     return judge(
         Metrics({}, 0.0),
-        {e.recording.name: e.metrics["estimate"] for e in new},
+        {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
         undetermined=result["structure"]["undetermined"],
         is_consistent=result["consistency"]["is_consistent"],
         joints=model.joints,
         alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
-        refitted=[
-            e.recording.name
-            for e, is_refitted in zip(evaluations, again, strict=True)
-            if is_refitted
-        ],
+        refitted=[e.recording.name for e in compress(evaluations, again)],
     )
 
 

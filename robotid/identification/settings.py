@@ -146,12 +146,12 @@ class EstimatorSettings(Settings):
     @property
     def words(self) -> str:
         """What the estimator is."""
-        return dict(self.keys())["name"].text
+        return self.paths()["name"].text
 
     @property
     def loss(self) -> str:
         """The loss of rows that fit badly, "none" if they count as the others."""
-        return "none"
+        return str(getattr(self, "robust", "none"))
 
     @property
     def is_robust(self) -> bool:
@@ -161,7 +161,7 @@ class EstimatorSettings(Settings):
     @property
     def bounds(self) -> ConstraintSettings:
         """The bounds beside physical consistency."""
-        return ConstraintSettings()
+        return ConstraintSettings(**getattr(self, "constraints", {}))
 
 
 def _called(name: str, words: str) -> Any:  # noqa: ANN401
@@ -173,10 +173,6 @@ class RobustSettings(EstimatorSettings):
     """Settings of estimators that can count rows less that fit badly."""
 
     robust: str = setting("none", "loss of rows that fit badly", among=("none", "huber", "tukey"))
-
-    @property
-    def loss(self) -> str:
-        return self.robust
 
 
 @dataclass(frozen=True, init=False)
@@ -215,10 +211,6 @@ class BoundedSettings(EstimatorSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         _ = self.bounds
-
-    @property
-    def bounds(self) -> ConstraintSettings:
-        return ConstraintSettings(**self.constraints)
 
 
 @dataclass(frozen=True, init=False)

@@ -10,8 +10,8 @@ from helpers.corruptions import CASES, NOISE, ROBOTS, clean_log, robot, table_of
 from helpers.synthetic import exact_log, truth
 
 from robotid.cli import main
-from robotid.commands.doctor import examine
 from robotid.commands.job import Job, LogEntry, read_job
+from robotid.commands.logs import examine
 from robotid.doctor.diagnosis import alarming, check_logs, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
+from robotid.commands.logs import examine
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import LogUnits

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.commands.doctor import examine
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry, job_from_settings, read_job
-from robotid.commands.logs import survey_logs
+from robotid.commands.logs import examine, survey_logs
 from robotid.commands.validate import validate_result
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.evaluation import evaluate_logs
