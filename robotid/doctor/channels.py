@@ -96,10 +96,8 @@ def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding
         return
     for limit in (float(x.max()), float(x.min())):
         at = (x == limit) & moving
-        share, plateau = (
-            float(at.mean()),
-            max((stop - start for start, stop in runs_of(at)), default=0),
-        )
+        share = float(at.mean())
+        plateau = max((stop - start for start, stop in runs_of(at)), default=0)
         if share < _CLIPPED or plateau < _PLATEAU or _steps(x) < _COARSE:
             continue
         message = (
@@ -175,16 +173,17 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
     if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
-    severity, what = (
-        "note",
-        "if the torque is as late, keep velocity = 'measured'; else differentiate",
+    is_late = abs(lag) >= _LATE
+    what = (
+        "velocity = 'auto' differentiates the position instead"
+        if is_late
+        else "if the torque is as late, keep velocity = 'measured'; else differentiate"
     )
-    if abs(lag) >= _LATE:
-        severity, what = "warning", "velocity = 'auto' differentiates the position instead"
     message = (
         f"the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late against d(q)/dt; "
         f"{what}, or state [signals] velocity_delay = {lag + stated:.4f}"
     )
+    severity = "warning" if is_late else "note"
     yield log_finding(log.name, "velocity_delay", severity, message, delay=lag, std_error=error)
 
 

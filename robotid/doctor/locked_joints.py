@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, log_finding
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_locked"]
@@ -39,6 +39,6 @@ def check_locked(
         else:
             what = f"stands at {middle:.4g} there"
             todo = f"state locked = {{ {joint} = {middle:.4g} }} (--lock {joint}={middle:.4g})"
-        message = f"{log}: {said}, but the log has its position, and it {what}; {todo}"
+        message = f"{said}, but the log has its position, and it {what}; {todo}"
         evidence = {"stated": stated, "median": middle, "range": reach}
-        yield Finding("locked_position", "error", f"{log}: {joint}", message, evidence)
+        yield log_finding(log, "locked_position", "error", message, joint, **evidence)

@@ -9,7 +9,7 @@ from robotid._typing import Array
 from robotid.estimators import WLS
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
-from robotid.findings import Finding
+from robotid.findings import Finding, log_finding
 from robotid.identification.prior import spread_of
 from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
@@ -58,10 +58,10 @@ def check_repeated_motion(
     if share < _SHARE:
         return
     message = (
-        f"{name}: {100 * share:.0f} % of this motion is in a fitted log, too: its score shows how "
-        "well the fit repeats itself, not how it predicts; record another motion to validate with"
+        f"{100 * share:.0f} % of this motion is in a fitted log, too: its score shows how well the "
+        "fit repeats itself, not how it predicts; record another motion to validate with"
     )
-    yield Finding("repeated_motion", "warning", name, message, {"share": share})
+    yield log_finding(name, "repeated_motion", "warning", message, share=share)
 
 
 def check_excitation(
@@ -90,31 +90,26 @@ def check_excitation(
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [_every(step, motion) for motion in motions]
     try:
-        factors = merge(
-            [
-                compress(base_problem(model, mapping, m, row_mask(model, m, signals.min_velocity)))
-                for m in thinned
-            ]
+        masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
+        problems = (
+            base_problem(model, mapping, *pair) for pair in zip(thinned, masks, strict=True)
         )
+        factors = merge([compress(problem) for problem in problems])
         found = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
-        message = f"{name}: which parameters the motion determines cannot be told: {error}"
-        yield Finding("excitation", "warning", name, message)
+        message = f"which parameters the motion determines cannot be told: {error}"
+        yield log_finding(name, "excitation", "warning", message)
         return
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
     squares = np.sum([motion.squares for motion in thinned], axis=0)
     spread = spread_of(model, squares, sum(len(motion.t) for motion in thinned))
     rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
     known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
-    evidence = {
-        "rank": float(known.rank),
-        "base": float(len(mapping.K)),
-        "weakest": float(known.shrinkage[-1]),
-    }
+    evidence = {"rank": known.rank, "base": len(mapping.K), "weakest": known.shrinkage[-1]}
     if np.isfinite(found.condition):
-        evidence["condition"] = float(found.condition)
+        evidence["condition"] = found.condition
     message = (
-        f"{name}: the motion determines {known.rank} of {len(mapping.K)} base parameters "
+        f"the motion determines {known.rank} of {len(mapping.K)} base parameters "
         f"(condition number {found.condition:.3g})"
     )
     is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
@@ -128,7 +123,7 @@ def check_excitation(
     else:
         message += "; nothing needs doing"
     severity = "warning" if known.groups and is_poor else "note"
-    yield Finding("excitation", severity, name, message, evidence)
+    yield log_finding(name, "excitation", severity, message, **evidence)
 
 
 def _every(step: int, motion: Trajectory) -> Trajectory:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, log_finding
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
@@ -135,19 +135,18 @@ def check_torque_delay(
     gain = misfit.gain()
     step = float(np.median(np.diff(motion.t)))
     late = abs(delay) > max(_LATE, _HELD * step, 3 * error) and gain > _HELPS
+    meaning = (
+        f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
+        "logger's clock, or"
+        if late
+        else ". Friction that the model lacks can look like this; if the drive filters its torque,"
+    )
     message = (
-        f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
-        + (
-            f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
-            f"logger's clock, or state [signals] torque_delay = {delay:.4f}"
-            if late
-            else ". Friction that the model lacks can look like this; if the drive filters its "
-            "torque, "
-            f"state [signals] torque_delay = {delay:.4f}"
-        )
+        f"the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
+        f"{meaning} state [signals] torque_delay = {delay:.4f}"
     )
     evidence = {"delay": delay, "std_error": error, "gain": gain}
-    yield Finding("torque_delay", "warning" if late else "note", name, message, evidence)
+    yield log_finding(name, "torque_delay", "warning" if late else "note", message, **evidence)
 
 
 def _misfit(model: RobotModel, motion: Trajectory, signals: SignalSettings) -> _Misfit | None:
