@@ -73,13 +73,10 @@ def check_rest(log: Log, motion: Trajectory, prismatic: Collection[str] = ()) ->
 
 
 def runs_of(flags: Array) -> list[tuple[int, int]]:
-    """Return where flags are true without a break.
+    """Return the first row, and the row after the last one, of each run of true flags.
 
     Args:
         flags: Shape (N,), bool.
-
-    Returns:
-        First row and row after the last one of each run.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]

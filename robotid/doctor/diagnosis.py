@@ -124,18 +124,11 @@ def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     Returns:
         {"findings": [{"code", "severity", "where", "message", "evidence"}]}.
     """
-    return {
-        "findings": [
-            {
-                "code": finding.code,
-                "severity": finding.severity,
-                "where": finding.where,
-                "message": finding.message,
-                "evidence": {key: float(value) for key, value in finding.evidence.items()},
-            }
-            for finding in findings
-        ]
-    }
+    plain = [
+        vars(finding) | {"evidence": {key: float(x) for key, x in finding.evidence.items()}}
+        for finding in findings
+    ]
+    return {"findings": plain}
 
 
 def _examine_log(

@@ -51,13 +51,10 @@ class LoadModel:
     independent: float
 
     def misfits(self, scales: Array) -> Array:
-        """Return how badly the torques fit when multiplied by some scales.
+        """Return how badly scaled torques fit: chi-squares, prior included, shape (T,).
 
         Args:
             scales: T times a factor of each torque column, shape (T, n).
-
-        Returns:
-            Chi-squares, prior included, shape (T,).
         """
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2

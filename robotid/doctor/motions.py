@@ -130,19 +130,10 @@ def _every(step: int, motion: Trajectory) -> Trajectory:
     """Return every so many rows of a motion."""
     if step == 1:
         return motion
-    rows = slice(None, None, step)
-    direction = None if motion.direction is None else motion.direction[rows]
-    return Trajectory(
-        t=motion.t[rows],
-        q=motion.q[rows],
-        v=motion.v[rows],
-        a=motion.a[rows],
-        tau=motion.tau[rows],
-        joints=motion.joints,
-        rate=None,
-        segment=motion.segment[rows],
-        direction=direction,
-    )
+    rows, m = slice(None, None, step), motion
+    direction = None if m.direction is None else m.direction[rows]
+    arrays = (m.t[rows], m.q[rows], m.v[rows], m.a[rows], m.tau[rows])
+    return Trajectory(*arrays, m.joints, None, m.segment[rows], direction=direction)
 
 
 def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:

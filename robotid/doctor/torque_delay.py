@@ -49,16 +49,10 @@ class _Misfit:
 
     squares: Array
 
-    @property
-    def without_a_block(self) -> list["_Misfit"]:
-        """The misfits of which one block of the log is left out in turn."""
-        blocks = self.squares.shape[1]
-        return [_Misfit(np.delete(self.squares, b, axis=1)) for b in range(blocks)]
-
-    @property
-    def without_a_joint(self) -> list["_Misfit"]:
-        """The misfits of which one joint is left out in turn."""
-        return [_Misfit(np.delete(self.squares, j, axis=0)) for j in range(len(self.squares))]
+    def delays_without(self, axis: int) -> list[float]:
+        """Return the delays if one joint (axis 0) or block of the log (1) is left out in turn."""
+        left_out = range(self.squares.shape[axis])
+        return [_Misfit(np.delete(self.squares, k, axis=axis)).delay() for k in left_out]
 
     def delay(self) -> float:
         """Return the delay that explains most [s], NaN if it is at an end of the grid."""
@@ -75,14 +69,14 @@ class _Misfit:
     def error(self) -> float:
         """Return the standard error of the delay [s]: jackknife over joints and over blocks."""
         variance = 0.0
-        for parts in (self.without_a_joint, self.without_a_block):
-            variance += (len(parts) - 1) * float(np.var([part.delay() for part in parts]))
+        for delays in (self.delays_without(0), self.delays_without(1)):
+            variance += (len(delays) - 1) * float(np.var(delays))
         return max(float(np.sqrt(variance)), _FINEST)
 
     def gain(self) -> float:
         """Return the share of what is unexplained that the delay of the other blocks explains."""
         joints, blocks, _ = self.squares.shape
-        delays = [part.delay() for part in self.without_a_block]
+        delays = self.delays_without(1)
         now, then = np.zeros(joints), np.zeros(joints)
         for j in range(joints):
             for b in range(blocks):

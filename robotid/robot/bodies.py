@@ -41,9 +41,6 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 
     Args:
         model: The robot.
-
-    Returns:
-        One place per link.
     """
     arriving = {joint.child: joint for joint in model.tree.joints}
     places = []

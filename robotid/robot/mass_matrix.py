@@ -57,18 +57,12 @@ def check_mass_matrix(
         What was found.
     """
     rng = np.random.default_rng(seed)
-    bounds = np.array(
-        [
-            (joint.lower, joint.upper)
-            if joint.has_limits
-            else ((-1.0, 1.0) if joint.type == "prismatic" else (-np.pi, np.pi))
-            for joint in model.limits
-        ]
-    )
-    q = rng.uniform(bounds[:, 0], bounds[:, 1], (poses, len(bounds)))
+    free = [1.0 if joint.type == "prismatic" else np.pi for joint in model.limits]
+    lower = [j.lower if j.has_limits else -x for j, x in zip(model.limits, free, strict=True)]
+    upper = [j.upper if j.has_limits else x for j, x in zip(model.limits, free, strict=True)]
+    q = rng.uniform(lower, upper, (poses, len(free)))
     if model.free_flyer:  # where the base is changes nothing
-        pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-        q = np.hstack([np.tile(pose, (poses, 1)), q])
+        q = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (poses, 1)), q])
     smallest = np.linalg.eigvalsh(joint_mass_matrices(model, pi, q))[:, 0]
     return MassMatrixCheck(poses, float(smallest.min()), float((smallest > 0).mean()))
 
@@ -128,13 +122,13 @@ def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
 
 
 def carried_inertia(model: RobotModel) -> Array:
-    """Return the inertia that each joint carries at the neutral posture.
+    """Return the inertia that each joint carries at the neutral posture, at least 0.
 
     Args:
         model: The robot.
 
     Returns:
-        Inertias, shape (n,), at least 0 [kg m^2, or kg].
+        Inertias, shape (n,) [kg m^2, or kg].
     """
     (M,) = rigid_mass_matrices(model, pin.neutral(model.pin_model)[None])
     return np.maximum(np.diag(M)[model.n_rows - len(model.joints) :], 0.0)

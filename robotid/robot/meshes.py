@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -60,14 +61,11 @@ class Shape:
 
 
 def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
-    """Return the shapes in a URDF.
+    """Return the shapes in a URDF, in the order of the file.
 
     Args:
         robot: The ``<robot>`` of the file.
         tag: Which of them: "visual" or "collision".
-
-    Returns:
-        The shapes, in the order of the file.
     """
     colours = {m.get("name"): _colour(m) for m in robot.findall("material")}
     found = []
@@ -139,7 +137,7 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
     for mesh in scene.dump():
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            rgba = _mesh_colour(mesh)
+            rgba = _mesh_colour(mesh.visual)
             surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
             by_colour.setdefault(rgba, []).append(surface)
     return tuple(_joined(surfaces) for surfaces in by_colour.values())
@@ -218,9 +216,8 @@ def _placement(origin: ET.Element | None) -> tuple[Array, bool]:
     return M, known
 
 
-def _mesh_colour(mesh: "object") -> tuple[float, ...] | None:
-    """Return the colour of a mesh of trimesh: of its material, or the mean of its corners."""
-    visual = mesh.visual  # type: ignore[attr-defined]
+def _mesh_colour(visual: Any) -> tuple[float, ...] | None:  # noqa: ANN401
+    """Return the colour of trimesh's visual: of its material, or the mean of its corners."""
     if visual.kind == "texture":
         colour = visual.material.main_color
     elif visual.kind in ("face", "vertex"):
