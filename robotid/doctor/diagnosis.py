@@ -59,19 +59,13 @@ def check_logs(
 def diagnose(
     model: RobotModel, fitted: Sequence[Log], kept: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Examine logs that were read.
+    """Examine logs that were read, as ``check_logs`` does.
 
     Args:
         model: The robot.
         fitted: Logs to fit, of the model's joints in its order.
         kept: Logs kept apart to validate with.
         signals: How the logs become trajectories.
-
-    Returns:
-        The findings, errors first.
-
-    Raises:
-        SettingsError: If a setting does not fit a log.
     """
     findings: list[Finding] = []
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
@@ -90,15 +84,12 @@ def diagnose(
 def alarming(
     findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
 ) -> tuple[Finding, ...]:
-    """Return the findings that make an identification wrong, but for those the user knows better.
+    """Return the errors that make an identification wrong, but for those the user knows better.
 
     Args:
         findings: What the doctor found.
         ignore: Codes of errors, or of what makes a result doubtful, that the user knows better.
         is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
-
-    Returns:
-        The errors that are not ignored.
 
     Raises:
         SettingsError: If a code to ignore is unknown.

@@ -225,8 +225,7 @@ def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:
     size = np.linalg.norm(X, axis=0)
     used = size > 1e-9 * size.max(initial=1e-300)
     R = np.asarray(np.linalg.qr(np.hstack([X[:, used] / size[used], tau]), mode="r"))
-    count = int(used.sum())
-    return R[:, :count], R[:, count:]
+    return R[:, : used.sum()], R[:, used.sum() :]
 
 
 def _nonnegative_misfit(R: Array, tau: Array) -> float:

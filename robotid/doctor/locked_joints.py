@@ -16,16 +16,13 @@ _STILL = 0.02  # [rad or m] a held joint may move, or stand elsewhere, by so muc
 def check_locked(
     model: RobotModel, positions: Mapping[str, Array], log: str, asked: Collection[str]
 ) -> Iterator[Finding]:
-    """Yield held joints that a log shows to move, or to stand elsewhere.
+    """Yield an error "locked_position" per held joint that a log shows to move or stand elsewhere.
 
     Args:
         model: The robot, whose locked joints are held.
         positions: The held joints' positions in the log by name, shape (N,) [rad or m].
         log: Name of the log.
         asked: Joints that the user asked to be locked.
-
-    Yields:
-        An error "locked_position" per joint.
     """
     for joint, q in positions.items():
         stated = model.locked[joint]

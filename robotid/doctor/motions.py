@@ -33,25 +33,19 @@ _LOST = "the motion is rich, but this hardly loads a joint and is lost in the no
 def check_repeated_motion(
     fitted: Sequence[Trajectory], kept: Trajectory, name: str
 ) -> Iterator[Finding]:
-    """Yield whether a validation log repeats motion that is fitted, whoever recorded it when.
+    """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted.
 
     Args:
         fitted: Smooth motions that are fitted.
         kept: Smooth motion that is kept apart.
         name: What its log is called.
-
-    Yields:
-        At most one warning "repeated_motion".
     """
     from scipy.spatial import cKDTree
 
     size = np.maximum(np.ptp(kept.q, axis=0), 1e-3)
     seen = _stretches(kept, size, _INSTANTS)
-    if len(seen) == 0:
-        return
     share = 0.0
-    for motion in fitted:
-        known = _stretches(motion, size, None)
+    for known in [_stretches(motion, size, None) for motion in fitted if len(seen)]:
         if len(known):
             distance, _ = cKDTree(known).query(seen, p=np.inf, distance_upper_bound=_NEAR)
             share = max(share, float(np.mean(np.isfinite(distance))))
@@ -71,10 +65,9 @@ def check_excitation(
     signals: SignalSettings,
     name: str,
 ) -> Iterator[Finding]:
-    """Yield which base parameters the fitted motions determine.
+    """Yield which base parameters the fitted motions determine, by ``determine``.
 
-    By ``determine``, as an identification does; of long logs a share of
-    the rows stands for all.
+    Of long logs a share of the rows stands for all.
 
     Args:
         model: The robot.

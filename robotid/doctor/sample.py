@@ -104,9 +104,6 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
         log: The log, of the model's joints in its order.
         settings: How the job smooths; what it says of velocities is not used.
 
-    Returns:
-        The trajectory.
-
     Raises:
         DataError: If the log is too short or an angle jumps.
         SettingsError: If a setting does not fit the log.
@@ -118,18 +115,14 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
 
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
-    """Return a probe of a motion.
+    """Return a probe of a motion, None if too little moves to judge anything by.
 
     Args:
         model: The robot, with a fixed base.
         motion: The smooth motion.
         samples: Number of instants, spread evenly over the rows at which something moves.
-
-    Returns:
-        The probe; None if too little moves to judge anything by.
     """
-    moving = (np.abs(motion.v) > _STILL).any(axis=1) & _inner(motion)
-    rows = np.flatnonzero(moving)
+    rows = np.flatnonzero((np.abs(motion.v) > _STILL).any(axis=1) & _inner(motion))
     if len(rows) < 50:
         return None
     chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))

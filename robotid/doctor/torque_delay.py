@@ -75,13 +75,12 @@ class _Misfit:
 
     def gain(self) -> float:
         """Return the share of what is unexplained that the delay of the other blocks explains."""
-        joints, blocks, _ = self.squares.shape
+        now, then = np.zeros((2, len(self.squares)))
         delays = self.delays_without(1)
-        now, then = np.zeros(joints), np.zeros(joints)
-        for j in range(joints):
-            for b in range(blocks):
-                now[j] += np.interp(0.0, _GRID, self.squares[j, b])
-                then[j] += np.interp(delays[b], _GRID, self.squares[j, b])
+        for j, squares in enumerate(self.squares):
+            for delay, block in zip(delays, squares, strict=True):
+                now[j] += np.interp(0.0, _GRID, block)
+                then[j] += np.interp(delay, _GRID, block)
         return float(1.0 - np.mean((then + _EXACT) / (now + _EXACT)))
 
 
@@ -105,7 +104,7 @@ class _Window:
 def check_torque_delay(
     model: RobotModel, motion: Trajectory, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
-    """Yield how late the torque is against the position.
+    """Yield at most one "torque_delay", how late the torque is against the position.
 
     The delay minimises what the regressor leaves of the delayed torque, rows near a change of
     direction apart; its uncertainty is the jackknife's over the joints and over stretches of the
@@ -116,9 +115,6 @@ def check_torque_delay(
         motion: The smooth motion.
         signals: How it was smoothed.
         name: What the log is called.
-
-    Yields:
-        At most one "torque_delay".
     """
     misfit = _misfit(model, motion, signals)
     if misfit is None:

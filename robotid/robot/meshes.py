@@ -82,7 +82,7 @@ def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
 
 
 def find_mesh(name: str, urdf: str | Path) -> Path | None:
-    """Return the file of a mesh.
+    """Return the file of a mesh, None if there is none.
 
     A path with ``package://`` or none is looked for in ROS_PACKAGE_PATH, in the URDF's folder and
     those above it, and in example-robot-data, with the name of its package and without it.
@@ -90,9 +90,6 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     Args:
         name: What the URDF calls it.
         urdf: The URDF file.
-
-    Returns:
-        Path of the file; None if there is none.
     """
     if name.startswith("file://"):
         path = Path(name.removeprefix("file://"))
@@ -147,14 +144,12 @@ def thin(surfaces: Sequence[Surface], most: int) -> list[Surface]:
     """Return surfaces with so few triangles together, edges kept sharp.
 
     Corners within a cell of a cube grid become one, at their mean; the cells grow until few
-    enough triangles are left, so no corner moves farther than the diagonal of a cell.
+    enough triangles are left, so no corner moves farther than the diagonal of a cell. Each side
+    of a sharp edge has a corner of its own.
 
     Args:
         surfaces: The surfaces of a robot, all in one scale.
         most: Triangles that may be left of all of them.
-
-    Returns:
-        The surfaces, in order, with a corner for each side of a sharp edge.
     """
     extents = [float(np.ptp(s.vertices, axis=0).max()) for s in surfaces if len(s.faces)]
     cell = _FIRST_CELL * max(extents, default=1.0)

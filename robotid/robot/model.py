@@ -218,10 +218,9 @@ class RobotModel:
         return configuration
 
     def support(self) -> Array:
-        """Return which parameters can load which row.
+        """Return which parameters can load which row, shape (n_rows, p), bool.
 
-        Returns:
-            Shape (n_rows, p), bool: False where the regressor is 0 for every motion.
+        False where the regressor is 0 for every motion.
         """
         nv = self.pin_model.nv
         carried = np.zeros((nv, self.layout.n_inertial), dtype=bool)

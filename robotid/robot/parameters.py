@@ -201,14 +201,9 @@ def to_paper_order(pi: Array) -> Array:
 
 
 def pseudo_inertia_basis() -> Array:
-    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k.
+    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k, shape (10, 4, 4).
 
-    Returns:
-        Basis, shape (10, 4, 4), in Pinocchio's parameter order.
-
-    References:
-        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
-        Inertial Parameter Identification, (8).
+    The parameters are in Pinocchio's order; see ``pseudo_inertia`` for the source.
     """
     basis = np.zeros((10, 4, 4))
     basis[0, 3, 3] = 1.0
@@ -250,9 +245,6 @@ def inertial_from_pseudo_inertia(J: Array) -> Array:
 
     Args:
         J: Pseudo-inertia, shape (4, 4).
-
-    Returns:
-        Inertial parameters in Pinocchio's order, shape (10,).
     """
     sigma = J[:3, :3]
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = np.trace(sigma) * np.eye(3) - sigma

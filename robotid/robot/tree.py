@@ -138,9 +138,6 @@ def read_tree(path: str | Path) -> Tree:
     Args:
         path: The URDF file. Meshes are not looked for.
 
-    Returns:
-        The tree.
-
     Raises:
         ModelError: If the file is missing, is no URDF, is no tree, has no movable joint, or if a
             number that the dynamics use is missing, not a number or not finite.
@@ -174,9 +171,6 @@ def parse_urdf(path: str | Path) -> ET.Element:
 
     Args:
         path: The URDF file.
-
-    Returns:
-        The element.
 
     Raises:
         ModelError: If the file is missing, or is no XML or another one.
