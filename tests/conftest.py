@@ -1,6 +1,9 @@
 import os
 from pathlib import Path
 
+# one thread of BLAS per process, before numpy loads it: the workers of pytest-xdist share the cores
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 from helpers.browsing import launch

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import LogSource
@@ -102,10 +103,10 @@ def _standard_names(
         raise DataError(f"{where} has {both}, several names of {twice[0]!r}; remove all but one")
     found = dict(pairs)
     if "time" not in found:
-        raise DataError(f"{where} has no column 'time'; columns found: {list(names)}. Rename it")
+        raise DataError(f"{where} has no column 'time'; columns found: {listed(names)}. Rename it")
     if not by_joint:
         raise DataError(
-            f"{where} has no column of a joint, as 'q_<joint>'; columns found: {list(names)}. "
+            f"{where} has no column of a joint, as 'q_<joint>'; columns found: {listed(names)}. "
             "Rename them"
         )
     return found, by_joint
