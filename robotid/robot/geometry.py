@@ -1,7 +1,6 @@
 """The extent of each body by the URDF's collision or visual geometry, for bounds on its mass."""
 
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -59,12 +58,7 @@ def body_points(model: RobotModel) -> dict[str, Array]:
         Points by name of the body, shape (k, 3) [m].
     """
     robot = model.tree.robot
-    shapes: dict[str, list[Shape]] = {}
-    for tag in ("visual", "collision"):
-        by_link: dict[str, list[Shape]] = defaultdict(list)
-        for shape in read_shapes(robot, tag):
-            by_link[shape.link].append(shape)
-        shapes |= by_link
+    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
     found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
     open_bodies = set()
     for place in link_places(model):
@@ -116,6 +110,13 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
     polar, turn = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
     A = np.column_stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
     return A, (A @ points.T).max(axis=1)
+
+
+def _by_link(shapes: Iterable[Shape]) -> dict[str, list[Shape]]:
+    by_link: dict[str, list[Shape]] = {}
+    for shape in shapes:
+        by_link.setdefault(shape.link, []).append(shape)
+    return by_link
 
 
 def _link_points(shapes: Sequence[Shape], urdf: Path) -> Array | None:
