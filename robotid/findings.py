@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Finding", "by_severity", "listed"]
+__all__ = ["Finding", "by_severity", "listed", "log_finding"]
 
 _RANK = {"error": 0, "warning": 1, "note": 2}
 
@@ -25,6 +25,27 @@ class Finding:
     where: str
     message: str
     evidence: Mapping[str, float] = field(default_factory=dict)
+
+
+def log_finding(
+    log: str, code: str, severity: str, message: str, part: str = "", /, **evidence: float
+) -> Finding:
+    """Return what was found in a log.
+
+    Args:
+        log: Name of the log, which the message is made to begin with.
+        code: A fixed word for programs.
+        severity: "note", "warning" or "error".
+        message: What was found, what was wanted, what to do.
+        part: Joint, link or channel that it is about; the whole log if empty.
+        evidence: The figures it rests on, by name.
+
+    Returns:
+        The finding.
+    """
+    where = f"{log}: {part}" if part else log
+    figures = {name: float(value) for name, value in evidence.items()}
+    return Finding(code, severity, where, f"{log}: {message}", figures)
 
 
 def listed(names: Iterable[object], limit: int | None = None) -> str:

@@ -6,19 +6,12 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.clock import runs_of
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import velocity_lag
 
-__all__ = [
-    "check_clipping",
-    "check_noise",
-    "check_quantisation",
-    "check_spikes",
-    "check_velocity_delay",
-    "check_velocity_order",
-    "check_velocity_scale",
-]
+__all__ = ["check_channels"]
 
 _COARSE = 100  # a channel of fewer steps than this over its range says little
 _PLATEAU = 5  # rows in a row at the very limit of a channel that are no coincidence
@@ -38,206 +31,170 @@ _SCALE = 1.1  # a velocity that is this many times d(q)/dt, or its inverse, is i
 _DEAD = 1e-3  # a velocity that moves by less than this share of d(q)/dt does not move
 
 
-def check_quantisation(log: Log) -> Iterator[Finding]:
-    """Yield channels that move in steps.
+def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
+    """Yield what the channels of a log show of their sensors.
 
     Args:
         log: The log.
+        signals: Where velocities come from, and the delay of measured ones that is corrected.
 
     Yields:
-        "quantised" per kind of channel: a warning for joints with few steps, else a note.
+        "quantised" per kind of channel: a warning for torques of few steps, else a note; warnings
+        "clipped" per joint and limit, or "constant_torque" per joint; "spikes" per channel: an
+        error where they are absurd and strong enough to ruin a fit; notes "noise" per kind of
+        channel and "noisy_torque" where noise prevails; of measured velocities an error
+        "velocity_order" for each that is the derivative of another joint's position, at most one
+        "velocity_delay", with the scatter over the joints as its uncertainty, and
+        "velocity_scale" per joint: an error where they are used, else a note.
     """
     for kind, values in _channels(log):
-        steps = np.array([_quantum(x) for x in values.T])
-        count = np.array([np.ptp(x) for x in values.T]) / np.where(steps > 0, steps, 1.0)
-        for few in (True, False):
-            chosen = np.flatnonzero((steps > 0) & ((count < _COARSE) == few))
-            if len(chosen) == 0:
-                continue
-            names = [log.joints[j] for j in chosen]
-            evidence = {f"steps_{log.joints[j]}": float(count[j]) for j in chosen}
-            message = (
-                f"{log.name}: {kind} of {listed(names)} moves in steps of "
-                f"{steps[chosen].max():.3g}, "
-                f"{count[chosen].min():.0f} of them over its range; "
-                + ("it is uninformative: scale or log it finer" if few else "log more digits")
-            )
-            severity = "warning" if few and kind == "tau" else "note"
-            yield Finding("quantised", severity, f"{log.name}: {kind}", message, evidence)
-
-
-def check_clipping(log: Log) -> Iterator[Finding]:
-    """Yield torques that stay at their largest value, or at one value throughout.
-
-    Args:
-        log: The log.
-
-    Yields:
-        A warning "clipped" per joint and limit, or "constant_torque" per joint.
-    """
+        yield from _quantisation(log, kind, values)
     moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
     for joint, x in zip(log.joints, log.tau.T, strict=True):
-        if moving.any() and np.ptp(x) == 0:
-            message = (
-                f"{log.name}: the torque of {joint} is {x[0] + 0.0:.6g} in every row while the "
-                "robot moves: the channel is dead, and nothing of this joint's drive can be "
-                f"identified; log tau_{joint}, or leave the joint out"
-            )
-            evidence = {"value": float(x[0]) + 0.0}
-            yield Finding("constant_torque", "warning", f"{log.name}: {joint}", message, evidence)
+        yield from _clipping(log, joint, x, moving)
+    for kind, values in _channels(log):
+        yield from _spikes(log, kind, values)
+    for kind, values in _channels(log):
+        yield from _noise(log, kind, values)
+    if log.v is not None:
+        slope, v = _slopes(log, log.v)
+        alike = _correlation(slope, v)  # (n, n): position j, velocity k
+        yield from _velocity_order(log, alike)
+        yield from _velocity_delay(log, signals.velocity_delay)
+        yield from _velocity_scale(log, slope, v, np.diag(alike), signals.velocity)
+
+
+def _quantisation(log: Log, kind: str, values: Array) -> Iterator[Finding]:
+    """Yield the joints whose channel moves in steps: those of few steps, and the others."""
+    steps = np.array([_quantum(x) for x in values.T])
+    count = np.ptp(values, axis=0) / np.where(steps > 0, steps, 1.0)
+    for few in (True, False):
+        chosen = np.flatnonzero((steps > 0) & ((count < _COARSE) == few))
+        if len(chosen) == 0:
             continue
-        for limit in (float(x.max()), float(x.min())):
-            at = (x == limit) & moving
-            plateau = max((stop - start for start, stop in runs_of(at)), default=0)
-            if at.mean() < _CLIPPED or plateau < _PLATEAU or _steps(x) < _COARSE:
-                continue
-            message = (
-                f"{log.name}: the torque of {joint} stays at its limit {limit:.6g} in "
-                f"{100 * at.mean():.3g} % of the rows while the robot moves: it is clipped, and "
-                "those rows are wrong; record a gentler motion or cut them out"
-            )
-            evidence = {"limit": limit, "share": float(at.mean())}
-            yield Finding("clipped", "warning", f"{log.name}: {joint}", message, evidence)
-
-
-def check_spikes(log: Log) -> Iterator[Finding]:
-    """Yield rows that jump away from both neighbours.
-
-    Args:
-        log: The log.
-
-    Yields:
-        "spikes" per channel: an error where they are absurd and strong enough to ruin a fit.
-    """
-    for kind, values in _channels(log):
-        reaches = [_reach(log.t, x) for x in values.T]
-        least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(reaches)))
-        for joint, x, own in zip(log.joints, values.T, reaches, strict=True):
-            reach = max(own, least)
-            rows, height = _spikes(log.t, x, reach)
-            if len(rows) == 0:
-                continue
-            energy = float(np.sum(height**2) / np.sum((x - np.median(x)) ** 2))
-            message = (
-                f"{log.name}: {kind} of {joint} jumps by up to {np.abs(height).max():.4g} for "
-                f"{len(rows)} rows, the first at t = {log.t[rows[0]]:.6g} s; remove these rows "
-                "from the recording"
-            )
-            evidence = {
-                "rows": len(rows),
-                "largest": float(np.abs(height).max()),
-                "energy_share": energy,
-                "first": float(log.t[rows[0]]),
-            }
-            absurd = evidence["largest"] > _ABSURD * reach and energy > _HARM
-            severity = "error" if absurd else "note"
-            yield Finding("spikes", severity, f"{log.name}: {kind}_{joint}", message, evidence)
-
-
-def check_noise(log: Log) -> Iterator[Finding]:
-    """Yield the noise level of every channel.
-
-    Args:
-        log: The log.
-
-    Yields:
-        A note "noise" per kind of channel, and a note "noisy_torque" where noise prevails.
-    """
-    for kind, values in _channels(log):
-        noise = np.array([_noise(log.t, x) for x in values.T])
-        size = values.std(axis=0)
-        share = np.divide(noise, size, out=np.zeros_like(noise), where=size > 0)
-        shown = ", ".join(f"{level:.2g}" for level in noise)
-        evidence = dict(zip(log.joints, noise.tolist(), strict=True))
+        names = [log.joints[j] for j in chosen]
+        evidence = {f"steps_{log.joints[j]}": count[j] for j in chosen}
+        todo = "it is uninformative: scale or log it finer" if few else "log more digits"
         message = (
-            f"{log.name}: white noise of {kind} {shown} (standard deviation per joint, in the "
-            "channel's unit); nothing needs doing"
+            f"{kind} of {listed(names)} moves in steps of {steps[chosen].max():.3g}, "
+            f"{count[chosen].min():.0f} of them over its range; {todo}"
         )
-        yield Finding("noise", "note", f"{log.name}: {kind}", message, evidence)
-        for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
-            message = (
-                f"{log.name}: the torque of {log.joints[j]} is {100 * share[j]:.0f} % noise; "
-                "record longer, faster, or with a lower cutoff"
-            )
-            where = f"{log.name}: {log.joints[j]}"
-            yield Finding("noisy_torque", "note", where, message, {"share": float(share[j])})
+        severity = "warning" if few and kind == "tau" else "note"
+        yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
 
 
-def check_velocity_delay(log: Log, stated: float = 0.0) -> Iterator[Finding]:
-    """Yield how late the measured velocity is against the position.
-
-    Args:
-        log: The log.
-        stated: The delay that is known and corrected [s].
-
-    Yields:
-        At most one "velocity_delay", with the scatter over the joints as its uncertainty.
-    """
-    if log.v is None:
+def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding]:
+    """Yield whether a torque stays at a limit, or at one value, in rows where the robot moves."""
+    if moving.any() and np.ptp(x) == 0:
+        value = float(x[0]) + 0.0  # no -0
+        message = (
+            f"the torque of {joint} is {value:.6g} in every row while the robot moves: the channel "
+            "is dead, and nothing of this joint's drive can be identified; log "
+            f"tau_{joint}, or leave the joint out"
+        )
+        yield log_finding(log.name, "constant_torque", "warning", message, joint, value=value)
         return
+    for limit in (float(x.max()), float(x.min())):
+        at = (x == limit) & moving
+        share = float(at.mean())
+        plateau = max((stop - start for start, stop in runs_of(at)), default=0)
+        if share < _CLIPPED or plateau < _PLATEAU or _steps(x) < _COARSE:
+            continue
+        message = (
+            f"the torque of {joint} stays at its limit {limit:.6g} in {100 * share:.3g} % of the "
+            "rows while the robot moves: it is clipped, and those rows are wrong; record a gentler "
+            "motion or cut them out"
+        )
+        yield log_finding(log.name, "clipped", "warning", message, joint, limit=limit, share=share)
+
+
+def _spikes(log: Log, kind: str, values: Array) -> Iterator[Finding]:
+    """Yield rows that jump away from both neighbours."""
+    reaches = [_reach(log.t, x) for x in values.T]
+    least = _LEAST.get(kind, _LEAST_TORQUE * float(np.median(reaches)))
+    for joint, x, own in zip(log.joints, values.T, reaches, strict=True):
+        reach = max(own, least)
+        rows, height = _jumps(log.t, x, reach)
+        if len(rows) == 0:
+            continue
+        largest, first = np.abs(height).max(), log.t[rows[0]]
+        energy = np.sum(height**2) / np.sum((x - np.median(x)) ** 2)
+        message = (
+            f"{kind} of {joint} jumps by up to {largest:.4g} for {len(rows)} rows, the first at "
+            f"t = {first:.6g} s; remove these rows from the recording"
+        )
+        severity = "error" if largest > _ABSURD * reach and energy > _HARM else "note"
+        evidence = {"rows": len(rows), "largest": largest, "energy_share": energy, "first": first}
+        yield log_finding(log.name, "spikes", severity, message, f"{kind}_{joint}", **evidence)
+
+
+def _noise(log: Log, kind: str, values: Array) -> Iterator[Finding]:
+    """Yield the noise level of a kind of channel, and torques in which it prevails."""
+    noise = np.array([_white_noise(log.t, x) for x in values.T])
+    size = values.std(axis=0)
+    share = np.divide(noise, size, out=np.zeros_like(noise), where=size > 0)
+    message = (
+        f"white noise of {kind} {', '.join(f'{level:.2g}' for level in noise)} (standard deviation "
+        "per joint, in the channel's unit); nothing needs doing"
+    )
+    evidence = dict(zip(log.joints, noise.tolist(), strict=True))
+    yield log_finding(log.name, "noise", "note", message, kind, **evidence)
+    for j in np.flatnonzero(share > _NOISY) if kind == "tau" else ():
+        joint = log.joints[j]
+        message = (
+            f"the torque of {joint} is {100 * share[j]:.0f} % noise; record longer, faster, or "
+            "with a lower cutoff"
+        )
+        yield log_finding(log.name, "noisy_torque", "note", message, joint, share=share[j])
+
+
+def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
+    """Yield joints whose measured velocity is the derivative of another joint's position."""
+    for j, joint in enumerate(log.joints):
+        k = int(np.argmax(alike[j]))
+        found, own = alike[j, k], alike[j, j]
+        if k == j or found < _ALIKE or own > 0.5 * found:
+            continue
+        message = (
+            f"dq_{log.joints[k]} is d(q)/dt of q_{joint} (correlation {found:.2f}; with dq_{joint} "
+            f"{own:.2f}): position or velocity columns are in another order; name them rightly"
+        )
+        evidence = {"correlation": found, "own_correlation": own}
+        yield log_finding(log.name, "velocity_order", "error", message, joint, **evidence)
+
+
+def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
+    """Yield how late the measured velocity is against the position, beyond what is stated [s]."""
     lag = velocity_lag(log) - stated
     single = [velocity_lag(log.select([joint])) for joint in log.joints]
     used = np.array([x for x in single if x != 0.0]) - stated
     scatter = float(np.median(np.abs(used - lag))) * 1.48 if len(used) else 0.0
-    error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * float(np.median(np.diff(log.t))))
-    if abs(lag) < max(_LAG, 3 * error, 0.1 * float(np.median(np.diff(log.t)))):
+    step = float(np.median(np.diff(log.t)))
+    error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
+    if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
-    severity = "warning" if abs(lag) >= _LATE else "note"
+    is_late = abs(lag) >= _LATE
     what = (
         "velocity = 'auto' differentiates the position instead"
-        if abs(lag) >= _LATE
+        if is_late
         else "if the torque is as late, keep velocity = 'measured'; else differentiate"
     )
     message = (
-        f"{log.name}: the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late "
-        f"against d(q)/dt; {what}, or state [signals] velocity_delay = {lag + stated:.4f}"
+        f"the measured velocity is {1e3 * lag:.1f} +- {1e3 * error:.1f} ms late against d(q)/dt; "
+        f"{what}, or state [signals] velocity_delay = {lag + stated:.4f}"
     )
-    evidence = {"delay": lag, "std_error": error}
-    yield Finding("velocity_delay", severity, log.name, message, evidence)
+    severity = "warning" if is_late else "note"
+    yield log_finding(log.name, "velocity_delay", severity, message, delay=lag, std_error=error)
 
 
-def check_velocity_order(log: Log) -> Iterator[Finding]:
-    """Yield joints whose measured velocity is the derivative of another joint's position.
-
-    Args:
-        log: The log.
-
-    Yields:
-        An error "velocity_order" for each pair of joints that are exchanged.
-    """
-    if log.v is None:
-        return
-    alike = _correlation(*_slopes(log, log.v))  # (n, n): position j, velocity k
-    for j, joint in enumerate(log.joints):
-        k = int(np.argmax(alike[j]))
-        if k == j or alike[j, k] < _ALIKE or alike[j, j] > 0.5 * alike[j, k]:
-            continue
-        message = (
-            f"{log.name}: dq_{log.joints[k]} is d(q)/dt of q_{joint} (correlation "
-            f"{alike[j, k]:.2f}; with dq_{joint} {alike[j, j]:.2f}): position or velocity columns "
-            "are in another order; name them rightly"
-        )
-        evidence = {"correlation": float(alike[j, k]), "own_correlation": float(alike[j, j])}
-        yield Finding("velocity_order", "error", f"{log.name}: {joint}", message, evidence)
-
-
-def check_velocity_scale(log: Log, velocity: str) -> Iterator[Finding]:
+def _velocity_scale(
+    log: Log, slope: Array, v: Array, alike: Array, velocity: str
+) -> Iterator[Finding]:
     """Yield measured velocities that are a multiple of d(q)/dt, or none.
 
     The factor lies between the regression of one on the other and the inverse of the regression
     of the other on the one, whatever the noise of both.
-
-    Args:
-        log: The log.
-        velocity: Setting of where velocities come from; if "differentiated" these are not used.
-
-    Yields:
-        "velocity_scale" per joint: an error where they are used, else a note.
     """
-    if log.v is None:
-        return
-    slope, v = _slopes(log, log.v)
-    alike = np.diag(_correlation(slope, v))
     slope, v = slope - slope.mean(axis=0), v - v.mean(axis=0)
     for j, joint in enumerate(log.joints):
         a, b, ab = slope[:, j] @ slope[:, j], v[:, j] @ v[:, j], slope[:, j] @ v[:, j]
@@ -249,13 +206,12 @@ def check_velocity_scale(log: Log, velocity: str) -> Iterator[Finding]:
         factor = 0.0 if is_dead else float(np.sqrt(b / a))
         what = "hardly changes while the position moves" if is_dead else "is in another unit"
         message = (
-            f"{log.name}: dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured "
-            f"velocity {what}, and every friction and inertia with it; correct the column, or set "
-            "[signals] velocity = 'differentiated'"
+            f"dq_{joint} is {factor:.3g} times d(q)/dt of q_{joint}: the measured velocity {what}, "
+            "and every friction and inertia with it; correct the column, or set [signals] velocity "
+            "= 'differentiated'"
         )
         severity = "note" if velocity == "differentiated" else "error"
-        where = f"{log.name}: {joint}"
-        yield Finding("velocity_scale", severity, where, message, {"factor": factor})
+        yield log_finding(log.name, "velocity_scale", severity, message, joint, factor=factor)
 
 
 def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
@@ -292,10 +248,10 @@ def _steps(x: Array) -> float:
     return float(np.ptp(x)) / quantum if quantum > 0 else float("inf")
 
 
-def _spikes(t: Array, x: Array, reach: float) -> tuple[Array, Array]:
+def _jumps(t: Array, x: Array, reach: float) -> tuple[Array, Array]:
     """Return the rows that jump away from their neighbours, and how far."""
     off = x - _without_spikes(x)
-    usual = max(1.48 * float(np.median(np.abs(off))), _noise(t, x))
+    usual = max(1.48 * float(np.median(np.abs(off))), _white_noise(t, x))
     rows = np.flatnonzero(np.abs(off) > max(_SPIKE * usual, _BEYOND * reach))
     return rows, off[rows]
 
@@ -307,7 +263,7 @@ def _reach(t: Array, x: Array) -> float:
     """
     usual = np.median(x)
     away = np.abs(_without_spikes(x) - usual)
-    away = away[away > _RESTING * _noise(t, x)]
+    away = away[away > _RESTING * _white_noise(t, x)]
     ever = np.abs(x - usual)
     return max(float(np.quantile(part, 0.995)) for part in (ever, away) if len(part))
 
@@ -319,7 +275,7 @@ def _without_spikes(x: Array) -> Array:
     return smooth
 
 
-def _noise(t: Array, x: Array) -> float:
+def _white_noise(t: Array, x: Array) -> float:
     """Return the white noise of a smooth signal, from its third divided differences."""
     if len(x) < 10:
         return 0.0

@@ -5,17 +5,10 @@ from collections.abc import Collection, Iterator
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
-from robotid.logs.data import Log
+from robotid.findings import Finding, log_finding
+from robotid.logs.data import Log, Trajectory
 
-__all__ = [
-    "check_clock",
-    "check_gaps",
-    "check_stale_rows",
-    "check_standstill",
-    "check_static",
-    "runs_of",
-]
+__all__ = ["check_clock", "check_rest", "runs_of"]
 
 _JITTER = 0.05  # spread of the steps over their median from which jitter is reported
 _GAP = 2.5  # a step longer than this many median steps is a gap
@@ -30,74 +23,107 @@ _MOVING = 0.1  # share of the log below which a joint's motion is thin
 
 
 def check_clock(log: Log) -> Iterator[Finding]:
-    """Yield the rate of a log and how its time stamps jitter.
+    """Yield what a log's time stamps and rows show of its logger.
 
     Args:
         log: The log.
 
     Yields:
-        Notes "rate" and "jitter".
+        Notes "rate" and "jitter"; at most one "gap", a warning if one is long, and one
+        "stale_rows", of rows that repeat the one before in every channel.
     """
     step = np.diff(log.t)
     median = float(np.median(step))
+    yield from _rate(log, step, median)
+    yield from _gaps(log, step, median)
+    yield from _stale_rows(log, step)
+
+
+def check_rest(log: Log, motion: Trajectory, prismatic: Collection[str] = ()) -> Iterator[Finding]:
+    """Yield how long the robot rests at the ends of a log, and joints that do not move, or hardly.
+
+    Args:
+        log: The log.
+        motion: Its smooth motion, positions without full turns.
+        prismatic: Names of the joints that slide.
+
+    Yields:
+        At most one note "standstill"; a warning "static_joint" or a note "hardly_moves" per joint.
+    """
+    speed = np.abs(motion.v)
+    yield from _standstill(log, motion.t[(speed > _STILL).any(axis=1)])
+    for j, joint in enumerate(log.joints):
+        reach = float(np.ptp(motion.q[:, j]))
+        share = float(np.mean(speed[:, j] > _STILL))
+        if reach < _STATIC:
+            code, severity = "static_joint", "warning"
+            message = (
+                f"{joint} stands still (range {reach:.2g}): its friction, its inertia and much of "
+                "what it carries cannot be identified from this log; move it, or lock it"
+            )
+        elif reach < (_HARDLY_SLIDES if joint in prismatic else _HARDLY) or share < _MOVING:
+            code, severity = "hardly_moves", "note"
+            message = (
+                f"{joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} % of the "
+                "time): what it alone excites is poorly known; move it farther and longer"
+            )
+        else:
+            continue
+        yield log_finding(log.name, code, severity, message, joint, range=reach, moving_share=share)
+
+
+def runs_of(flags: Array) -> list[tuple[int, int]]:
+    """Return the first row, and the row after the last one, of each run of true flags.
+
+    Args:
+        flags: Shape (N,), bool.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+
+
+def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
+    """Yield the rate of a log and how its time stamps jitter."""
+    rate, duration = 1 / median, float(log.t[-1] - log.t[0])
+    message = (
+        f"{len(log.t)} rows in {duration:.4g} s, {rate:.4g} Hz in the median; nothing needs doing"
+    )
+    yield log_finding(
+        log.name, "rate", "note", message, rate=rate, samples=len(log.t), duration=duration
+    )
     usual = step[step < _GAP * median]
     spread = float(np.std(usual)) / median
-    name = log.name
-    evidence = {"rate": 1 / median, "samples": len(log.t), "duration": float(log.t[-1] - log.t[0])}
-    message = (
-        f"{name}: {len(log.t)} rows in {evidence['duration']:.4g} s, {1 / median:.4g} Hz in the "
-        "median; nothing needs doing"
-    )
-    yield Finding("rate", "note", name, message, evidence)
     if spread > _JITTER:
         low, high = 1e3 * float(step.min()), 1e3 * float(usual.max())
         message = (
-            f"{name}: steps jitter from {low:.3g} to {high:.3g} ms about {1e3 * median:.3g} ms "
-            f"(standard deviation {100 * spread:.2g} %); use the time column as it is, never row "
-            "number / rate; robotid does"
+            f"steps jitter from {low:.3g} to {high:.3g} ms about {1e3 * median:.3g} ms (standard "
+            f"deviation {100 * spread:.2g} %); use the time column as it is, never row number / "
+            "rate; robotid does"
         )
         evidence = {"relative_spread": spread, "shortest": low / 1e3, "longest": high / 1e3}
-        yield Finding("jitter", "note", name, message, evidence)
+        yield log_finding(log.name, "jitter", "note", message, **evidence)
 
 
-def check_gaps(log: Log) -> Iterator[Finding]:
-    """Yield the gaps of a log.
-
-    Args:
-        log: The log.
-
-    Yields:
-        At most one "gap": a warning, or a note if every gap is short.
-    """
-    step = np.diff(log.t)
-    median = float(np.median(step))
+def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
     if len(gaps) == 0:
         return
-    longest = int(gaps[np.argmax(step[gaps])])
-    severity = "warning" if step[longest] > max(_LONG, _GAP * median) else "note"
+    at = int(gaps[np.argmax(step[gaps])])
+    longest, start = float(step[at]), float(log.t[at])
+    severity = "warning" if longest > max(_LONG, _GAP * median) else "note"
     message = (
-        f"{log.name}: {len(gaps)} gaps, the longest of {step[longest]:.3g} s at t = "
-        f"{log.t[longest]:.6g} s; nothing is filtered or differentiated across long ones, and the "
-        "rows beside them are lost: record without interruption if you can"
+        f"{len(gaps)} gaps, the longest of {longest:.3g} s at t = {start:.6g} s; nothing is "
+        "filtered or differentiated across long ones, and the rows beside them are lost: record "
+        "without interruption if you can"
     )
-    evidence = {"gaps": len(gaps), "longest": float(step[longest]), "at": float(log.t[longest])}
-    yield Finding("gap", severity, log.name, message, evidence)
+    yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
 
 
-def check_stale_rows(log: Log) -> Iterator[Finding]:
-    """Yield rows that repeat the one before in every channel.
-
-    Args:
-        log: The log.
-
-    Yields:
-        At most one "stale_rows".
-    """
+def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:
     channels = np.hstack([x for x in (log.q, log.v, log.tau) if x is not None])
     same = (np.diff(channels, axis=0) == 0).all(axis=1)
     # where nothing moves on a coarse grid, rows repeat rightly: a repeated row must be passed by
-    speed = np.abs(np.diff(log.q, axis=0)).max(axis=1) / np.diff(log.t)
+    speed = np.abs(np.diff(log.q, axis=0)).max(axis=1) / step
     passing = np.zeros(len(same), dtype=bool)
     passing[1:-1] = (speed[:-2] > _STILL) | (speed[2:] > _STILL)
     runs = runs_of(same)
@@ -106,86 +132,26 @@ def check_stale_rows(log: Log) -> Iterator[Finding]:
         return
     share = stale / len(log.t)
     message = (
-        f"{log.name}: {stale} rows ({100 * share:.2g} %) repeat the row before in every channel "
-        "while the robot moves: the logger ran faster than the robot's state; log each state "
-        "once, with its own time stamp"
+        f"{stale} rows ({100 * share:.2g} %) repeat the row before in every channel while the "
+        "robot moves: the logger ran faster than the robot's state; log each state once, with its "
+        "own time stamp"
     )
-    evidence = {"rows": stale, "share": share, "longest_run": max(e - s for s, e in runs)}
-    severity = "warning" if share > _STALE else "note"
-    yield Finding("stale_rows", severity, log.name, message, evidence)
+    severity, longest = "warning" if share > _STALE else "note", max(e - s for s, e in runs)
+    yield log_finding(
+        log.name, "stale_rows", severity, message, rows=stale, share=share, longest_run=longest
+    )
 
 
-def check_standstill(log: Log, motion_t: Array, motion_v: Array) -> Iterator[Finding]:
-    """Yield how long the whole robot rests at the ends of a log.
-
-    Args:
-        log: The log.
-        motion_t: Time stamps of the smooth motion, shape (N,) [s].
-        motion_v: Its velocities, shape (N, n) [rad/s or m/s].
-
-    Yields:
-        At most one note "standstill".
-    """
-    moving = np.flatnonzero((np.abs(motion_v) > _STILL).any(axis=1))
+def _standstill(log: Log, moving: Array) -> Iterator[Finding]:
+    """Yield how long the robot rests at the ends of a log, by the times at which it moves."""
     if len(moving) == 0:
         return
-    before = float(motion_t[moving[0]] - log.t[0])
-    after = float(log.t[-1] - motion_t[moving[-1]])
+    before, after = float(moving[0] - log.t[0]), float(log.t[-1] - moving[-1])
     if max(before, after) < _REST:
         return
     message = (
-        f"{log.name}: the robot rests for the first {before:.3g} s and the last {after:.3g} s; "
-        "rows of resting joints are left out where friction is identified; cut them with start "
-        f"= {motion_t[moving[0]]:.4g} and end = {motion_t[moving[-1]]:.4g}"
+        f"the robot rests for the first {before:.3g} s and the last {after:.3g} s; rows of resting "
+        "joints are left out where friction is identified; cut them with start = "
+        f"{moving[0]:.4g} and end = {moving[-1]:.4g}"
     )
-    yield Finding("standstill", "note", log.name, message, {"before": before, "after": after})
-
-
-def check_static(
-    log: Log, motion_q: Array, motion_v: Array, prismatic: Collection[str] = ()
-) -> Iterator[Finding]:
-    """Yield joints that do not move, or hardly.
-
-    Args:
-        log: The log.
-        motion_q: Smooth positions without full turns, shape (N, n) [rad or m].
-        motion_v: Their velocities, shape (N, n) [rad/s or m/s].
-        prismatic: Names of the joints that slide.
-
-    Yields:
-        A warning "static_joint", or a note "hardly_moves", per joint.
-    """
-    for j, joint in enumerate(log.joints):
-        reach = float(np.ptp(motion_q[:, j]))
-        share = float(np.mean(np.abs(motion_v[:, j]) > _STILL))
-        evidence = {"range": reach, "moving_share": share}
-        if reach < _STATIC:
-            message = (
-                f"{log.name}: {joint} stands still (range {reach:.2g}): its friction, its "
-                "inertia and much of what it carries cannot be identified from this log; move it, "
-                "or lock it"
-            )
-            yield Finding("static_joint", "warning", _at(log, joint), message, evidence)
-        elif reach < (_HARDLY_SLIDES if joint in prismatic else _HARDLY) or share < _MOVING:
-            message = (
-                f"{log.name}: {joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} "
-                "% of the time): what it alone excites is poorly known; move it farther and longer"
-            )
-            yield Finding("hardly_moves", "note", _at(log, joint), message, evidence)
-
-
-def runs_of(flags: Array) -> list[tuple[int, int]]:
-    """Return where flags are true without a break.
-
-    Args:
-        flags: Shape (N,), bool.
-
-    Returns:
-        First row and row after the last one of each run.
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
-
-
-def _at(log: Log, joint: str) -> str:
-    return f"{log.name}: {joint}"
+    yield log_finding(log.name, "standstill", "note", message, before=before, after=after)

@@ -8,28 +8,14 @@ import difflib
 from collections.abc import Sequence
 from typing import Any
 
-from robotid.doctor.channels import (
-    check_clipping,
-    check_noise,
-    check_quantisation,
-    check_spikes,
-    check_velocity_delay,
-    check_velocity_order,
-    check_velocity_scale,
-)
-from robotid.doctor.clock import (
-    check_clock,
-    check_gaps,
-    check_stale_rows,
-    check_standstill,
-    check_static,
-)
+from robotid.doctor.channels import check_channels
+from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
 from robotid.exceptions import DataError, SettingsError
-from robotid.findings import Finding, by_severity, listed
+from robotid.findings import Finding, by_severity, listed, log_finding
 from robotid.identification.verdict import DOUBTFUL, is_outvoted
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
@@ -73,19 +59,13 @@ def check_logs(
 def diagnose(
     model: RobotModel, fitted: Sequence[Log], kept: Sequence[Log], signals: SignalSettings
 ) -> tuple[Finding, ...]:
-    """Examine logs that were read.
+    """Examine logs that were read, as ``check_logs`` does.
 
     Args:
         model: The robot.
         fitted: Logs to fit, of the model's joints in its order.
         kept: Logs kept apart to validate with.
         signals: How the logs become trajectories.
-
-    Returns:
-        The findings, errors first.
-
-    Raises:
-        SettingsError: If a setting does not fit a log.
     """
     findings: list[Finding] = []
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
@@ -104,15 +84,12 @@ def diagnose(
 def alarming(
     findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
 ) -> tuple[Finding, ...]:
-    """Return the findings that make an identification wrong, but for those the user knows better.
+    """Return the errors that make an identification wrong, but for those the user knows better.
 
     Args:
         findings: What the doctor found.
         ignore: Codes of errors, or of what makes a result doubtful, that the user knows better.
         is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
-
-    Returns:
-        The errors that are not ignored.
 
     Raises:
         SettingsError: If a code to ignore is unknown.
@@ -138,18 +115,11 @@ def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     Returns:
         {"findings": [{"code", "severity", "where", "message", "evidence"}]}.
     """
-    return {
-        "findings": [
-            {
-                "code": finding.code,
-                "severity": finding.severity,
-                "where": finding.where,
-                "message": finding.message,
-                "evidence": {key: float(value) for key, value in finding.evidence.items()},
-            }
-            for finding in findings
-        ]
-    }
+    plain = [
+        vars(finding) | {"evidence": {key: float(x) for key, x in finding.evidence.items()}}
+        for finding in findings
+    ]
+    return {"findings": plain}
 
 
 def _examine_log(
@@ -157,28 +127,22 @@ def _examine_log(
 ) -> tuple[Trajectory | None, Probe | None]:
     """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
     name = log.name
-    findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in log.notes]
-    for check in (check_clock, check_gaps, check_stale_rows, check_quantisation, check_clipping):
-        findings += check(log)
-    for check in (check_spikes, check_noise, check_velocity_order):
-        findings += check(log)
-    findings += check_velocity_delay(log, signals.velocity_delay)
-    findings += check_velocity_scale(log, signals.velocity)
+    findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
+    findings += [*check_clock(log), *check_channels(log, signals)]
     if model.free_flyer:
-        message = f"{name}: torques of a robot with a floating base are not judged"
-        findings.append(Finding("floating_base", "note", name, message))
+        message = "torques of a robot with a floating base are not judged"
+        findings.append(log_finding(name, "floating_base", "note", message))
         return None, None
     try:
         motion = smooth_motion(model, log, signals)
     except DataError as error:
         findings.append(Finding(error.code, "error", name, str(error)))
         return None, None
-    findings += check_standstill(log, motion.t, motion.v)
-    findings += check_static(log, motion.q, motion.v, model.layout.prismatic)
+    findings += check_rest(log, motion, model.layout.prismatic)
     probe = take_probe(model, motion)
     if probe is None:
-        message = f"{name}: too little moves to judge torques by; record motion of every joint"
-        findings.append(Finding("no_motion", "warning", name, message))
+        message = "too little moves to judge torques by; record motion of every joint"
+        findings.append(log_finding(name, "no_motion", "warning", message))
         return motion, None
     torques = list(check_torques(probe, name))
     findings += torques

@@ -5,7 +5,7 @@ by the URDF, of the inertia and the frictions of its drive, and of a constant. M
 by any factor; signs, columns, gravity and positions may not.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -127,19 +127,14 @@ def _gravity(probe: Probe) -> Explanation:
     _, _, frame = np.linalg.svd(start.reshape(1, 3))
     across = frame[1:]
 
-    def tilted(x: Array) -> Array:
+    def tilted(x: Array) -> Explanation:
         g = start + size * x @ across
-        turned: Array = size * g / np.linalg.norm(g)
-        return turned
+        return explained(size * g / np.linalg.norm(g))
 
-    found = minimize(
-        lambda x: explained(tilted(x)).misfit, np.zeros(2), method="Nelder-Mead",
-        options={
-            "initial_simplex": [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]],
-            "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60,
-        },
-    )  # fmt: skip
-    return explained(tilted(found.x))
+    simplex = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
+    options = {"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-2, "maxfev": 60}
+    found = minimize(lambda x: tilted(x).misfit, np.zeros(2), method="Nelder-Mead", options=options)
+    return tilted(found.x)
 
 
 def _positions(probe: Probe) -> Iterator[Explanation]:
@@ -148,9 +143,9 @@ def _positions(probe: Probe) -> Iterator[Explanation]:
     small = probe.at(probe.rows[::every])
     n = len(probe.model.joints)
     for pair in combinations(range(n), 2):
-        order = list(range(n))
-        order[pair[0]], order[pair[1]] = pair[1], pair[0]
-        share = unexplained(small.with_motion(_reordered(small, order)))
+        order = [pair[1] if j == pair[0] else pair[0] if j == pair[1] else j for j in range(n)]
+        state = small.q[:, order], small.v[:, order], small.a[:, order]
+        share = unexplained(small.with_motion(state))
         yield Explanation("position_order", np.diagonal(share[:, :, 0]), pair)
         yield Explanation("joint_order", share[np.arange(n), order, 0], pair)
     turning = [j for j in range(n) if probe.model.joints[j] not in probe.model.layout.prismatic]
@@ -182,10 +177,6 @@ def _refined(probe: Probe, rough: Explanation) -> Explanation:
         options={"xatol": 5e-3, "maxiter": 15},
     )  # fmt: skip
     return min(rough, _offset(probe, j, float(found.x)), key=lambda e: e.misfit)
-
-
-def _reordered(probe: Probe, order: Sequence[int]) -> tuple[Array, Array, Array]:
-    return probe.q[:, order], probe.v[:, order], probe.a[:, order]
 
 
 def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Array, Array]:
@@ -234,8 +225,7 @@ def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:
     size = np.linalg.norm(X, axis=0)
     used = size > 1e-9 * size.max(initial=1e-300)
     R = np.asarray(np.linalg.qr(np.hstack([X[:, used] / size[used], tau]), mode="r"))
-    count = int(used.sum())
-    return R[:, :count], R[:, count:]
+    return R[:, : used.sum()], R[:, used.sum() :]
 
 
 def _nonnegative_misfit(R: Array, tau: Array) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, listed, log_finding
 
 __all__ = ["LoadModel", "check_loads", "load_model"]
 
@@ -51,13 +51,10 @@ class LoadModel:
     independent: float
 
     def misfits(self, scales: Array) -> Array:
-        """Return how badly the torques fit when multiplied by some scales.
+        """Return how badly scaled torques fit: chi-squares, prior included, shape (T,).
 
         Args:
             scales: T times a factor of each torque column, shape (T, n).
-
-        Returns:
-            Chi-squares, prior included, shape (T,).
         """
         R = np.asarray(np.linalg.qr(self._rows(scales), mode="r"))  # (T, c+1, c+1)
         chi: Array = R[:, -1, -1] ** 2
@@ -146,17 +143,16 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
     chi, theta, error = model.fit(np.ones(len(share)))
-    if _is_this_robot(model, chi, theta):
-        yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
-        return
-    scale = _torque_scales(model)
-    other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
-    if len(other) and _is_this_robot(model, *model.fit(scale)[:2]):
-        yield from _scaled(probe, scale, _needed(model, scale, other), name)
-    elif len(other) or _error_of_links(theta) > _MISMATCH:
-        yield _mismatch(probe, theta[:bodies], name)
-    else:
-        yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
+    if not _is_this_robot(model, chi, theta):
+        scale = _torque_scales(model)
+        other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
+        if len(other) and _is_this_robot(model, *model.fit(scale)[:2]):
+            yield from _scaled(probe, scale, _needed(model, scale, other), name)
+            return
+        if len(other) or _error_of_links(theta) > _MISMATCH:
+            yield _mismatch(probe, theta[:bodies], name)
+            return
+    yield from _payload(probe, theta[bodies:], float(error[bodies]), name)
 
 
 def _is_this_robot(model: LoadModel, chi: float, theta: Array) -> bool:
@@ -211,42 +207,36 @@ def _needed(model: LoadModel, scale: Array, other: Array) -> Array:
 
 
 def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Finding]:
-    joints = [probe.model.joints[j] for j in other]
-    factors = scale[other]
-    todo = "with [torque] gains (--gain {0}=...), or correct the gain"
+    joints, factors = [probe.model.joints[j] for j in other], scale[other].tolist()
+    code, todo = "current_for_torque", "with [torque] gains (--gain {0}=...), or correct the gain"
     if len(other) > 1 and np.ptp(np.log(factors)) < np.log(_ALIKE):
         factor = float(np.exp(np.log(factors).mean()))
         message = (
-            f"{name}: the torques of {listed(joints)} fit the URDF far better times {factor:.3g}: "
-            "they may "
+            f"the torques of {listed(joints)} fit the URDF far better times {factor:.3g}: they may "
             "be currents, or have another unit or gain; give them as current_<joint> "
             + todo.format("JOINT")
         )
-        evidence = {"factor": factor, "joints": float(len(other))}
-        where = name if len(other) == len(scale) else f"{name}: {', '.join(joints)}"
-        yield Finding("current_for_torque", "warning", where, message, evidence)
+        part = "" if len(other) == len(scale) else listed(joints)
+        yield log_finding(name, code, "warning", message, part, factor=factor, joints=len(other))
         return
-    for joint, factor in zip(joints, factors.tolist(), strict=True):
+    for joint, factor in zip(joints, factors, strict=True):
         message = (
-            f"{name}: the torque of {joint} fits the URDF far better times {factor:.3g}: it may "
-            f"be a current, or have another unit or gain; give it as current_{joint} "
+            f"the torque of {joint} fits the URDF far better times {factor:.3g}: it may be a "
+            f"current, or have another unit or gain; give it as current_{joint} "
             + todo.format(joint)
         )
-        yield Finding(
-            "current_for_torque", "warning", f"{name}: {joint}", message, {"factor": factor}
-        )
+        yield log_finding(name, code, "warning", message, joint, factor=factor)
 
 
 def _mismatch(probe: Probe, factors: Array, name: str) -> Finding:
-    links = probe.model.layout.bodies
-    shown = ", ".join(f"{link} {factor:.2g}" for link, factor in zip(links, factors, strict=True))
+    found = dict(zip(probe.model.layout.bodies, factors.tolist(), strict=True))
+    shown = ", ".join(f"{link} {factor:.2g}" for link, factor in found.items())
     message = (
-        f"{name}: to explain the torques, the URDF's links would have to weigh {shown} times what "
-        "it says: the URDF may be of another robot or lack a load, or the torques be currents of "
-        "several gains; check the model and the unit, and use the URDF's values as prior with care"
+        f"to explain the torques, the URDF's links would have to weigh {shown} times what it says: "
+        "the URDF may be of another robot or lack a load, or the torques be currents of several "
+        "gains; check the model and the unit, and use the URDF's values as prior with care"
     )
-    evidence = dict(zip(links, factors.tolist(), strict=True))
-    return Finding("urdf_mismatch", "warning", name, message, evidence)
+    return log_finding(name, "urdf_mismatch", "warning", message, **found)
 
 
 def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Finding]:
@@ -255,12 +245,11 @@ def _payload(probe: Probe, load: Array, error: float, name: str) -> Iterator[Fin
     if abs(mass) < 3 * error:
         return
     link = probe.model.layout.bodies[-1]
-    verb = "more" if mass > 0 else "less"
     message = (
-        f"{name}: {link} carries about {abs(mass):.2g} +- {error:.2g} kg {verb} than the URDF "
-        "says; if a tool or payload is mounted, add it to the URDF or expect it in the last link"
+        f"{link} carries about {abs(mass):.2g} +- {error:.2g} kg {'more' if mass > 0 else 'less'} "
+        "than the URDF says; if a tool or payload is mounted, add it to the URDF or expect it in "
+        "the last link"
     )
-    evidence = {"mass": mass, "std_error": error, "mcx": float(load[1]), "mcy": float(load[2]),
-                "mcz": float(load[3])}  # fmt: skip
+    evidence = {"mass": mass, "std_error": error, "mcx": load[1], "mcy": load[2], "mcz": load[3]}
     severity = "warning" if abs(mass) - 2 * error > _HEAVY * arm else "note"
-    yield Finding("payload", severity, f"{name}: {link}", message, evidence)
+    yield log_finding(name, "payload", severity, message, link, **evidence)

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, log_finding
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_locked"]
@@ -16,16 +16,13 @@ _STILL = 0.02  # [rad or m] a held joint may move, or stand elsewhere, by so muc
 def check_locked(
     model: RobotModel, positions: Mapping[str, Array], log: str, asked: Collection[str]
 ) -> Iterator[Finding]:
-    """Yield held joints that a log shows to move, or to stand elsewhere.
+    """Yield an error "locked_position" per held joint that a log shows to move or stand elsewhere.
 
     Args:
         model: The robot, whose locked joints are held.
         positions: The held joints' positions in the log by name, shape (N,) [rad or m].
         log: Name of the log.
         asked: Joints that the user asked to be locked.
-
-    Yields:
-        An error "locked_position" per joint.
     """
     for joint, q in positions.items():
         stated = model.locked[joint]
@@ -39,6 +36,6 @@ def check_locked(
         else:
             what = f"stands at {middle:.4g} there"
             todo = f"state locked = {{ {joint} = {middle:.4g} }} (--lock {joint}={middle:.4g})"
-        message = f"{log}: {said}, but the log has its position, and it {what}; {todo}"
+        message = f"{said}, but the log has its position, and it {what}; {todo}"
         evidence = {"stated": stated, "median": middle, "range": reach}
-        yield Finding("locked_position", "error", f"{log}: {joint}", message, evidence)
+        yield log_finding(log, "locked_position", "error", message, joint, **evidence)

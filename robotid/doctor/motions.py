@@ -9,7 +9,7 @@ from robotid._typing import Array
 from robotid.estimators import WLS
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
-from robotid.findings import Finding
+from robotid.findings import Finding, log_finding
 from robotid.identification.prior import prior_spread
 from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
@@ -33,35 +33,29 @@ _LOST = "the motion is rich, but this hardly loads a joint and is lost in the no
 def check_repeated_motion(
     fitted: Sequence[Trajectory], kept: Trajectory, name: str
 ) -> Iterator[Finding]:
-    """Yield whether a validation log repeats motion that is fitted, whoever recorded it when.
+    """Yield a warning "repeated_motion" if a validation log repeats motion that is fitted.
 
     Args:
         fitted: Smooth motions that are fitted.
         kept: Smooth motion that is kept apart.
         name: What its log is called.
-
-    Yields:
-        At most one warning "repeated_motion".
     """
     from scipy.spatial import cKDTree
 
     size = np.maximum(np.ptp(kept.q, axis=0), 1e-3)
     seen = _stretches(kept, size, _INSTANTS)
-    if len(seen) == 0:
-        return
     share = 0.0
-    for motion in fitted:
-        known = _stretches(motion, size, None)
+    for known in [_stretches(motion, size, None) for motion in fitted if len(seen)]:
         if len(known):
             distance, _ = cKDTree(known).query(seen, p=np.inf, distance_upper_bound=_NEAR)
             share = max(share, float(np.mean(np.isfinite(distance))))
     if share < _SHARE:
         return
     message = (
-        f"{name}: {100 * share:.0f} % of this motion is in a fitted log, too: its score shows how "
-        "well the fit repeats itself, not how it predicts; record another motion to validate with"
+        f"{100 * share:.0f} % of this motion is in a fitted log, too: its score shows how well the "
+        "fit repeats itself, not how it predicts; record another motion to validate with"
     )
-    yield Finding("repeated_motion", "warning", name, message, {"share": share})
+    yield log_finding(name, "repeated_motion", "warning", message, share=share)
 
 
 def check_excitation(
@@ -71,10 +65,9 @@ def check_excitation(
     signals: SignalSettings,
     name: str,
 ) -> Iterator[Finding]:
-    """Yield which base parameters the fitted motions determine.
+    """Yield which base parameters the fitted motions determine, by ``determine``.
 
-    By ``determine``, as an identification does; of long logs a share of
-    the rows stands for all.
+    Of long logs a share of the rows stands for all.
 
     Args:
         model: The robot.
@@ -90,31 +83,26 @@ def check_excitation(
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
     thinned = [_every(step, motion) for motion in motions]
     try:
-        factors = merge(
-            [
-                compress(base_problem(model, mapping, m, row_mask(model, m, signals.min_velocity)))
-                for m in thinned
-            ]
+        masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
+        problems = (
+            base_problem(model, mapping, *pair) for pair in zip(thinned, masks, strict=True)
         )
+        factors = merge([compress(problem) for problem in problems])
         found = WLS(prior=mapping.to_base(prior)).fit(factors)
     except RobotIdError as error:
-        message = f"{name}: which parameters the motion determines cannot be told: {error}"
-        yield Finding("excitation", "warning", name, message)
+        message = f"which parameters the motion determines cannot be told: {error}"
+        yield log_finding(name, "excitation", "warning", message)
         return
     share = step * min(independent_share(replace(signals, rate=m.rate)) for m in motions)
     squares = np.sum([motion.squares for motion in thinned], axis=0)
     spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
     rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
     known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
-    evidence = {
-        "rank": float(known.rank),
-        "base": float(len(mapping.K)),
-        "weakest": float(known.shrinkage[-1]),
-    }
+    evidence = {"rank": known.rank, "base": len(mapping.K), "weakest": known.shrinkage[-1]}
     if np.isfinite(found.condition):
-        evidence["condition"] = float(found.condition)
+        evidence["condition"] = found.condition
     message = (
-        f"{name}: the motion determines {known.rank} of {len(mapping.K)} base parameters "
+        f"the motion determines {known.rank} of {len(mapping.K)} base parameters "
         f"(condition number {found.condition:.3g})"
     )
     is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
@@ -128,26 +116,17 @@ def check_excitation(
     else:
         message += "; nothing needs doing"
     severity = "warning" if known.groups and is_poor else "note"
-    yield Finding("excitation", severity, name, message, evidence)
+    yield log_finding(name, "excitation", severity, message, **evidence)
 
 
 def _every(step: int, motion: Trajectory) -> Trajectory:
     """Return every so many rows of a motion."""
     if step == 1:
         return motion
-    rows = slice(None, None, step)
-    direction = None if motion.direction is None else motion.direction[rows]
-    return Trajectory(
-        t=motion.t[rows],
-        q=motion.q[rows],
-        v=motion.v[rows],
-        a=motion.a[rows],
-        tau=motion.tau[rows],
-        joints=motion.joints,
-        rate=None,
-        segment=motion.segment[rows],
-        direction=direction,
-    )
+    rows, m = slice(None, None, step), motion
+    direction = None if m.direction is None else m.direction[rows]
+    arrays = (m.t[rows], m.q[rows], m.v[rows], m.a[rows], m.tau[rows])
+    return Trajectory(*arrays, m.joints, None, m.segment[rows], direction=direction)
 
 
 def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:

@@ -56,13 +56,10 @@ class Probe:
         return np.array(self.model.pin_model.gravity.linear)
 
     def regressor(self, gravity: Array | None = None) -> Array:
-        """Return the inertial regressor in a gravity.
+        """Return the inertial regressor in a gravity, shape (N, n, p).
 
         Args:
             gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
-
-        Returns:
-            Regressor, shape (N, n, p).
         """
         g = self.gravity if gravity is None else gravity
         Y: Array = self.Y + np.tensordot(g, self.G, axes=1)
@@ -79,30 +76,22 @@ class Probe:
         """
         v, one = self.v[:, j], np.ones(len(self.v))
         still = min(_STILL, _SLOW * float(np.abs(v).max())) or _STILL
-        friction = np.tanh(v / still)
-        own = np.column_stack([self.a[:, j], v, friction, one, -one])
+        own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
         return np.hstack([own, self.drives[:, j]])
 
     def at(self, rows: Array) -> "Probe":
-        """Return the probe at other rows of the same motion.
+        """Return the probe at other rows of the same motion, computed anew.
 
         Args:
             rows: Rows of the motion, shape (N,), int.
-
-        Returns:
-            The probe, computed anew.
         """
-        m = self.motion
-        return _probe(self.model, m, rows, (m.q[rows], m.v[rows], m.a[rows]))
+        return _probe_at(self.model, self.motion, rows)
 
     def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
-        """Return the probe with other positions, velocities and accelerations, torques as they are.
+        """Return the probe with another motion, torques as they are, computed anew.
 
         Args:
-            state: q, v and a, each of shape (N, n).
-
-        Returns:
-            The probe, computed anew.
+            state: Positions, velocities and accelerations, each of shape (N, n).
         """
         return _probe(self.model, self.motion, self.rows, state)
 
@@ -115,9 +104,6 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
         log: The log, of the model's joints in its order.
         settings: How the job smooths; what it says of velocities is not used.
 
-    Returns:
-        The trajectory.
-
     Raises:
         DataError: If the log is too short or an angle jumps.
         SettingsError: If a setting does not fit the log.
@@ -129,23 +115,18 @@ def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Traj
 
 
 def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> Probe | None:
-    """Return a probe of a motion.
+    """Return a probe of a motion, None if too little moves to judge anything by.
 
     Args:
         model: The robot, with a fixed base.
         motion: The smooth motion.
         samples: Number of instants, spread evenly over the rows at which something moves.
-
-    Returns:
-        The probe; None if too little moves to judge anything by.
     """
-    moving = (np.abs(motion.v) > _STILL).any(axis=1) & _inner(motion)
-    rows = np.flatnonzero(moving)
+    rows = np.flatnonzero((np.abs(motion.v) > _STILL).any(axis=1) & _inner(motion))
     if len(rows) < 50:
         return None
     chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))
-    kept = rows[chosen]
-    return _probe(model, motion, kept, (motion.q[kept], motion.v[kept], motion.a[kept]))
+    return _probe_at(model, motion, rows[chosen])
 
 
 def _inner(motion: Trajectory) -> Array:
@@ -158,6 +139,10 @@ def _inner(motion: Trajectory) -> Array:
     return inner
 
 
+def _probe_at(model: RobotModel, motion: Trajectory, rows: Array) -> Probe:
+    return _probe(model, motion, rows, (motion.q[rows], motion.v[rows], motion.a[rows]))
+
+
 def _probe(
     model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
 ) -> Probe:
@@ -166,12 +151,8 @@ def _probe(
     shape = (len(q), model.n_rows, -1)
     still = np.zeros_like(v)
     whole = joint_torque_regressor(_in_gravity(model, np.zeros(3)), q, v, a).reshape(shape)
-    G = np.array(
-        [
-            joint_torque_regressor(_in_gravity(model, g), q, still, still).reshape(shape)
-            for g in np.eye(3)
-        ]
-    )
+    pulled = [_in_gravity(model, g) for g in np.eye(3)]
+    G = np.array([joint_torque_regressor(m, q, still, still).reshape(shape) for m in pulled])
     own = len(model.joints) * len(model.layout.terms)
     return Probe(
         model, motion, rows, q, v, a, motion.tau[rows],

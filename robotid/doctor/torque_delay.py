@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, log_finding
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
@@ -49,16 +49,10 @@ class _Misfit:
 
     squares: Array
 
-    @property
-    def without_a_block(self) -> list["_Misfit"]:
-        """The misfits of which one block of the log is left out in turn."""
-        blocks = self.squares.shape[1]
-        return [_Misfit(np.delete(self.squares, b, axis=1)) for b in range(blocks)]
-
-    @property
-    def without_a_joint(self) -> list["_Misfit"]:
-        """The misfits of which one joint is left out in turn."""
-        return [_Misfit(np.delete(self.squares, j, axis=0)) for j in range(len(self.squares))]
+    def delays_without(self, axis: int) -> list[float]:
+        """Return the delays if one joint (axis 0) or block of the log (1) is left out in turn."""
+        left_out = range(self.squares.shape[axis])
+        return [_Misfit(np.delete(self.squares, k, axis=axis)).delay() for k in left_out]
 
     def delay(self) -> float:
         """Return the delay that explains most [s], NaN if it is at an end of the grid."""
@@ -75,19 +69,18 @@ class _Misfit:
     def error(self) -> float:
         """Return the standard error of the delay [s]: jackknife over joints and over blocks."""
         variance = 0.0
-        for parts in (self.without_a_joint, self.without_a_block):
-            variance += (len(parts) - 1) * float(np.var([part.delay() for part in parts]))
+        for delays in (self.delays_without(0), self.delays_without(1)):
+            variance += (len(delays) - 1) * float(np.var(delays))
         return max(float(np.sqrt(variance)), _FINEST)
 
     def gain(self) -> float:
         """Return the share of what is unexplained that the delay of the other blocks explains."""
-        joints, blocks, _ = self.squares.shape
-        delays = [part.delay() for part in self.without_a_block]
-        now, then = np.zeros(joints), np.zeros(joints)
-        for j in range(joints):
-            for b in range(blocks):
-                now[j] += np.interp(0.0, _GRID, self.squares[j, b])
-                then[j] += np.interp(delays[b], _GRID, self.squares[j, b])
+        now, then = np.zeros((2, len(self.squares)))
+        delays = self.delays_without(1)
+        for j, squares in enumerate(self.squares):
+            for delay, block in zip(delays, squares, strict=True):
+                now[j] += np.interp(0.0, _GRID, block)
+                then[j] += np.interp(delay, _GRID, block)
         return float(1.0 - np.mean((then + _EXACT) / (now + _EXACT)))
 
 
@@ -111,7 +104,7 @@ class _Window:
 def check_torque_delay(
     model: RobotModel, motion: Trajectory, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
-    """Yield how late the torque is against the position.
+    """Yield at most one "torque_delay", how late the torque is against the position.
 
     The delay minimises what the regressor leaves of the delayed torque, rows near a change of
     direction apart; its uncertainty is the jackknife's over the joints and over stretches of the
@@ -122,9 +115,6 @@ def check_torque_delay(
         motion: The smooth motion.
         signals: How it was smoothed.
         name: What the log is called.
-
-    Yields:
-        At most one "torque_delay".
     """
     misfit = _misfit(model, motion, signals)
     if misfit is None:
@@ -135,19 +125,18 @@ def check_torque_delay(
     gain = misfit.gain()
     step = float(np.median(np.diff(motion.t)))
     late = abs(delay) > max(_LATE, _HELD * step, 3 * error) and gain > _HELPS
+    meaning = (
+        f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
+        "logger's clock, or"
+        if late
+        else ". Friction that the model lacks can look like this; if the drive filters its torque,"
+    )
     message = (
-        f"{name}: the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
-        + (
-            f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
-            f"logger's clock, or state [signals] torque_delay = {delay:.4f}"
-            if late
-            else ". Friction that the model lacks can look like this; if the drive filters its "
-            "torque, "
-            f"state [signals] torque_delay = {delay:.4f}"
-        )
+        f"the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
+        f"{meaning} state [signals] torque_delay = {delay:.4f}"
     )
     evidence = {"delay": delay, "std_error": error, "gain": gain}
-    yield Finding("torque_delay", "warning" if late else "note", name, message, evidence)
+    yield log_finding(name, "torque_delay", "warning" if late else "note", message, **evidence)
 
 
 def _misfit(model: RobotModel, motion: Trajectory, signals: SignalSettings) -> _Misfit | None:

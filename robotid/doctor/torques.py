@@ -1,14 +1,15 @@
 """Do the torques fit the model: signs, order of columns, gravity, positions."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from robotid._typing import Array
 from robotid.doctor.hypotheses import Explanation, explanations
 from robotid.doctor.loads import check_loads
 from robotid.doctor.sample import Probe
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, listed, log_finding
 
 __all__ = ["check_torques"]
 
@@ -20,6 +21,35 @@ _TILT = 5.0  # [deg] gravity farther than this off is worth a warning
 _TURNED = 30.0  # [deg] ... and farther than this gives wrong answers
 _HINT = 0.7  # gain from which a tilt is believed
 _UNEXPLAINED = 0.25  # share of a torque's variance that no physics explains
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """The reading that explains the torques of a log best, beside the stated one."""
+
+    probe: Probe
+    stated: Explanation
+    best: Explanation
+    log: str
+
+    @property
+    def gain(self) -> float:
+        return self.stated.misfit - self.best.misfit
+
+    @property
+    def is_certain(self) -> bool:
+        return self.gain > _CERTAIN and float(np.median(self.best.share)) < _EXPLAINED
+
+    @property
+    def joints(self) -> list[str]:
+        return [self.probe.model.joints[j] for j in self.best.joints]
+
+    def finding(self, message: str, part: str) -> Finding:
+        """Return that columns hold something else than is stated."""
+        return log_finding(
+            self.log, self.best.kind, "error", message, part, gain=self.gain,
+            unexplained=self.stated.share.max(), unexplained_so_read=self.best.share.max(),
+        )  # fmt: skip
 
 
 def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
@@ -41,45 +71,36 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     best = min(others, key=lambda e: e.misfit)
     if best.kind != "torque_sign" and loaded.misfit < best.misfit:
         best = stated  # a load explains it better
-    found = list(_FINDINGS[best.kind](probe, stated, best, stated.misfit - best.misfit, name))
+    make = _FINDINGS.get(best.kind)
+    found = list(make(_Reading(probe, stated, best, name))) if make else []
     for finding in found:
         # what a load on the last link would explain as well is no error for certain
-        excused = _is_excused(best, loaded)
-        yield replace(finding, severity="warning") if excused else finding
+        yield replace(finding, severity="warning") if _is_excused(best, loaded) else finding
     if not found:
         yield from check_loads(probe, loaded.share, name)
-        yield from _unexplained(probe, loaded, name)
+        yield from _unexplained(probe, loaded.share, name)
 
 
-def _no_finding(*_: object) -> Iterator[Finding]:
-    yield from ()
-
-
-def _sign(
-    probe: Probe, stated: Explanation, best: Explanation, _gain: float, name: str
-) -> Iterator[Finding]:
-    for j in best.joints:
-        before, after = float(stated.share[j]), float(best.share[j])
+def _sign(reading: _Reading) -> Iterator[Finding]:
+    for j, joint in zip(reading.best.joints, reading.joints, strict=True):
+        before, after = reading.stated.share[j], reading.best.share[j]
         if before < _WRONG or after > _EXPLAINED:
             continue
-        joint = probe.model.joints[j]
         message = (
-            f"{name}: the torque of {joint} has the opposite sign: as it is, {100 * before:.0f} % "
-            f"of its variance cannot be explained, negated {100 * after:.2g} %; negate tau_{joint} "
-            "(or its gain), or check the joint's axis in the URDF"
+            f"the torque of {joint} has the opposite sign: as it is, {100 * before:.0f} % of its "
+            f"variance cannot be explained, negated {100 * after:.2g} %; negate tau_{joint} (or "
+            "its gain), or check the joint's axis in the URDF"
         )
         evidence = {"unexplained": before, "unexplained_if_negated": after}
-        yield Finding("torque_sign", "error", f"{name}: {joint}", message, evidence)
+        yield log_finding(reading.log, "torque_sign", "error", message, joint, **evidence)
 
 
-def _exchanged(
-    probe: Probe, stated: Explanation, best: Explanation, gain: float, name: str
-) -> Iterator[Finding]:
-    if not _is_certain(best, gain):
+def _exchanged(reading: _Reading) -> Iterator[Finding]:
+    if not reading.is_certain:
         return
-    names = [probe.model.joints[j] for j in best.joints]
+    names, best = reading.joints, reading.best
     if best.kind == "torque_order":
-        owners = [probe.model.joints[int(best.values[j])] for j in best.joints]
+        owners = [reading.probe.model.joints[int(best.values[j])] for j in best.joints]
         shown = ", ".join(f"tau_{a} is that of {b}" for a, b in zip(names, owners, strict=True))
         what, todo = f"torque columns are exchanged: {shown}", "rename these torque columns"
     elif best.kind == "position_order":
@@ -87,19 +108,16 @@ def _exchanged(
     else:
         what, todo = f"all columns of {listed(names)} are exchanged", "name the joints rightly"
     message = (
-        f"{name}: {what}: so read, the unexplained share of the worst torque falls from "
-        f"{100 * stated.share.max():.2g} to {100 * best.share.max():.2g} %; {todo}"
+        f"{what}: so read, the unexplained share of the worst torque falls from "
+        f"{100 * reading.stated.share.max():.2g} to {100 * best.share.max():.2g} %; {todo}"
     )
-    where = f"{name}: {', '.join(names)}"
-    yield Finding(best.kind, "error", where, message, _shares(stated, best, gain))
+    yield reading.finding(message, listed(names))
 
 
-def _position(
-    probe: Probe, stated: Explanation, best: Explanation, gain: float, name: str
-) -> Iterator[Finding]:
-    if not _is_certain(best, gain):
+def _position(reading: _Reading) -> Iterator[Finding]:
+    if not reading.is_certain:
         return
-    joint = probe.model.joints[best.joints[0]]
+    best, (joint,) = reading.best, reading.joints
     if best.kind == "joint_axis":
         what = (
             f"position and torque of {joint} have the opposite sign: its axis is reversed; turn "
@@ -112,48 +130,44 @@ def _position(
             f"the zero of {joint} is off by about {best.values[0]:.2g} rad; correct q_{joint} or "
             "the joint's origin in the URDF"
         )
-    worst = int(np.argmax(stated.share - best.share))
+    before = reading.stated.share
+    worst = int(np.argmax(before - best.share))
     message = (
-        f"{name}: {what}: so read, the unexplained share of {probe.model.joints[worst]}'s torque "
-        f"falls from {100 * stated.share[worst]:.3g} to {100 * best.share[worst]:.3g} %"
+        f"{what}: so read, the unexplained share of {reading.probe.model.joints[worst]}'s torque "
+        f"falls from {100 * before[worst]:.3g} to {100 * best.share[worst]:.3g} %"
     )
-    where = f"{name}: {joint}"
-    yield Finding(best.kind, "error", where, message, _shares(stated, best, gain))
+    yield reading.finding(message, joint)
 
 
-def _gravity(
-    probe: Probe, stated: Explanation, best: Explanation, gain: float, name: str
-) -> Iterator[Finding]:
-    g, believed = np.array(best.values), probe.gravity
+def _gravity(reading: _Reading) -> Iterator[Finding]:
+    g, believed, gain = np.array(reading.best.values), reading.probe.gravity, reading.gain
     size = float(np.linalg.norm(believed))
     if not g.any():
-        if size > 0 and _is_certain(best, gain):
+        if size > 0 and reading.is_certain:
             message = (
-                f"{name}: the torques hold no gravity: without it they are explained best; they "
-                "may be those of a gravity-compensated channel: log the torque of the motor, or "
-                "state gravity = [0, 0, 0] for what is left"
+                "the torques hold no gravity: without it they are explained best; they may be "
+                "those of a gravity-compensated channel: log the torque of the motor, or state "
+                "gravity = [0, 0, 0] for what is left"
             )
-            yield Finding("gravity", "error", name, message, {"gain": gain})
+            yield log_finding(reading.log, "gravity", "error", message, gain=gain)
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    turned = angle > _TURNED and _is_certain(best, gain)
+    turned = angle > _TURNED and reading.is_certain
     if not turned and (angle < _TILT or gain < _HINT):
         return
-    shown = ", ".join(f"{x:.2f}" for x in g)
+    shown, stated = (", ".join(f"{x:.2f}" for x in vector) for vector in (g, believed))
     message = (
-        f"{name}: gravity along [{shown}] m/s^2 explains the torques best, {angle:.0f} degrees "
-        f"from the stated [{', '.join(f'{x:.2f}' for x in believed)}]; if the robot is mounted on "
-        f"a wall, a ceiling or a slope, state gravity = [{shown}] in the job file"
+        f"gravity along [{shown}] m/s^2 explains the torques best, {angle:.0f} degrees from the "
+        f"stated [{stated}]; if the robot is mounted on a wall, a ceiling or a slope, state "
+        f"gravity = [{shown}] in the job file"
     )
     evidence = {"angle_deg": angle, "x": g[0], "y": g[1], "z": g[2], "gain": gain}
     severity = "error" if turned else "warning"
-    yield Finding("gravity", severity, name, message, {k: float(v) for k, v in evidence.items()})
+    yield log_finding(reading.log, "gravity", severity, message, **evidence)
 
 
-_Maker = Callable[[Probe, Explanation, Explanation, float, str], Iterator[Finding]]
-_FINDINGS: dict[str, _Maker] = {
-    "stated": _no_finding,
+_FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
     "torque_sign": _sign,
     "torque_order": _exchanged,
     "joint_order": _exchanged,
@@ -171,35 +185,23 @@ def _is_excused(best: Explanation, loaded: Explanation) -> bool:
     return loaded.misfit - best.misfit < _CERTAIN
 
 
-def _is_certain(best: Explanation, gain: float) -> bool:
-    return gain > _CERTAIN and float(np.median(best.share)) < _EXPLAINED
-
-
-def _shares(stated: Explanation, best: Explanation, gain: float) -> dict[str, float]:
-    return {
-        "unexplained": float(stated.share.max()),
-        "unexplained_so_read": float(best.share.max()),
-        "gain": gain,
-    }
-
-
-def _unexplained(probe: Probe, stated: Explanation, name: str) -> Iterator[Finding]:
-    bad = np.flatnonzero(stated.share > _UNEXPLAINED)
-    if 2 * len(bad) > len(stated.share):
+def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
+    """Yield torques of which physics leaves too much, or once that most of them are so."""
+    bad = np.flatnonzero(share > _UNEXPLAINED)
+    if 2 * len(bad) > len(share):
         message = (
-            f"{name}: the torques of {len(bad)} of {len(stated.share)} joints fit neither gravity, "
-            "inertia nor friction of this model: the base may move or the robot touch something, "
-            "the log or the URDF may be of another robot; nothing identified from it can be right"
+            f"the torques of {len(bad)} of {len(share)} joints fit neither gravity, inertia nor "
+            "friction of this model: the base may move or the robot touch something, the log or "
+            "the URDF may be of another robot; nothing identified from it can be right"
         )
-        evidence = {"joints": len(bad), "share": float(np.median(stated.share))}
-        yield Finding("unexplained_torque", "warning", name, message, evidence)
+        evidence = {"joints": len(bad), "share": float(np.median(share))}
+        yield log_finding(name, "unexplained_torque", "warning", message, **evidence)
         return
     for j in bad:
-        joint, share = probe.model.joints[j], float(stated.share[j])
+        joint = probe.model.joints[j]
         message = (
-            f"{name}: {100 * share:.0f} % of the variance of {joint}'s torque fits neither "
-            "gravity, inertia nor friction: the channel may hold another quantity, little but "
-            "noise, or a drive that is coupled to others; what depends on it is not to be trusted"
+            f"{100 * share[j]:.0f} % of the variance of {joint}'s torque fits neither gravity, "
+            "inertia nor friction: the channel may hold another quantity, little but noise, or a "
+            "drive that is coupled to others; what depends on it is not to be trusted"
         )
-        where = f"{name}: {joint}"
-        yield Finding("unexplained_torque", "warning", where, message, {"share": share})
+        yield log_finding(name, "unexplained_torque", "warning", message, joint, share=share[j])

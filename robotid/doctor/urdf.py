@@ -82,13 +82,11 @@ class Inspection:
         Returns:
             {"robot", "joints", "structure", "base_groups", "findings"}; finite numbers only.
         """
-        structure = None
-        if self.structure is not None:
-            structure = {**vars(self.structure), "undetermined": list(self.structure.undetermined)}
+        found = self.structure
         return {
             "robot": self.robot,
             "joints": list(self.joints),
-            "structure": structure,
+            "structure": found and vars(found) | {"undetermined": list(found.undetermined)},
             "base_groups": list(self.base_groups),
             "findings": [_plain(finding) for finding in self.findings],
         }
@@ -170,16 +168,14 @@ def _joint_findings(path: Path) -> Iterator[Finding]:
     for joint in joints:
         if joint.type in ("revolute", "prismatic"):
             yield from _no_limits(joint)
-        if joint.dynamics is not None:
-            yield from _negative(joint, "damping", joint.dynamics.damping)
-            yield from _negative(joint, "friction", joint.dynamics.friction)
+        for key in ("damping", "friction") if joint.dynamics is not None else ():
+            yield from _negative(joint, key, getattr(joint.dynamics, key))
         if joint.mimic is not None:
             yield _mimic(joint, names)
 
 
 def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
-    lower = joint.limit.lower if joint.limit is not None else None
-    upper = joint.limit.upper if joint.limit is not None else None
+    lower, upper = (getattr(joint.limit, key, None) for key in ("lower", "upper"))
     if (lower or 0.0) < (upper or 0.0):
         return
     message = (
@@ -236,8 +232,7 @@ def _link_findings(model: RobotModel) -> Iterator[Finding]:
             moved = model.layout.bodies[body]
             message = (
                 f"link {moved!r} is one body with {listed(lumped)}, joined to it by fixed joints: "
-                "one sum "
-                "is identified, and a written URDF has it in this link; nothing needs doing"
+                "one sum is identified, and a written URDF has it in this link; nothing needs doing"
             )
             yield Finding("fixed_lumped", "note", f"link {moved}", message)
 

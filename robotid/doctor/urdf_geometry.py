@@ -75,10 +75,10 @@ def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:
         yield Finding("com_outside", "warning", at, message, {"outside": outside})
     density = mass / float(np.prod(sides))
     if not _LIGHTEST <= density <= _HEAVIEST:
-        wanted = f"{_LIGHTEST:g} to {_HEAVIEST:g}"
         message = (
             f"link {body!r}: {mass:.4g} kg in a box of {_metres(sides)} m are {density:.3g} "
-            f"kg/m^3, wanted {wanted}; check the mass, and whether meshes are in mm"
+            f"kg/m^3, wanted {_LIGHTEST:g} to {_HEAVIEST:g}; check the mass, and whether meshes "
+            "are in mm"
         )
         yield Finding("density", "warning", at, message, {"density": density})
     second = np.trace(J[:3, :3]) / mass - float(centre @ centre)  # mean square distance from it
@@ -130,8 +130,7 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
             continue
         message = (
             f"the links {listed(group)} have the same mass, centre of mass and inertia, but other "
-            "sizes; "
-            "one was copied: write each link's own"
+            "sizes; one was copied: write each link's own"
         )
         evidence = {"links": float(len(group)), "difference": spread}
         yield Finding("copied_inertial", "warning", f"link {group[0]}", message, evidence)

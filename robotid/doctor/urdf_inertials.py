@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotid._typing import Array
 from robotid.findings import Finding
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
@@ -22,9 +21,6 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
 
     Args:
         robot: Root element of a URDF.
-
-    Yields:
-        Findings.
     """
     for link in robot.findall("link"):
         mass = link.find("inertial/mass")
@@ -45,9 +41,6 @@ def impossible_inertials(model: RobotModel) -> list[Finding]:
 
     Args:
         model: The robot.
-
-    Returns:
-        The findings.
     """
     inertials = model.tree.inertials
     effect = "; a consistent fit takes the nearest possible body for what the URDF says"
@@ -67,9 +60,6 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
         link: Name of the link.
         inertial: What the URDF says of it.
         matters: Whether a mass of 0 matters, since nothing else gives its body one.
-
-    Yields:
-        Findings.
     """
     at, mass = f"link {link}", inertial.mass
     if mass == 0:
@@ -78,25 +68,18 @@ def impossible_inertial(link: str, inertial: Inertial, matters: bool) -> Iterato
             "<inertial> if the link is a mere frame"
         )
         yield Finding("zero_mass", "warning" if matters else "note", at, message)
-    moments = _principal(inertial)
-    fault = _inertia_fault(moments)
+    ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
+    A, B, C = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]).tolist()
+    fault = _inertia_fault(A, B, C)
     if fault and (mass != 0 or any(inertial.inertia)):
         severity = "note" if fault.startswith("flat") else "error"
-        A, B, C = (float(moment) for moment in moments)
         evidence = {"smallest": A, "middle": B, "largest": C, "triangle": A + B - C}
         message = f"link {link!r}: {fault}"
         yield Finding("not_positive_definite", severity, at, message, evidence)
 
 
-def _principal(inertial: Inertial) -> Array:
-    ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
-    moments: Array = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-    return moments  # ascending
-
-
-def _inertia_fault(moments: Array) -> str | None:
+def _inertia_fault(A: float, B: float, C: float) -> str | None:
     """Return what keeps a body with these principal moments of inertia from being possible."""
-    A, B, C = (float(moment) for moment in moments)
     stated = f"principal moments of inertia {A:.4g}, {B:.4g}, {C:.4g} kg m^2"
     advice = "take the inertia from CAD, about the centre of mass and in the stated frame"
     margin = A + B - C

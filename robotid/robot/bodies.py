@@ -41,9 +41,6 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 
     Args:
         model: The robot.
-
-    Returns:
-        One place per link.
     """
     arriving = {joint.child: joint for joint in model.tree.joints}
     places = []
@@ -67,15 +64,12 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
 
 
 def held_parameters(model: RobotModel) -> Array:
-    """Return the share of each body that belongs to links on locked joints.
+    """Return the share of each body that belongs to links on locked joints, (10 bodies,).
 
     They keep the inertials the URDF gives them, so the rest of the body must be possible alone.
 
     Args:
         model: The robot.
-
-    Returns:
-        Inertial parameters, shape (10 bodies,).
     """
     held = np.zeros((len(model.layout.bodies), 10))
     for place in link_places(model):

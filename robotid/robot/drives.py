@@ -91,11 +91,7 @@ DRIVE_TERMS = tuple(name for name, term in TERMS.items() if term.is_default)
 
 
 def friction_models() -> dict[str, tuple[str, ...]]:
-    """Return the choices of a job's ``friction``: none, and each friction term with those before.
-
-    Returns:
-        Names of terms by choice: none, viscous, viscous+coulomb.
-    """
+    """Return the terms by choice of a job's ``friction``: none, viscous, viscous+coulomb."""
     names = [name for name, term in TERMS.items() if term.is_friction]
     choices = [tuple(names[:count]) for count in range(len(names) + 1)]
     return {"+".join(terms) or "none": terms for terms in choices}

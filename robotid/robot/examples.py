@@ -10,10 +10,7 @@ __all__ = ["example_urdf", "example_urdfs"]
 
 
 def example_urdfs() -> tuple[Path, ...]:
-    """Return every URDF of example-robot-data.
-
-    Returns:
-        Paths, sorted.
+    """Return the paths of every URDF of example-robot-data, sorted.
 
     Raises:
         MissingDependencyError: If example-robot-data is not installed.

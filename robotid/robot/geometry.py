@@ -77,13 +77,10 @@ def body_points(model: RobotModel) -> dict[str, Array]:
 
 
 def box_half_spaces(points: Array) -> tuple[Array, Array]:
-    """Return the axis-parallel box around points as half-spaces A c <= b.
+    """Return the axis-parallel box around points: A c <= b, A of shape (6, 3), b of (6,) [m].
 
     Args:
         points: Shape (k, 3) [m].
-
-    Returns:
-        A, shape (6, 3), and b, shape (6,) [m].
     """
     A = np.vstack([np.eye(3), -np.eye(3)])
     return A, (A @ points.T).max(axis=1)

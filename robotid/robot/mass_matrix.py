@@ -23,17 +23,11 @@ POSES = 10_000
 
 @dataclass(frozen=True)
 class MassMatrixCheck:
-    """The mass matrix over random poses.
+    """The mass matrix over random poses."""
 
-    Attributes:
-        poses: Number of poses.
-        smallest_eigenvalue: The smallest one of them all [kg m^2, or kg].
-        positive_share: Share of the poses where it is positive definite [-].
-    """
-
-    poses: int
-    smallest_eigenvalue: float
-    positive_share: float
+    poses: int  # number of them
+    smallest_eigenvalue: float  # of all poses [kg m^2, or kg]
+    positive_share: float  # of the poses where it is positive definite [-]
 
     @property
     def is_positive(self) -> bool:
@@ -57,32 +51,23 @@ def check_mass_matrix(
         What was found.
     """
     rng = np.random.default_rng(seed)
-    bounds = np.array(
-        [
-            (joint.lower, joint.upper)
-            if joint.has_limits
-            else ((-1.0, 1.0) if joint.type == "prismatic" else (-np.pi, np.pi))
-            for joint in model.limits
-        ]
-    )
-    q = rng.uniform(bounds[:, 0], bounds[:, 1], (poses, len(bounds)))
+    free = [1.0 if joint.type == "prismatic" else np.pi for joint in model.limits]
+    lower = [j.lower if j.has_limits else -x for j, x in zip(model.limits, free, strict=True)]
+    upper = [j.upper if j.has_limits else x for j, x in zip(model.limits, free, strict=True)]
+    q = rng.uniform(lower, upper, (poses, len(free)))
     if model.free_flyer:  # where the base is changes nothing
-        pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-        q = np.hstack([np.tile(pose, (poses, 1)), q])
+        q = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (poses, 1)), q])
     smallest = np.linalg.eigvalsh(joint_mass_matrices(model, pi, q))[:, 0]
     return MassMatrixCheck(poses, float(smallest.min()), float((smallest > 0).mean()))
 
 
 def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
-    """Return the mass matrix in the coordinates of the model's joints, armatures included.
+    """Return the mass matrices of the joints, armatures included, shape (N, n_rows, n_rows).
 
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,).
         q: Joint coordinates, shape (N, n), or (N, 7 + n) with a floating base [rad, m].
-
-    Returns:
-        Matrices, shape (N, n_rows, n_rows).
     """
     bodies = model.with_parameters(pi)
     M = rigid_mass_matrices(bodies, bodies.configurations(q))
@@ -94,15 +79,12 @@ def joint_mass_matrices(model: RobotModel, pi: Array, q: Array) -> Array:
 def rigid_mass_matrices(
     model: RobotModel, configurations: Array, data: pin.Data | None = None
 ) -> Array:
-    """Return the mass matrix of the bodies alone, without drives, in the joints' coordinates.
+    """Return the mass matrices of the bodies alone, without drives, shape (N, n_rows, n_rows).
 
     Args:
         model: The robot.
         configurations: Pinocchio's configurations, shape (N, nq), as of ``model.configurations``.
         data: Pinocchio's work space of the model; a new one if None.
-
-    Returns:
-        Matrices, shape (N, n_rows, n_rows).
     """
     data = model.pin_model.createData() if data is None else data
     M = np.empty((len(configurations), model.pin_model.nv, model.pin_model.nv))
@@ -113,14 +95,11 @@ def rigid_mass_matrices(
 
 
 def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
-    """Return what the drives' inertias add to the mass matrix of the joints.
+    """Return what the drives add to the mass matrix of the joints, (n, n) [kg m^2, or kg].
 
     Args:
         layout: The standard parameters of a robot with n joints.
         pi: Their values, shape (p,).
-
-    Returns:
-        Matrix, shape (n, n) [kg m^2, or kg].
     """
     Ia = pi[layout.n_inertial :] * [term.is_inertia for _, term in layout.drive_parameters]
     added: Array = (layout.drive_loads * Ia) @ layout.drive_loads.T
@@ -128,13 +107,10 @@ def drive_inertia(layout: ParameterLayout, pi: Array) -> Array:
 
 
 def carried_inertia(model: RobotModel) -> Array:
-    """Return the inertia that each joint carries at the neutral posture.
+    """Return the inertia that each joint carries at the neutral posture, (n,) [kg m^2, or kg].
 
     Args:
         model: The robot.
-
-    Returns:
-        Inertias, shape (n,), at least 0 [kg m^2, or kg].
     """
     (M,) = rigid_mass_matrices(model, pin.neutral(model.pin_model)[None])
     return np.maximum(np.diag(M)[model.n_rows - len(model.joints) :], 0.0)

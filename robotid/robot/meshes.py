@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -60,14 +61,11 @@ class Shape:
 
 
 def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
-    """Return the shapes in a URDF.
+    """Return the shapes in a URDF, in the order of the file.
 
     Args:
         robot: The ``<robot>`` of the file.
         tag: Which of them: "visual" or "collision".
-
-    Returns:
-        The shapes, in the order of the file.
     """
     colours = {m.get("name"): _colour(m) for m in robot.findall("material")}
     found = []
@@ -84,7 +82,7 @@ def read_shapes(robot: ET.Element, tag: str = "visual") -> tuple[Shape, ...]:
 
 
 def find_mesh(name: str, urdf: str | Path) -> Path | None:
-    """Return the file of a mesh.
+    """Return the file of a mesh, None if there is none.
 
     A path with ``package://`` or none is looked for in ROS_PACKAGE_PATH, in the URDF's folder and
     those above it, and in example-robot-data, with the name of its package and without it.
@@ -92,9 +90,6 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     Args:
         name: What the URDF calls it.
         urdf: The URDF file.
-
-    Returns:
-        Path of the file; None if there is none.
     """
     if name.startswith("file://"):
         path = Path(name.removeprefix("file://"))
@@ -139,7 +134,7 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     by_colour: dict[tuple[float, ...] | None, list[Surface]] = {}
     for mesh in scene.dump():
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            rgba = _mesh_colour(mesh)
+            rgba = _mesh_colour(mesh.visual)
             surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
             by_colour.setdefault(rgba, []).append(surface)
     return tuple(_joined(surfaces) for surfaces in by_colour.values())
@@ -149,14 +144,12 @@ def thin(surfaces: Sequence[Surface], most: int) -> list[Surface]:
     """Return surfaces with so few triangles together, edges kept sharp.
 
     Corners within a cell of a cube grid become one, at their mean; the cells grow until few
-    enough triangles are left, so no corner moves farther than the diagonal of a cell.
+    enough triangles are left, so no corner moves farther than the diagonal of a cell. Each side
+    of a sharp edge has a corner of its own.
 
     Args:
         surfaces: The surfaces of a robot, all in one scale.
         most: Triangles that may be left of all of them.
-
-    Returns:
-        The surfaces, in order, with a corner for each side of a sharp edge.
     """
     extents = [float(np.ptp(s.vertices, axis=0).max()) for s in surfaces if len(s.faces)]
     cell = _FIRST_CELL * max(extents, default=1.0)
@@ -218,9 +211,8 @@ def _placement(origin: ET.Element | None) -> tuple[Array, bool]:
     return M, known
 
 
-def _mesh_colour(mesh: "object") -> tuple[float, ...] | None:
-    """Return the colour of a mesh of trimesh: of its material, or the mean of its corners."""
-    visual = mesh.visual  # type: ignore[attr-defined]
+def _mesh_colour(visual: Any) -> tuple[float, ...] | None:  # noqa: ANN401
+    """Return the colour of trimesh's visual: of its material, or the mean of its corners."""
     if visual.kind == "texture":
         colour = visual.material.main_color
     elif visual.kind in ("face", "vertex"):

@@ -159,15 +159,12 @@ class RobotModel:
         return longest if longest > 1e-6 else 1.0
 
     def standard_parameters(self) -> Array:
-        """Return the standard parameters as the URDF states them.
+        """Return the standard parameters as the URDF states them, shape (p,), SI units.
 
-        Returns:
-            Parameters, shape (p,), SI units, in ``layout.names`` order; the drive terms are 0,
-            since what a URDF says of them is not used.
+        The drive terms are 0, since what a URDF says of them is not used.
         """
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
-        drive = np.zeros(len(self.layout.drive_names))
-        return np.concatenate([*inertial, drive])
+        return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
 
     def with_parameters(self, pi: Array) -> "RobotModel":
         """Return the same robot with other inertial parameters.
@@ -221,10 +218,9 @@ class RobotModel:
         return configuration
 
     def support(self) -> Array:
-        """Return which parameters can load which row.
+        """Return which parameters can load which row, shape (n_rows, p), bool.
 
-        Returns:
-            Shape (n_rows, p), bool: False where the regressor is 0 for every motion.
+        False where the regressor is 0 for every motion.
         """
         nv = self.pin_model.nv
         carried = np.zeros((nv, self.layout.n_inertial), dtype=bool)
@@ -278,8 +274,7 @@ def _check_joints(tree: Tree, names: Sequence[str], followers: Mapping[str, obje
                 "it out, or use mimic = 'independent'"
             )
         if name not in known:
-            fixed = [joint.name for joint in tree.joints if joint.name == name]
-            if fixed:
+            if any(joint.name == name for joint in tree.joints):
                 raise ModelError(
                     f"joint {name!r} is fixed in {Path(tree.path).name}: it cannot move"
                 )
@@ -360,8 +355,8 @@ def _velocity_map(
     free_flyer: bool,
 ) -> tuple[Array, Array]:
     base = 6 if free_flyer else 0
-    G = np.zeros((model.nv, base + len(moving)))
-    G[:base, :base] = np.eye(base)
+    G = np.eye(model.nv, base + len(moving))
+    G[base:] = 0.0
     shift = np.zeros(model.nv)
     for name, joint in list(zip(model.names, model.joints, strict=True))[2 if free_flyer else 1 :]:
         leader, ratio, offset = followers.get(name, (name, 1.0, 0.0))

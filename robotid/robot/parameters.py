@@ -8,6 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 
 __all__ = [
@@ -67,13 +68,13 @@ class ParameterLayout:
     def __post_init__(self) -> None:
         unknown = [term for term in self.terms if term not in TERMS]
         if unknown:
-            raise SettingsError(f"unknown drive terms {unknown}; known: {list(TERMS)}")
+            raise SettingsError(f"unknown drive terms {listed(unknown)}; known: {listed(TERMS)}")
         for coupling in self.couplings:
             missing = [joint for joint, _ in coupling.ratios if joint not in self.joints]
             if missing:
                 raise SettingsError(
-                    f"coupling {coupling.name!r} names the joints {missing}, which are not "
-                    f"identified; joints: {list(self.joints)}"
+                    f"coupling {coupling.name!r} names the joints {listed(missing)}, which are "
+                    f"not identified; joints: {listed(self.joints)}"
                 )
             if coupling.name in self.joints:
                 raise SettingsError(
@@ -108,12 +109,8 @@ class ParameterLayout:
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
         """Which of ``drives`` each drive parameter belongs to, and its term."""
-        n = len(self.joints)
-        return tuple(
-            (d, TERMS[term])
-            for d in range(len(self.drives))
-            for term in (self.terms if d < n else self.coupling_terms)
-        )
+        owned = [self.terms] * len(self.joints) + [self.coupling_terms] * len(self.couplings)
+        return tuple((d, TERMS[term]) for d, terms in enumerate(owned) for term in terms)
 
     @cached_property
     def drive_loads(self) -> Array:
@@ -144,13 +141,10 @@ class ParameterLayout:
         return tuple(inertial + drive)
 
     def owned_by(self, owners: Sequence[str]) -> Array:
-        """Return which parameters belong to some bodies or joints.
+        """Return which parameters belong to some bodies or joints, flags, shape (p,), bool.
 
         Args:
             owners: Their names.
-
-        Returns:
-            Flags, shape (p,), bool.
         """
         return np.isin([name.rsplit(".", 1)[0] for name in self.names], list(owners))
 
@@ -164,31 +158,21 @@ class ParameterLayout:
             Scales, shape (p,): 1 for a mass, length for m c, length^2 for an inertia and for the
             armature of a rotary joint, 1 for other drive terms.
         """
-        inertial = [1.0, *[length] * 3, *[length**2] * 6]
-        drive = [
-            length**2 if term.is_inertia and not self._slides(d) else 1.0
-            for d, term in self.drive_parameters
-        ]
-        return np.array(inertial * len(self.bodies) + drive)
+        inertial = [1.0, *[length] * 3, *[length**2] * 6] * len(self.bodies)
+        turns = [t.is_inertia and not self._slides(d) for d, t in self.drive_parameters]
+        return np.append(inertial, np.where(turns, length**2, 1.0))
 
     def preference(self) -> Array:
-        """Return how much each parameter is favoured as the name of a base parameter.
+        """Return how much each parameter is favoured as the name of a base parameter, shape (p,).
 
         Inertias before first moments before masses: the groups then have short expressions, for
         example 59 coefficients beside the kept columns on a UR where plain pivoting leaves 142.
-
-        Returns:
-            Factors, shape (p,).
         """
         inertial = [0.1, *[0.3] * 3, *[1.0] * 6] * len(self.bodies)
         return np.array(inertial + [term.preference for _, term in self.drive_parameters])
 
     def is_nonnegative(self) -> Array:
-        """Return which parameters cannot be negative by physics: armature, viscous, coulomb.
-
-        Returns:
-            Flags, shape (p,), bool.
-        """
+        """Return which parameters cannot be negative by physics, flags, shape (p,), bool."""
         drive = [term.is_nonnegative for _, term in self.drive_parameters]
         return np.array([False] * self.n_inertial + drive)
 
@@ -217,14 +201,9 @@ def to_paper_order(pi: Array) -> Array:
 
 
 def pseudo_inertia_basis() -> Array:
-    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k.
+    """Return the ten symmetric matrices B_k with J(pi) = sum_k pi_k B_k, shape (10, 4, 4).
 
-    Returns:
-        Basis, shape (10, 4, 4), in Pinocchio's parameter order.
-
-    References:
-        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
-        Inertial Parameter Identification, (8).
+    The parameters are in Pinocchio's order; see ``pseudo_inertia`` for the source.
     """
     basis = np.zeros((10, 4, 4))
     basis[0, 3, 3] = 1.0
@@ -266,24 +245,10 @@ def inertial_from_pseudo_inertia(J: Array) -> Array:
 
     Args:
         J: Pseudo-inertia, shape (4, 4).
-
-    Returns:
-        Inertial parameters in Pinocchio's order, shape (10,).
     """
     sigma = J[:3, :3]
-    inertia = np.trace(sigma) * np.eye(3) - sigma
-    return np.array(
-        [
-            J[3, 3],
-            *J[:3, 3],
-            inertia[0, 0],
-            inertia[0, 1],
-            inertia[1, 1],
-            inertia[0, 2],
-            inertia[1, 2],
-            inertia[2, 2],
-        ]
-    )
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = np.trace(sigma) * np.eye(3) - sigma
+    return np.array([J[3, 3], *J[:3, 3], xx, xy, yy, xz, yz, zz])
 
 
 def _by_body(pi: Array | Sequence[float]) -> Array:

@@ -7,7 +7,7 @@ matters is refused by name, and Pinocchio gets the kinematic tree alone.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -138,9 +138,6 @@ def read_tree(path: str | Path) -> Tree:
     Args:
         path: The URDF file. Meshes are not looked for.
 
-    Returns:
-        The tree.
-
     Raises:
         ModelError: If the file is missing, is no URDF, is no tree, has no movable joint, or if a
             number that the dynamics use is missing, not a number or not finite.
@@ -166,15 +163,7 @@ def read_tree(path: str | Path) -> Tree:
         for link, element in links.items()
         if (inertial := element.find("inertial")) is not None
     }
-    return Tree(
-        path=str(source),
-        name=name,
-        root=root,
-        links=tuple(links),
-        joints=joints,
-        inertials=MappingProxyType(inertials),
-        robot=robot,
-    )
+    return Tree(str(source), name, root, tuple(links), joints, MappingProxyType(inertials), robot)
 
 
 def parse_urdf(path: str | Path) -> ET.Element:
@@ -182,9 +171,6 @@ def parse_urdf(path: str | Path) -> ET.Element:
 
     Args:
         path: The URDF file.
-
-    Returns:
-        The element.
 
     Raises:
         ModelError: If the file is missing, or is no XML or another one.
@@ -240,12 +226,10 @@ def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joi
     limit, mimic = element.find("limit"), element.find("mimic")
     bounds = {}
     if limit is not None and kind != "fixed":
-        keys = ["velocity", "effort"]
-        if kind != "continuous":
-            keys += ["lower", "upper"]
+        keys = ("velocity", "effort") + (("lower", "upper") if kind != "continuous" else ())
         for key in keys:
-            if limit.get(key) is not None:
-                bounds[key] = _numbers(limit.get(key, ""), 1, f"{at}: limit {key}")[0]
+            if (text := limit.get(key)) is not None:
+                (bounds[key],) = _numbers(text, 1, f"{at}: limit {key}")
     return Joint(name, kind, ends["parent"], ends["child"], **bounds, mimic=_mimic(mimic, at))
 
 
@@ -291,13 +275,10 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    """Return the numbers of an attribute.
+    """Return the numbers of an attribute, none if a word is no finite number.
 
     Args:
         text: The attribute, numbers with blanks between them.
-
-    Returns:
-        The numbers; none if a word is no finite number.
     """
     try:
         values = tuple(float(word) for word in text.split())
@@ -315,7 +296,7 @@ def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
 
 def _copy(element: ET.Element, children: tuple[str, ...]) -> ET.Element:
     copy = ET.Element(element.tag, element.attrib)
-    copy.extend(_present(element, children))
+    copy.extend(child for tag in children if (child := element.find(tag)) is not None)
     return copy
 
 
@@ -325,13 +306,6 @@ def _minimal_joint(element: ET.Element) -> ET.Element:
         # the parser demands limits; the dynamics do not use them, `Joint` keeps the stated ones
         ET.SubElement(copy, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")
     return copy
-
-
-def _present(element: ET.Element, tags: tuple[str, ...]) -> Iterator[ET.Element]:
-    for tag in tags:
-        child = element.find(tag)
-        if child is not None:
-            yield child
 
 
 def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401

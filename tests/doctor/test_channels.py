@@ -7,14 +7,9 @@ import numpy as np
 import pytest
 
 from robotid.commands.job import LogEntry, read_job
-from robotid.doctor.channels import (
-    check_clipping,
-    check_noise,
-    check_spikes,
-    check_velocity_delay,
-    check_velocity_scale,
-)
+from robotid.doctor.channels import check_channels
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
 
 RATE, N = 500.0, 20000  # [Hz], rows of 40 s
 JOB = Path(__file__).parents[1] / "jobs" / "ur10e.toml"
@@ -33,8 +28,12 @@ def log_of_two(q=None, tau=None, moving=1.0):
     return Log(t, q, tau, ("a", "b"), v=np.gradient(q, t, axis=0), path="run.csv")
 
 
+def found_of(log, *codes, **signals):
+    return [f for f in check_channels(log, SignalSettings(**signals)) if f.code in codes]
+
+
 def spikes(log):
-    return {f.where.removeprefix("run.csv: "): f.severity for f in check_spikes(log)}
+    return {f.where.removeprefix("run.csv: "): f.severity for f in found_of(log, "spikes")}
 
 
 def flicker(step, count=17):
@@ -69,12 +68,14 @@ def test_joints_at_rest_in_a_real_recording_raise_no_alarm(recordings, monkeypat
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     job = read_job(JOB)
     path = recordings / "ur10e" / f"jointwise_{number}.parquet"
-    assert "error" not in {f.severity for f in check_spikes(job.read(LogEntry(path), job.model()))}
+    log = job.read(LogEntry(path), job.model())
+    assert "error" not in {f.severity for f in found_of(log, "spikes")}
 
 
 @pytest.mark.parametrize("value", [0.0, -0.0, 3.0])
 def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
-    (found,) = check_clipping(log_of_two(tau=np.full(N, value)))
+    log = log_of_two(tau=np.full(N, value))
+    (found,) = found_of(log, "constant_torque", "clipped")
     assert (found.code, found.where) == ("constant_torque", "run.csv: b")
     assert f"the torque of b is {abs(value):g} in every row" in found.message
 
@@ -83,16 +84,16 @@ def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
 def test_a_velocity_in_another_unit_is_told_with_its_factor(factor):
     log = log_of_two()
     scaled = replace(log, v=log.v * [1.0, factor])
-    (found,) = check_velocity_scale(scaled, "auto")
+    (found,) = found_of(scaled, "velocity_scale", velocity="auto")
     assert (found.code, found.severity, found.where) == ("velocity_scale", "error", "run.csv: b")
     assert found.evidence["factor"] == pytest.approx(factor, rel=1e-3)
-    (unused,) = check_velocity_scale(scaled, "differentiated")
+    (unused,) = found_of(scaled, "velocity_scale", velocity="differentiated")
     assert unused.severity == "note"
-    assert list(check_velocity_scale(log, "auto")) == []
+    assert found_of(log, "velocity_scale", velocity="auto") == []
 
 
 def test_the_noise_of_a_channel_is_its_standard_deviation():
-    levels = {f.where: f.evidence for f in check_noise(log_of_two()) if f.code == "noise"}
+    levels = {f.where: f.evidence for f in found_of(log_of_two(), "noise")}
     assert levels["run.csv: tau"]["a"] == pytest.approx(0.05, rel=0.05)
     assert levels["run.csv: tau"]["b"] == pytest.approx(0.05, rel=0.05)
     assert levels["run.csv: q"]["a"] < 1e-6
@@ -102,7 +103,7 @@ def test_the_noise_of_a_channel_is_its_standard_deviation():
 def test_the_delay_of_a_velocity_is_told_beyond_what_is_stated(stated):
     log = log_of_two()
     late = np.column_stack([np.interp(log.t - 0.03, log.t, v) for v in log.v.T])
-    (found,) = check_velocity_delay(replace(log, v=late), stated)
+    (found,) = found_of(replace(log, v=late), "velocity_delay", velocity_delay=stated)
     assert found.evidence["delay"] == pytest.approx(0.03 - stated, abs=1e-3)
     assert "state [signals] velocity_delay = 0.0300" in found.message
-    assert list(check_velocity_delay(log)) == []
+    assert found_of(log, "velocity_delay") == []

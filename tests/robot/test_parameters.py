@@ -64,10 +64,10 @@ def test_names_and_units_follow_the_layout():
 
 
 def test_a_coupling_of_an_unknown_joint_is_refused():
-    with pytest.raises(SettingsError, match=r"coupling 'motor' names the joints \['wrist'\]"):
+    with pytest.raises(SettingsError, match=r"coupling 'motor' names the joints wrist, which"):
         ParameterLayout(("a",), ("elbow",), couplings=(Coupling("motor", (("wrist", 1.0),)),))
 
 
 def test_an_unknown_drive_term_is_refused():
-    with pytest.raises(SettingsError, match=r"unknown drive terms \['stiction'\]"):
+    with pytest.raises(SettingsError, match="unknown drive terms stiction; known: armature"):
         ParameterLayout(("a",), ("elbow",), terms=("stiction",))
