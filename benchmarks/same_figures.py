@@ -6,7 +6,7 @@ The recordings are found by ROBOTID_DATA.
 
     python benchmarks/same_figures.py BEFORE [AFTER]    # folders of two checkouts; AFTER: this one
 
-Exits with 1 if a figure differs by more than 1e-12 of its size, is gone, or is new.
+Exits with 1 if a figure differs by more than 1e-12 of its size, or is gone.
 """
 
 import argparse
@@ -53,7 +53,7 @@ def main():
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path, nargs="?", default=HERE)
     options = parser.parse_args()
-    data, largest, unmatched = Path(os.environ["ROBOTID_DATA"]), 0.0, 0
+    data, largest, gone = Path(os.environ["ROBOTID_DATA"]), 0.0, 0
     with tempfile.TemporaryDirectory() as made:
         folders = Path(made, "before"), Path(made, "after")
         for tree, folder in zip((options.before, options.after), folders, strict=True):
@@ -62,11 +62,15 @@ def main():
         for file in sorted(files):
             old, new = (dict(figures(json.loads((f / file).read_text()))) for f in folders)
             worst = max((difference(old[k], new[k]) for k in old.keys() & new.keys()), default=0.0)
-            odd = sorted(old.keys() ^ new.keys())
-            print(f"{file}: {len(new)} figures, largest relative difference {worst:.1g}", *odd[:9])
-            largest, unmatched = max(largest, worst), unmatched + len(odd)
-    print(f"largest relative difference {largest:.1g}; figures without a counterpart: {unmatched}")
-    return int(largest > SAME or unmatched > 0)
+            odd = sorted(old.keys() - new.keys())
+            print(
+                f"{file}: {len(new)} figures, {len(new.keys() - old.keys())} of them new, "
+                f"largest relative difference {worst:.1g}; gone: {len(odd)}",
+                *odd[:9],
+            )
+            largest, gone = max(largest, worst), gone + len(odd)
+    print(f"largest relative difference {largest:.1g}; figures gone: {gone}")
+    return int(largest > SAME or gone > 0)
 
 
 if __name__ == "__main__":

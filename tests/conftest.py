@@ -10,12 +10,11 @@ from helpers.browsing import launch
 from helpers.paths import IN_CI, ROOT
 from helpers.synthetic import exact_log, truth
 
-from robotid.doctor.urdf import inspect_urdf
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
-from robotid.robot.examples import example_urdf, example_urdfs
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 
@@ -33,12 +32,6 @@ def ur5():
 def panda():
     arm = [f"panda_joint{i}" for i in range(1, 8)]
     return RobotModel.from_urdf(example_urdf("panda.urdf"), joints=arm)
-
-
-@pytest.fixture(scope="session")
-def inspections():
-    """The inspection of every example robot by its path; tests share it by one xdist group."""
-    return {path: inspect_urdf(path) for path in example_urdfs()}
 
 
 @pytest.fixture(scope="session")

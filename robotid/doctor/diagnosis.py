@@ -66,6 +66,12 @@ def diagnose(
         fitted: Logs to fit, of the model's joints in its order.
         kept: Logs kept apart to validate with.
         signals: How the logs become trajectories.
+
+    Returns:
+        The findings, errors first.
+
+    Raises:
+        SettingsError: If a setting does not fit a log.
     """
     findings: list[Finding] = []
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]

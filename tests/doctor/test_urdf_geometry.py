@@ -1,5 +1,3 @@
-import os
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -105,20 +103,3 @@ def test_a_mesh_that_is_not_found_is_one_note(tmp_path):
 def test_the_panda_of_the_examples_has_an_inertia_that_its_shape_cannot_have():
     codes = {(f.code, f.where) for f in inspect_urdf(example_urdf("panda.urdf")).findings}
     assert ("gyration", "link panda_link1") in codes
-
-
-@pytest.mark.xdist_group("every example robot")
-def test_the_table_of_all_example_robots_is_the_documents(inspections):
-    lines = ["| robot | joints | errors | warnings | which |", "|---|---|---|---|---|"]
-    for path, found in inspections.items():
-        graves = [f for f in found.findings if f.severity != "note"]
-        counts = Counter(f.code for f in graves)
-        errors = sum(f.severity == "error" for f in graves)
-        which = ", ".join(f"{code} {count}" for code, count in sorted(counts.items()))
-        name = f"{path.parent.parent.name}/{path.name}"
-        cells = [name, len(found.joints), errors, len(graves) - errors, which or "–"]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    table = "\n".join(lines) + "\n"
-    if os.environ.get("ROBOTID_WRITE_DOCS"):
-        DOCS.write_text(DOCS.read_text().split("| robot |")[0] + table)
-    assert DOCS.read_text().endswith(table)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.estimators.batch import least_squares
+from robotid.estimators import batch
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.identification import pipeline
 from robotid.identification.pipeline import EstimatorSettings, identify
@@ -137,11 +137,11 @@ def test_parameters_with_an_indefinite_mass_matrix_are_not_consistent(ur5, rng):
 def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeypatch):
     """Their change halves every two iterations: 3e-4 after 20, 2.5e-7 after 40, on any machine."""
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=60, noise=0.5)
-    monkeypatch.setattr(least_squares, "_MAX_ITERATIONS", 40)
+    monkeypatch.setattr(batch, "_MAX_ITERATIONS", 40)
     found = identify(ur5, [log], estimator="wls")
     assert "after 40 iterations, where they still change by" in found.estimate.message
     assert found.errors.stretches < 12
-    monkeypatch.setattr(least_squares, "_MAX_ITERATIONS", 20)
+    monkeypatch.setattr(batch, "_MAX_ITERATIONS", 20)
     with pytest.raises(NotConvergedError, match=r"still change by 3\.\de-04 after 20 iterations"):
         identify(ur5, [log], estimator="wls")
 

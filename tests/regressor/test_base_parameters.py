@@ -1,4 +1,3 @@
-import os
 from pathlib import Path
 
 import numpy as np
@@ -44,30 +43,6 @@ def test_number_of_base_inertial_parameters(name, expected):
     assert count(path, joints=ARM.get(name)) == fixed
     if floating is not None:
         assert count(path, free_flyer=True) == floating
-
-
-@pytest.mark.xdist_group("every example robot")
-def test_table_of_every_example_robot_is_the_one_in_the_docs(inspections):
-    lines = [
-        "| robot | joints | standard | base, fixed | base, floating |",
-        "|---|---|---|---|---|",
-    ]
-    for path, inspection in inspections.items():
-        if inspection.structure is None:
-            continue
-        fixed = inspection.structure
-        floating = RobotModel.from_urdf(path, terms=(), free_flyer=True)
-        counts = fixed.base_inertial, len(structural_mapping(floating).K)
-        assert counts[0] <= counts[1] <= floating.layout.n_inertial
-        lines.append(
-            f"| {path.parent.parent.name}/{path.name} | {len(inspection.joints)} | "
-            f"{fixed.standard} | {counts[0]} | {counts[1]} |"
-        )
-    assert len(lines) == 2 + 66
-    table = "\n".join(lines) + "\n"
-    if os.environ.get("ROBOTID_WRITE_DOCS"):
-        DOCS.write_text(DOCS.read_text().split("| robot |")[0] + table)
-    assert table in DOCS.read_text()
 
 
 def test_tx40_with_drives_and_the_wrist_coupling(recordings):

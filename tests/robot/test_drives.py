@@ -18,7 +18,7 @@ from robotid.regressor import prediction
 from robotid.regressor.prediction import predict
 from robotid.regressor.rows import COMPILED, TrajectoryRows
 from robotid.regressor.torque import InstantRegressor, joint_torque_regressor
-from robotid.report.tables import drive_table
+from robotid.report.tables import tables
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm, friction_models
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import joint_mass_matrices
@@ -135,7 +135,7 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
     drives = drive_part(model)
     if not term.is_inertia:  # that of a joint may come in a group with inertia of its body
         np.testing.assert_allclose(found.standard[drives], pi[drives], atol=1e-7)
-    html = drive_table(found).replace("<wbr>", "")
+    html = tables(found)["drives"].replace("<wbr>", "")
     lines = [re.sub(r"<[^>]*>", " ", row) for row in html.split("</tr>")[1:]]
     for name, value in zip(model.layout.drive_names, found.standard[drives], strict=True):
         (line,) = [line for line in lines if f" {name} " in line]
