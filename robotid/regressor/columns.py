@@ -39,8 +39,14 @@ class RowPlan:
     first: Array
 
 
-def drive_values(layout: ParameterLayout, v: Array, a: Array, direction: Array) -> Array:
-    """Return what each drive parameter multiplies, shape (k, N), by the speed w of its drive.
+def drive_values(
+    layout: ParameterLayout,
+    v: Array,
+    a: Array,
+    direction: Array,
+    which: Sequence[int] | None = None,
+) -> Array:
+    """Return what drive parameters multiply, shape (k, N), by the speed w of their drives.
 
     Row j of the regressor holds them times ``layout.drive_loads[j]``.
 
@@ -49,13 +55,16 @@ def drive_values(layout: ParameterLayout, v: Array, a: Array, direction: Array) 
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         direction: As of ``friction_directions``, shape (N, c).
+        which: Which k of the drive parameters, in any order; all of them if None.
     """
     R = layout.drive_ratios
     first = v.shape[1] - R.shape[1]
     w, dw = R @ v[:, first:].T, R @ a[:, first:].T  # (d, N)
     signs = direction.T if direction.shape[1] else w
-    values = np.empty((len(layout.drive_parameters), len(v)))
-    for x, (d, term) in zip(values, layout.drive_parameters, strict=True):
+    wanted = range(len(layout.drive_parameters)) if which is None else which
+    values = np.empty((len(wanted), len(v)))
+    for x, k in zip(values, wanted, strict=True):
+        d, term = layout.drive_parameters[k]
         x[:] = term.column(DriveMotion(w[d], dw[d], signs[d]))
     return values
 

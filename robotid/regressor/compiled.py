@@ -93,8 +93,10 @@ class CompiledWriter:
             q = q[:, 1:]  # the pose has one entry more than the twist
         # copies that Numba finds writable and in C order: another kind would be compiled again
         self._q, self._v, self._a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
-        values = drive_values(self._model.layout, v, a, direction)
-        self._values = np.vstack([self._ratios * values[self._drives], tau.T])
+        values = drive_values(self._model.layout, v, a, direction, self._drives)
+        if (self._ratios != 1.0).any():
+            values *= self._ratios
+        self._values = np.vstack([values, tau.T])
         self._weights = np.zeros((0, 0)) if weights is None else np.array(weights, float, order="C")
 
     def write(self, start: int, stop: int) -> None:

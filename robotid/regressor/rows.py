@@ -32,7 +32,7 @@ COMPILED = "compiled by Numba"
 
 _LANES = 64  # the compiled path works on whole groups of so many samples
 _BLOCK_SIZE = 2**18  # numbers per block, 2 MiB, if that leaves it a group of samples
-_LOADED = 32  # blocks that a writer takes at once
+_LOADED = 8  # blocks that a writer takes at once
 
 _log = logging.getLogger(__name__)
 
