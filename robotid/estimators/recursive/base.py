@@ -14,9 +14,16 @@ from robotid._files import written_whole
 from robotid._typing import Array
 from robotid.estimators.estimator import Estimate, Estimator
 from robotid.exceptions import DataError
-from robotid.regressor.problem import Sample
+from robotid.regressor.problem import Problem, Sample
 
-__all__ = ["RecursiveEstimator", "fold", "load_state", "save_state", "scaled_rows"]
+__all__ = [
+    "RecursiveEstimator",
+    "fold",
+    "load_state",
+    "require_samples",
+    "save_state",
+    "scaled_rows",
+]
 
 StateT = TypeVar("StateT")
 
@@ -144,3 +151,18 @@ def load_state(path: str | Path, kind: type[StateT]) -> StateT:
     # LAPACK wants its own order: arrays come back in the order they were saved in
     plain = {key: x if x.ndim else x.item() for key, x in content.items()}
     return kind(**plain)
+
+
+def require_samples(data: object) -> None:
+    """Refuse what holds no samples.
+
+    Args:
+        data: What was given to ``fit``.
+
+    Raises:
+        DataError: If it is no problem: factors hold no samples.
+    """
+    if not isinstance(data, Problem):
+        raise DataError(
+            "a recursive estimator reads samples, and factors hold none; give it the problem itself"
+        )

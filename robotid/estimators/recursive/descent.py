@@ -12,7 +12,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators.estimator import Estimate, Weighing, require_rows
-from robotid.estimators.recursive.base import RecursiveEstimator, fold, scaled_rows
+from robotid.estimators.recursive.base import RecursiveEstimator, fold, require_samples, scaled_rows
 from robotid.exceptions import DataError
 from robotid.regressor.problem import Problem, Sample, shuffled
 
@@ -161,6 +161,7 @@ class Descent(RecursiveEstimator[DescentState]):
         )
 
     def fit(self, data: Problem) -> Estimate:
+        require_samples(data)
         estimator, c = self, len(data.names)
         if self.scale is None and self._takes_scale:
             estimator = replace(self, scale=column_scale(data, self.sigma))

@@ -10,7 +10,13 @@ from scipy.linalg.lapack import dtpqrt
 from robotid._typing import Array
 from robotid.estimators.batch import solve_factor
 from robotid.estimators.estimator import Estimate, Weighing, require_rows
-from robotid.estimators.recursive.base import RecursiveEstimator, StateT, fold, scaled_rows
+from robotid.estimators.recursive.base import (
+    RecursiveEstimator,
+    StateT,
+    fold,
+    require_samples,
+    scaled_rows,
+)
 from robotid.exceptions import DataError, RankDeficientError
 from robotid.regressor.factors import Factors
 from robotid.regressor.problem import Problem, Sample
@@ -33,6 +39,7 @@ class Filter(RecursiveEstimator[StateT]):
         """Return the number of rows that a state rests on."""
 
     def fit(self, data: Problem) -> Estimate:
+        require_samples(data)
         c = len(data.names)
         state = fold(self, data.samples(), self.init(c))
         require_rows(self._rows_of(state), c, data.n_joints)
