@@ -180,7 +180,8 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
 
 def _doctor(options: argparse.Namespace) -> int:
     from robotid.commands.logs import examine
-    from robotid.doctor.diagnosis import alarming, findings_to_dict
+    from robotid.doctor.diagnosis import findings_to_dict
+    from robotid.identification.verdict import alarming
 
     job = job_from_flags(options)
     findings = examine(job)

@@ -8,13 +8,13 @@ from typing import Any
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
-from robotid.doctor.diagnosis import alarming, diagnose
+from robotid.doctor.diagnosis import diagnose
 from robotid.export.result import load_result, recording_metrics, stated_parameters
 from robotid.findings import Finding
 from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
 from robotid.identification.metrics import Metrics
 from robotid.identification.survey import SurveyedLog
-from robotid.identification.verdict import Doubt, Verdict, doubts_of, judge
+from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 

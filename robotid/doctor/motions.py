@@ -10,13 +10,13 @@ from robotid.estimators import WLS
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
 from robotid.findings import Finding, log_finding
-from robotid.identification.prior import prior_spread
-from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress, merge
+from robotid.regressor.used_rows import base_problem, independent_share, row_mask
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
 __all__ = ["check_excitation", "check_repeated_motion"]
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,6 @@ from robotid._files import file_sha256
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export.urdf import load_identified
-from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import Identification
@@ -41,7 +40,6 @@ _WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
 def build_result(
     identification: Identification,
     settings: Mapping[str, Any],
-    findings: Sequence[Finding] = (),
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the content of result.json, plain values only and all of them finite.
@@ -49,7 +47,6 @@ def build_result(
     Args:
         identification: What was found.
         settings: The job, in the shape of its file.
-        findings: Warnings.
         outputs: Files written beside it, by kind.
     """
     model, size = identification.model, identification.model.layout.n_inertial
@@ -85,7 +82,10 @@ def build_result(
             recording_metrics(e, "estimate") | {"band": _band(identification, e)}
             for e in identification.validation
         ],
-        "warnings": [{"code": f.code, "message": f.message, "where": f.where} for f in findings],
+        "warnings": [
+            {"code": f.code, "message": f.message, "where": f.where}
+            for f in identification.findings
+        ],
         "wls": {
             "base_values": identification.wls.theta.tolist(),
             "base_std_errors": [_finite(error) for error in identification.wls.std_error],

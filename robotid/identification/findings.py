@@ -1,13 +1,18 @@
 """What a user should know of a fit: open parameters, outliers, mass matrix, solvers, bounds."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robotid.findings import Finding
-from robotid.identification.pipeline import Identification
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
 
 __all__ = ["consistency_findings", "fit_findings", "locked_findings", "log_findings"]
 

@@ -1,13 +1,26 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
+import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from robotid.findings import Finding
+from robotid.doctor.diagnosis import CODES
+from robotid.exceptions import SettingsError
+from robotid.findings import Finding, listed
 from robotid.identification.metrics import JointMetrics, Metrics
 
-__all__ = ["DOUBTFUL", "Doubt", "JointVerdict", "Verdict", "doubts_of", "is_outvoted", "judge"]
+__all__ = [
+    "DOUBTFUL",
+    "Doubt",
+    "JointVerdict",
+    "Verdict",
+    "alarming",
+    "check_ignored",
+    "doubts_of",
+    "is_outvoted",
+    "judge",
+]
 
 _GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
 _POOR = 50.0  # [%] a joint predicted worse than this is not usable
@@ -172,6 +185,39 @@ def judge(
             "consistent"
         ]
     return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
+
+
+def check_ignored(ignore: Sequence[str]) -> None:
+    """Refuse codes to ignore that no error and no doubt has.
+
+    Args:
+        ignore: The codes.
+
+    Raises:
+        SettingsError: If a code is unknown.
+    """
+    known = sorted({*CODES, *DOUBTFUL})
+    for code in ignore:
+        if code not in known:
+            near = difflib.get_close_matches(code, known, n=1)
+            hint = f". Did you mean {near[0]!r}?" if near else ""
+            raise SettingsError(
+                f"doctor: ignore names {code!r}, wanted some of {listed(known)}{hint}"
+            )
+
+
+def alarming(
+    findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
+) -> tuple[Finding, ...]:
+    """Return the errors that make an identification wrong, but for those the user knows better.
+
+    Args:
+        findings: What was found.
+        ignore: Codes of errors that the user knows better.
+        is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
+    """
+    errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
+    return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
 
 
 def doubts_of(

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from robotid._files import write_text
 from robotid._html import code, figure, number, page, percent, table, text
-from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
@@ -31,9 +30,7 @@ _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 _SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 
 
-def write_report(
-    identification: Identification, target: str | Path, *, findings: Sequence[Finding] = ()
-) -> Path:
+def write_report(identification: Identification, target: str | Path) -> Path:
     """Write what an identification found, and how far to trust it, as one HTML file.
 
     The file fetches nothing. It is made beside its target and then put in place.
@@ -41,7 +38,6 @@ def write_report(
     Args:
         identification: What was found.
         target: The file to write.
-        findings: Warnings to show; notes of the logs that are not among them are added.
 
     Returns:
         Path of the file.
@@ -60,7 +56,7 @@ def write_report(
         "consistency": ("Physical consistency", made["consistency"]),
         "information": ("Excitation and correlation", information_section(identification)),
         "open": ("What the data do not determine", made["open"]),
-        "warnings": ("Warnings and notes", _warnings(identification, findings)),
+        "warnings": ("Warnings and notes", _warnings(identification)),
         "settings": ("Settings", made["settings"]),
         "inputs": ("Inputs", made["inputs"]),
         "versions": ("Versions", made["versions"]),
@@ -223,22 +219,14 @@ def _standard(found: Identification) -> str:
     )
 
 
-def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
-    known = [finding.message for finding in findings]
-    notes = [
-        Finding("log_note", "note", str(e.recording.log.path), note)
-        for e in (*found.fitted, *found.validation)
-        for note in e.recording.log.notes
-        if not any(message.endswith(note) for message in known)
-    ]
-    if not findings and not notes:
+def _warnings(found: Identification) -> str:
+    if not found.findings:
         return "<p>None.</p>\n"
-    every = [*findings, *notes]
     html = ""
     for severity, title in _SEVERITIES.items():
         rows = [
             [code(f.code), text(f.message, flag=severity == "error"), code(f.where)]
-            for f in every
+            for f in found.findings
             if f.severity == severity
         ]
         if rows:

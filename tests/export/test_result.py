@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "n
 @pytest.fixture(scope="module")
 def result(identified):
     settings = {"estimator": {"name": "consistent"}}
-    return build_result(identified, settings, FINDINGS, {"report": "report.html"})
+    return build_result(replace(identified, findings=FINDINGS), settings, {"report": "report.html"})
 
 
 def test_the_head_says_what_was_identified_and_how(result, identified):
