@@ -59,7 +59,7 @@ def run_job(
     with folder_beside(target) as partial:
         outputs = {"report": "report.html"}
         name = f"{Path(model.tree.path).stem}.identified.urdf"
-        if identification.is_consistent:
+        if identification.has_urdf:
             sidecar = write_urdf(
                 model, identification.standard, partial / name, dynamics=job.dynamics
             )

@@ -127,7 +127,7 @@ class Result:
 
     @property
     def has_urdf(self) -> bool:
-        """Whether the identified URDF was written: it is if the parameters are possible."""
+        """Whether the identified URDF was written: none is of a result that cannot be right."""
         return "urdf" in self.content["outputs"]
 
     @cached_property
@@ -135,8 +135,8 @@ class Result:
         """The robot of the identified URDF with its sidecar, and its standard parameters."""
         if not self.has_urdf:
             raise DataError(
-                f"{self.path.name} has no URDF, for its parameters are not physically consistent; "
-                "identify with the 'consistent' estimator"
+                f"{self.path.name} has no URDF, for its parameters are wrong or impossible: "
+                f"{self.verdict['reasons'][0]}"
             )
         outputs, folder = self.content["outputs"], self.path.parent
         return load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])

@@ -18,7 +18,7 @@ from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
-from robotid.identification.findings import fit_findings, log_findings
+from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.recordings import Recordings
@@ -134,6 +134,11 @@ class Identification:
         signs = self.standard[self.model.layout.is_nonnegative()]
         is_possible = bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
         return is_possible and self.mass_matrix.is_positive
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF may be written of it: it is possible, and no fault makes it wrong."""
+        return self.is_consistent and not self.alarms
 
     @property
     def mass_matrix(self) -> MassMatrixCheck:
@@ -273,14 +278,16 @@ def conclude(
         fit = _fitted(recordings, choice)
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
+    told += fit_findings(fit)
+    alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
-    findings = [*log_findings(heads), *impossible_inertials(model), *told, *fit_findings(fit)]
+    findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
     counted = [finding for finding in findings if finding.code not in ignore]
     names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
     return replace(
         fit,
         findings=tuple(findings),
-        alarms=tuple(f.message for f in alarming(counted, (), is_robust=is_robust)),
+        alarms=tuple(finding.message for finding in alarms),
         doubts=doubts_of(counted, model.joints, names, is_robust=is_robust),
     )
 

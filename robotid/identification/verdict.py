@@ -54,6 +54,7 @@ _WORDS = {
 }
 #: Codes of the warnings that make a result doubtful.
 DOUBTFUL = (*_WORDS, "repeated_motion")
+_OF_RESULTS = ("total_mass",)  # errors that a result alone can show
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
 _OF_THE_FIT = ("estimator", "standard_parameters")  # places that are no recording
 
@@ -196,7 +197,7 @@ def check_ignored(ignore: Sequence[str]) -> None:
     Raises:
         SettingsError: If a code is unknown.
     """
-    known = sorted({*CODES, *DOUBTFUL})
+    known = sorted({*CODES, *DOUBTFUL, *_OF_RESULTS})
     for code in ignore:
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)

@@ -235,7 +235,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
         f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
-    assert main(words) == 0
+    assert main(words) == 1
     result = json.loads(capsys.readouterr().out)
     assert result["verdict"]["status"] == "poor"
     assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
