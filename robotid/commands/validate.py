@@ -9,7 +9,13 @@ from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import diagnose
-from robotid.export.result import load_result, recording_metrics, stated_parameters
+from robotid.export.result import (
+    load_result,
+    recording_metrics,
+    stated_parameters,
+    stated_urdf_with_drives,
+    stated_witness,
+)
 from robotid.findings import Finding
 from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
 from robotid.identification.metrics import Metrics
@@ -51,7 +57,8 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     prior = source.standard_parameters()
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
     (kept,) = survey_logs(job, model, entries)
-    _, evaluations = evaluate_logs((), kept, parameters, prior)
+    driven = stated_urdf_with_drives(result, source)
+    _, evaluations = evaluate_logs((), kept, parameters, prior, driven)
     verdict = _verdict(job, source, result, evaluations, kept)
     return {
         "result": str(path),
@@ -106,6 +113,7 @@ def _verdict(
         alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
         refitted=[e.recording.name for e in compress(evaluations, again)],
+        witness=stated_witness(result),
     )
 
 

@@ -18,6 +18,7 @@ from robotid.export.urdf import load_identified
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import Identification
+from robotid.identification.witness import Witness
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -30,6 +31,8 @@ __all__ = [
     "read_result",
     "recording_metrics",
     "stated_parameters",
+    "stated_urdf_with_drives",
+    "stated_witness",
 ]
 
 SCHEMA_VERSION = 1
@@ -75,7 +78,14 @@ def build_result(
             "inflation": identification.errors.inflation,
         },
         "standard_parameters": _entries(identification, range(size)),
-        "drive_parameters": _entries(identification, range(size, len(identification.standard))),
+        "drive_parameters": [
+            entry | {"with_urdf": float(value)}
+            for entry, value in zip(
+                _entries(identification, range(size, len(identification.standard))),
+                identification.urdf_with_drives[size:],
+                strict=True,
+            )
+        ],
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
@@ -92,6 +102,7 @@ def build_result(
             "identification": identification.metrics("wls").to_dict(),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
+        "witness": identification.witness.to_dict(),
         "verdict": identification.verdict.to_dict(),
     }
 
@@ -207,6 +218,33 @@ def read_result(path: str | Path) -> dict[str, Any]:
     if missing:
         raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
     return dict(result)
+
+
+def stated_witness(result: Mapping[str, Any]) -> Witness | None:
+    """Return what speaks for the scale of a result, if it says so.
+
+    Args:
+        result: Content of a result.json.
+    """
+    stated = result.get("witness")
+    if stated is None:
+        return None
+    return Witness(**{each.name: stated[each.name] for each in dataclasses.fields(Witness)})
+
+
+def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:
+    """Return the URDF's bodies with the drives that fit best beside them, if a result states them.
+
+    Args:
+        result: Content of a result.json.
+        model: The robot.
+    """
+    drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
+    if None in drives:
+        return None
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = drives
+    return pi
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.findings import Finding, listed
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
+from robotid.robot.geometry import body_points
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -52,6 +55,7 @@ def fit_findings(identification: Identification) -> list[Finding]:
         findings.append(Finding("undetermined", "warning", "base_parameters", message))
     findings += consistency_findings(identification)
     findings += _total_mass(identification)
+    findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
     for evaluation in identification.refitted:
         message = (
@@ -200,6 +204,26 @@ def _total_mass(identification: Identification) -> list[Finding]:
     )
     evidence = {"urdf": before, "identified": after}
     return [Finding("total_mass", "error", "standard_parameters", message, evidence)]
+
+
+def _impossible_shapes(identification: Identification) -> list[Finding]:
+    """Return which identified bodies cannot be so in their geometry; as notes where the URDF's."""
+    model, points = identification.model, body_points(identification.model)
+    before = {
+        (finding.code, finding.where)
+        for finding in audit_bodies(model, identification.prior, points)
+    }
+    findings = []
+    for finding in audit_bodies(model, identification.standard, points):
+        if (finding.code, finding.where) in before:
+            message = f"{finding.message.partition(';')[0]}; so it is in the URDF already"
+            finding = replace(finding, severity="note", message=message)
+        else:
+            said = finding.message.partition(";")[0]
+            message = f"as identified, {said}; record more motion of it, or pin it to the URDF"
+            finding = replace(finding, message=message)
+        findings.append(finding)
+    return findings
 
 
 def _outlier_findings(identification: Identification) -> list[Finding]:

@@ -17,6 +17,7 @@ from robotid.estimators.estimator import Weighing
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
 from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
@@ -43,7 +44,9 @@ from robotid.identification.verdict import (
     check_ignored,
     doubts_of,
     judge,
+    settled,
 )
+from robotid.identification.witness import Witness, call_witness
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
@@ -72,6 +75,7 @@ class Identification:
         estimate: What the estimator returned: base parameters, or standard ones ("consistent").
         wls: Weighted least squares on the same factors, base parameters.
         prior: Standard parameters of the URDF, shape (p,).
+        urdf_with_drives: The same with the drive terms that then fit best, shape (p,).
         prior_std: How far they may plausibly be wrong, shape (p,).
         standard: Standard parameters, shape (p,).
         standard_covariance: Their covariance given the prior, shape (p, p).
@@ -94,6 +98,7 @@ class Identification:
     estimate: Estimate
     wls: Estimate
     prior: Array
+    urdf_with_drives: Array
     prior_std: Array
     standard: Array
     standard_covariance: Array
@@ -202,18 +207,29 @@ class Identification:
         return tuple(e for e in self.validation if e.is_refitted)
 
     @property
+    def predictions(self) -> dict[str, Metrics]:
+        """Metrics of each validation recording that shows a prediction, by its name."""
+        kept = (e for e in self.validation if not e.is_refitted)
+        return {e.recording.name: e.metrics["estimate"] for e in kept}
+
+    @cached_property
+    def witness(self) -> Witness:
+        """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
+        return call_witness(self)
+
+    @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        kept = [e for e in self.validation if not e.is_refitted]
         return judge(
             self.metrics(),
-            {e.recording.name: e.metrics["estimate"] for e in kept},
+            self.predictions,
             undetermined=self.determination.undetermined,
             is_consistent=self.is_consistent,
             joints=self.model.joints,
             alarms=self.alarms,
             doubts=self.doubts,
             refitted=[e.recording.name for e in self.refitted],
+            witness=self.witness,
         )
 
 
@@ -278,7 +294,7 @@ def conclude(
         fit = _fitted(recordings, choice)
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
-    told += fit_findings(fit)
+    told = settled([*told, *fit_findings(fit)], fit.predictions, fit.witness)
     alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
@@ -313,8 +329,10 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     candidates = {"estimate": standard, "wls": mapping.to_standard(wls.theta, prior, spread)}
+    sigma = ground.before.sigma
+    driven = urdf_with_drives(model, mapping, ground.factors, sigma, ground.before.spread)
     fitted, kept = evaluate_logs(
-        recordings.fitted, recordings.kept, candidates, prior, plan=recordings.plan
+        recordings.fitted, recordings.kept, candidates, prior, driven, plan=recordings.plan
     )
     is_base = estimate.names == mapping.base_names
     return Identification(
@@ -324,6 +342,7 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
         estimate=estimate,
         wls=wls,
         prior=prior,
+        urdf_with_drives=driven,
         prior_std=spread if estimate.prior_std is None else estimate.prior_std,
         standard=standard,
         standard_covariance=covariance,

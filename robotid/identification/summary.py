@@ -59,17 +59,20 @@ def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None
     """
     others = {} if wls is None else wls["per_joint"]
     width = max(len(joint) for joint in metrics["per_joint"])
-    lines = [f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %"]
+    lines = [
+        f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %  urdf + drives %"
+    ]
     for joint, m in metrics["per_joint"].items():
-        error, urdf, gravity = (
-            m[f"{of}relative_error_pct"] for of in ("", "urdf_", "gravity_only_")
+        error, urdf, gravity, driven = (
+            m.get(f"{of}relative_error_pct")
+            for of in ("", "urdf_", "gravity_only_", "urdf_with_drives_")
         )
         cells = [cell(others.get(joint, {}).get("relative_error_pct")), cell(urdf)]
         rmse = f"{m['rmse']:.3g} {m['unit']}"
         flag = "" if m["better_than_constant"] else "  worse than a constant"
         lines.append(
             f"  {joint:{width}}  {cell(error)}   {rmse:10}{' '.join(cells)}  {cell(gravity, 9)}"
-            f"{flag}"
+            f"  {cell(driven, 15)}{flag}"
         )
     return lines
 

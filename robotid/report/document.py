@@ -6,6 +6,7 @@ from pathlib import Path
 
 from robotid._files import write_text
 from robotid._html import code, figure, number, page, percent, table, text
+from robotid.findings import listed
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
@@ -81,9 +82,21 @@ def _summary(found: Identification) -> str:
     return (
         f"<h1>{escape(found.model.name)}</h1>\n"
         f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
-        f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n"
+        f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n<p>{escape(_beside(found))}</p>\n"
         f'<p class="note">Written by robotid {__version__}. SI units throughout; inertial '
         "parameters in Pinocchio's order, inertias about the joint frame.</p>\n"
+    )
+
+
+def _beside(found: Identification) -> str:
+    """Return masses, gravity and friction in a sentence, beside which a verdict is read."""
+    witness = found.witness
+    shares = [f"{joint} {100 * share:.0f} %" for joint, share in witness.friction.items()]
+    before, after, _ = witness.masses
+    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in witness.gravity.items()]
+    return (
+        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: "
+        f"{listed(gravity)}. Friction as a share of the torque: {listed(shares)}."
     )
 
 
@@ -115,21 +128,21 @@ def _errors(found: Identification) -> str:
     return (
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
         "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
-        "without drive parameters, of its gravity torque alone, and of predicting zero.</p>\n"
-        + "".join(parts)
+        "without drive parameters, of the URDF's bodies with drive terms fitted to the same logs, of "
+        "the URDF's gravity torque alone, and of predicting zero.</p>\n" + "".join(parts)
     )
 
 
 def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metrics) -> str:
     headers = ["joint", "error %", "RMSE", "unit", "R²", "rows", "WLS %", "URDF %"]
-    headers += ["gravity only %", "zero %", "verdict", "remark"]
+    headers += ["URDF + drives %", "gravity only %", "zero %", "verdict", "remark"]
     rows, verdicts = [], found.verdict.joints
     for name in found.model.row_names:
         m, status = ours.per_joint.get(name), verdicts[name].status if name in verdicts else "–"
         if m is None:
             dash = number(None)
             nothing = text("does not move: no rows used")
-            rows.append([code(name), dash, dash, text(""), *[dash] * 6, text(status), nothing])
+            rows.append([code(name), dash, dash, text(""), *[dash] * 7, text(status), nothing])
             continue
         rows.append(
             [
@@ -141,6 +154,7 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
                 number(m.rows, "d"),
                 percent(wls.per_joint[name].relative_error_pct),
                 percent(m.baselines["urdf"]),
+                percent(m.baselines.get("urdf_with_drives")),
                 percent(m.baselines["gravity_only"]),
                 percent(None if m.relative_error_pct is None else 100.0),
                 text(status, flag=status == "poor"),
