@@ -108,6 +108,7 @@ def _verdict(
         Metrics({}, 0.0),
         {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
         undetermined=result["structure"]["undetermined"],
+        is_poorly_excited=result["structure"].get("poorly_excited", True),
         is_consistent=result["consistency"]["is_consistent"],
         joints=model.joints,
         alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators import WLS
+from robotid.estimators import WLS, Estimate
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
 from robotid.findings import Finding, log_finding
@@ -18,7 +18,7 @@ from robotid.regressor.used_rows import base_problem, independent_share, row_mas
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = ["check_excitation", "check_repeated_motion"]
+__all__ = ["check_excitation", "check_repeated_motion", "is_poorly_excited"]
 
 _AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] positions compared: the same now and in a second
 _NEAR = 0.02  # of the range of each joint
@@ -105,7 +105,7 @@ def check_excitation(
         f"the motion determines {known.rank} of {len(mapping.K)} base parameters "
         f"(condition number {found.condition:.3g})"
     )
-    is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
+    is_poor = is_poorly_excited(found, len(mapping.K))
     if known.groups:
         advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
         message += f": {known.in_words()}; {advice}"
@@ -117,6 +117,16 @@ def check_excitation(
         message += "; nothing needs doing"
     severity = "warning" if known.groups and is_poor else "note"
     yield log_finding(name, "excitation", severity, message, **evidence)
+
+
+def is_poorly_excited(wls: Estimate, count: int) -> bool:
+    """Return whether it is the motion, not the noise, that leaves base parameters open.
+
+    Args:
+        wls: Weighted least squares on the motion.
+        count: Number of base parameters.
+    """
+    return wls.rank < count or wls.condition > _ILL_CONDITIONED
 
 
 def _every(step: int, motion: Trajectory) -> Trajectory:

@@ -69,6 +69,7 @@ def build_result(
             "rank": identification.determination.rank,
             "condition": _finite(identification.wls.condition),
             "undetermined": list(identification.determination.undetermined),
+            "poorly_excited": identification.is_poorly_excited,
             "not_told_apart": identification.determination.to_list(),
         },
         "base_parameters": _base_parameters(identification),

@@ -52,7 +52,8 @@ def fit_findings(identification: Identification) -> list[Finding]:
             f"{known.in_words()}. What they leave open keeps the URDF's values; record a richer "
             "trajectory to determine it"
         )
-        findings.append(Finding("undetermined", "warning", "base_parameters", message))
+        severity = "warning" if identification.is_poorly_excited else "note"
+        findings.append(Finding("undetermined", severity, "base_parameters", message))
     findings += consistency_findings(identification)
     findings += _total_mass(identification)
     findings += _impossible_shapes(identification)

@@ -10,6 +10,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.diagnosis import diagnose
+from robotid.doctor.motions import is_poorly_excited
 from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.estimators import WLS, Consistent, Estimate
 from robotid.estimators.determination import Determination, base_spread, determine
@@ -207,6 +208,11 @@ class Identification:
         return tuple(e for e in self.validation if e.is_refitted)
 
     @property
+    def is_poorly_excited(self) -> bool:
+        """Whether the motion, not the noise, leaves parameters open that a richer one would not."""
+        return is_poorly_excited(self.wls, len(self.base))
+
+    @property
     def predictions(self) -> dict[str, Metrics]:
         """Metrics of each validation recording that shows a prediction, by its name."""
         kept = (e for e in self.validation if not e.is_refitted)
@@ -224,6 +230,7 @@ class Identification:
             self.metrics(),
             self.predictions,
             undetermined=self.determination.undetermined,
+            is_poorly_excited=self.is_poorly_excited,
             is_consistent=self.is_consistent,
             joints=self.model.joints,
             alarms=self.alarms,

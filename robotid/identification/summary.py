@@ -18,6 +18,7 @@ __all__ = [
     "identification_html",
     "identification_line",
     "identification_text",
+    "verdict_cell",
     "verdict_lines",
 ]
 
@@ -84,10 +85,26 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
         verdict: Status, reasons and joints, as in result.json.
     """
     lines = [f"verdict: {verdict['status']}", *(f"  - {reason}" for reason in verdict["reasons"])]
-    by_status: dict[str, list[str]] = {}
+    by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
-        by_status.setdefault(joint["status"], []).append(name)
-    return lines + [f"  {status}: {', '.join(names)}" for status, names in by_status.items()]
+        by_cell.setdefault(verdict_cell(name, joint), []).append(name)
+    return lines + [f"  {', '.join(names)}: {said}" for said, names in by_cell.items()]
+
+
+def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
+    """Return the verdict on a joint with its first reason, as in "usable: predicted to 20 %".
+
+    Args:
+        joint: The joint.
+        verdict: Its status and reasons, as in result.json.
+    """
+    status, reasons = verdict["status"], verdict["reasons"]
+    if status == "good" or not reasons:
+        return str(status)
+    why = reasons[0]
+    if why.partition(": ")[0] == joint or joint in why.partition(": ")[0].split(", "):
+        why = why.partition(": ")[2]
+    return f"{status}: {why}"
 
 
 def cell(value: float | None, width: int = 7) -> str:

@@ -67,6 +67,7 @@ _WORDS = {
 #: Codes of the warnings that make a result doubtful.
 DOUBTFUL = (*_WORDS, "repeated_motion")
 _OF_RESULTS = ("total_mass",)  # errors that a result alone can show
+_NAMED = 8  # parameters that a reason names
 _HYPOTHESES = ("current_for_torque", "unexplained_torque", "urdf_mismatch")
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
 _OF_THE_FIT = ("estimator", "standard_parameters")  # places that are no recording
@@ -138,6 +139,7 @@ def judge(
     *,
     undetermined: Sequence[str],
     is_consistent: bool,
+    is_poorly_excited: bool = True,
     joints: Sequence[str] = (),
     alarms: Sequence[str] = (),
     doubts: Sequence[Doubt] = (),
@@ -151,6 +153,7 @@ def judge(
         validation: Metrics of each kept recording, by its name.
         undetermined: Base parameters that the data do not determine by themselves.
         is_consistent: Whether the parameters are physically possible.
+        is_poorly_excited: Whether a richer motion would determine them; else noise hides them.
         joints: The model's joints; one without a row in any recording is not evaluated.
         alarms: Faults of the recordings that make any result of them wrong.
         doubts: Why the result may be wrong however well it predicts.
@@ -176,10 +179,10 @@ def judge(
     if witness is not None and witness.is_against:
         reasons.append(witness.message)
     reasons += _unseen(names, identification, validation)
-    if undetermined:
+    if undetermined and is_poorly_excited:
         reasons.append(
             f"the data do not determine {len(undetermined)} base parameters by themselves: "
-            f"{list(undetermined)}"
+            f"{listed(undetermined, _NAMED)}"
         )
     if not is_consistent:
         reasons.append(
@@ -203,6 +206,11 @@ def judge(
             "better than by a constant and than by the URDF, and every parameter is physically "
             "consistent"
         ]
+    if undetermined and not is_poorly_excited:
+        reasons.append(
+            f"{len(undetermined)} base parameters are lost in the noise of a rich motion and keep "
+            f"the URDF's values: {listed(undetermined, _NAMED)}"
+        )
     if witness is not None and not witness.is_against:
         reasons.append(witness.message)
     return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
@@ -389,10 +397,12 @@ def _judge_joint(
     if error > _POOR:
         return [f"{joint}: predicted to {error:.1f} % only on {log}"], []
     if error > _GOOD:
-        return [], [f"{joint}: predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"]
+        why = f"predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"
+        return [], [f"{joint}: {why}; see in the report what its residual holds"]
     if fitted is not None and error > max(_OPTIMISM * _error(fitted), 5.0):
         return [], [
-            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted"
+            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted; "
+            "record a richer motion to fit"
         ]
     if _is_beaten(measured):
         driven = measured.baselines["urdf_with_drives"]

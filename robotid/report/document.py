@@ -1,6 +1,7 @@
 """The report: one HTML file that reads without a network, on a screen, a phone or paper."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
+from robotid.identification.summary import verdict_cell
 from robotid.logs.settings import SignalSettings
 from robotid.report.diagnosis import (
     body_figures,
@@ -128,8 +130,8 @@ def _errors(found: Identification) -> str:
     return (
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
         "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
-        "without drive parameters, of the URDF's bodies with drive terms fitted to the same logs, of "
-        "the URDF's gravity torque alone, and of predicting zero.</p>\n" + "".join(parts)
+        "without drive parameters, of the URDF's bodies with drive terms fitted to the same rows, "
+        "of the URDF's gravity torque alone, and of predicting zero.</p>\n" + "".join(parts)
     )
 
 
@@ -138,7 +140,9 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
     headers += ["URDF + drives %", "gravity only %", "zero %", "verdict", "remark"]
     rows, verdicts = [], found.verdict.joints
     for name in found.model.row_names:
-        m, status = ours.per_joint.get(name), verdicts[name].status if name in verdicts else "–"
+        m, status = ours.per_joint.get(name), "–"
+        if name in verdicts:
+            status = verdict_cell(name, asdict(verdicts[name]))
         if m is None:
             dash = number(None)
             nothing = text("does not move: no rows used")
@@ -157,7 +161,7 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
                 percent(m.baselines.get("urdf_with_drives")),
                 percent(m.baselines["gravity_only"]),
                 percent(None if m.relative_error_pct is None else 100.0),
-                text(status, flag=status == "poor"),
+                text(status, flag=status.startswith("poor")),
                 text(_remark(m), flag=True),
             ]
         )
