@@ -81,7 +81,7 @@ def check_excitation(
         noise of a rich one or all are determined.
     """
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
-    thinned = [_every(step, motion) for motion in motions]
+    thinned = [motion.every(step) for motion in motions]
     try:
         masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
         problems = (
@@ -127,16 +127,6 @@ def is_poorly_excited(wls: Estimate, count: int) -> bool:
         count: Number of base parameters.
     """
     return wls.rank < count or wls.condition > _ILL_CONDITIONED
-
-
-def _every(step: int, motion: Trajectory) -> Trajectory:
-    """Return every so many rows of a motion."""
-    if step == 1:
-        return motion
-    rows, m = slice(None, None, step), motion
-    direction = None if m.direction is None else m.direction[rows]
-    arrays = (m.t[rows], m.q[rows], m.v[rows], m.a[rows], m.tau[rows])
-    return Trajectory(*arrays, m.joints, None, m.segment[rows], direction=direction)
 
 
 def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.findings import Finding, listed
+from robotid.identification.calibration import calibration_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
 from robotid.robot.geometry import body_points
@@ -56,6 +57,7 @@ def fit_findings(identification: Identification) -> list[Finding]:
         findings.append(Finding("undetermined", severity, "base_parameters", message))
     findings += consistency_findings(identification)
     findings += _total_mass(identification)
+    findings += calibration_findings(identification)
     findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
     for evaluation in identification.refitted:

@@ -45,7 +45,7 @@ from robotid.identification.verdict import (
     check_ignored,
     doubts_of,
     judge,
-    settled,
+    refuted,
 )
 from robotid.identification.witness import Witness, call_witness
 from robotid.logs.data import Log
@@ -301,7 +301,7 @@ def conclude(
         fit = _fitted(recordings, choice)
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
-    told = settled([*told, *fit_findings(fit)], fit.predictions, fit.witness)
+    told = refuted([*told, *fit_findings(fit)], fit.predictions, fit.witness)
     alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]

@@ -23,7 +23,7 @@ __all__ = [
     "doubts_of",
     "is_outvoted",
     "judge",
-    "settled",
+    "refuted",
 ]
 
 _BEATEN = 1.05  # the URDF with fitted drives is better if it misses this many times less, ...
@@ -38,6 +38,8 @@ _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
 #: Warnings that make a result doubtful, in words that a verdict can hold. A word in braces is a
 #: figure of the evidence.
 _WORDS = {
+    "angle_scale": "the angles may be in another scale: divided by 1 + {fault:.3f} they leave "
+    "{share_pct:.0f} % less",
     "bound_binds": "the data, or the masses that it leaves, speak against a stated bound",
     "com_outside": "its centre of mass lies {outside:.2g} m outside its geometry: no such body",
     "clipped": "the torque is clipped at a limit",
@@ -59,6 +61,9 @@ _WORDS = {
     "solvers_differ": "two solvers found different parameters",
     "torque_delay": "the torque is late against the position by {delay:.3f} s",
     "torque_order": "the torque may be that of another joint",
+    "time_scale": "the clock may run in another scale: time divided by 1 + {fault:.3f} leaves "
+    "{share_pct:.0f} % less",
+    "torque_scale": "the torque may be in another scale than the other joints', by 1 + {fault:.2f}",
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
@@ -70,7 +75,7 @@ _OF_RESULTS = ("total_mass",)  # errors that a result alone can show
 _NAMED = 8  # parameters that a reason names
 _HYPOTHESES = ("current_for_torque", "unexplained_torque", "urdf_mismatch")
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
-_OF_THE_FIT = ("estimator", "standard_parameters")  # places that are no recording
+_OF_THE_FIT = ("estimator", "recordings", "standard_parameters")  # places that are no recording
 
 
 @dataclass(frozen=True)
@@ -249,7 +254,7 @@ def alarming(
     return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
 
 
-def settled(
+def refuted(
     findings: Sequence[Finding], kept: Mapping[str, Metrics], witness: Witness
 ) -> list[Finding]:
     """Return findings, hypotheses that a prediction of unseen motion refutes as notes.

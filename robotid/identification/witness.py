@@ -99,10 +99,12 @@ class Witness:
 
     @property
     def _off(self) -> float:
-        """How far scale and total mass are off, a payload left out [-]."""
+        """How far gravity and total mass are off, a payload left out if it explains them [-]."""
         before, after, payload = self.masses
-        mass = abs((after - payload) / before - 1.0) if before > 0 else np.inf
-        return max(mass, 0.0 if self.scale is None else abs(self.scale - 1.0))
+        if not before > 0:
+            return np.inf
+        with_load = max(abs((after - payload) / before - 1.0), abs((self.scale or 1.0) - 1.0))
+        return min(with_load, max(abs(after / before - 1.0), abs(self.factor - 1.0)))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""

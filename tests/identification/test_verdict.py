@@ -7,7 +7,7 @@ from robotid.commands.job import job_from_settings
 from robotid.commands.validate import validate_result
 from robotid.findings import Finding
 from robotid.identification.metrics import JointMetrics, Metrics
-from robotid.identification.verdict import Doubt, doubts_of, is_outvoted, judge, settled
+from robotid.identification.verdict import Doubt, doubts_of, is_outvoted, judge, refuted
 from robotid.identification.witness import Witness
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -356,28 +356,28 @@ def test_the_urdf_with_fitted_drives_is_to_be_beaten():
     assert tie.status == "good"
 
 
-def settled_code(code, error, gravity=None, where="run.csv", more=()):
+def refuted_code(code, error, gravity=None, where="run.csv", more=()):
     witness = Witness(gravity=gravity or {}, gravity_error=gravity or {})
     kept = {"val.csv": Metrics({"a": joint(error), "b": joint(1.0)}, 1.0)}
-    return settled([finding(code, where), *more], kept, witness)[0].severity
+    return refuted([finding(code, where), *more], kept, witness)[0].severity
 
 
 def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
-    assert settled_code("urdf_mismatch", 1.0) == "note"
-    assert settled_code("urdf_mismatch", 5.1) == "warning"
-    assert settled_code("clipped", 1.0) == "warning"
-    assert settled_code("current_for_torque", 1.0, {"a": 1.3}) == "note"
-    assert settled_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
-    assert settled_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
-    assert settled_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
+    assert refuted_code("urdf_mismatch", 1.0) == "note"
+    assert refuted_code("urdf_mismatch", 5.1) == "warning"
+    assert refuted_code("clipped", 1.0) == "warning"
+    assert refuted_code("current_for_torque", 1.0, {"a": 1.3}) == "note"
+    assert refuted_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
+    assert refuted_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
+    assert refuted_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
     seen = [finding("repeated_motion", "val.csv")]
-    assert settled_code("urdf_mismatch", 1.0, more=seen) == "warning"
+    assert refuted_code("urdf_mismatch", 1.0, more=seen) == "warning"
 
 
 @pytest.mark.parametrize(
     ("witness", "status", "said"),
     [
-        (Witness(scale=0.97, factor=0.97, masses=(10.0, 10.2, 0.0)), "good", "agree with"),
+        (Witness(scale=0.97, factor=0.97, masses=(10.0, 10.2, 0.0)), "good", "agree within"),
         (Witness(scale=0.8, factor=0.8, masses=(10.0, 9.0, 0.0)), "good", "could not be checked"),
         (Witness(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0)), "usable", "rests on the sensors"),
         (
@@ -386,7 +386,7 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
             "All joints alike are off by 0.80",
         ),
         (Witness(scale=1.0, factor=1.0, masses=(10.0, 15.0, 0.0)), "usable", "15 kg against"),
-        (Witness(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "agree with"),
+        (Witness(scale=1.0, factor=1.4, masses=(10.0, 15.0, 5.0)), "good", "agree within"),
         (Witness(scale=0.6, factor=0.6, masses=(10.0, 9.0, 0.0), is_stated=True), "good", "stated"),
     ],
 )
