@@ -54,21 +54,6 @@ _SAID = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of recordings over their usual residual, 0 where they are not used.
-
-    Attributes:
-        W: Regressor of the base parameters over their spread before the data, shape (N n, b).
-        r: Residual of the result, shape (N n,).
-        F: Columns of the faults, shape (N n, k).
-    """
-
-    W: Array
-    r: Array
-    F: Array
-
-
 @dataclass(frozen=True)
 class _Trial:
     """What a fault explains beside the base parameters and the faults before it."""
@@ -89,12 +74,17 @@ def calibration_findings(found: Identification) -> list[Finding]:
     if found.model.free_flyer or not kept:
         return []
     names = _names(found)
+    b, size = len(found.base), len(found.base) + len(names)
     own, other = (_rows(found, some) for some in (found.fitted, kept))
+    own = np.vstack([own, np.eye(size, size + 1)])  # 0 +- 1 before the data
+    own, other = (np.asarray(np.linalg.qr(rows, mode="r")) for rows in (own, other))
     chosen: list[int] = []
     findings = []
-    before = _try(own, other, [])
+    before = _try(own, other, b, [])
     while len(chosen) < _MOST:
-        trials = {k: _try(own, other, [*chosen, k]) for k in range(len(names)) if k not in chosen}
+        trials = {
+            k: _try(own, other, b, [*chosen, k]) for k in range(len(names)) if k not in chosen
+        }
         sure = {
             k: trial
             for k, trial in trials.items()
@@ -122,17 +112,14 @@ def _finding(code: str, joint: str, fault: float, share: float) -> Finding:
     return Finding(code, "warning", joint or "recordings", message, evidence)
 
 
-def _try(own: _Rows, other: _Rows, which: Sequence[int]) -> _Trial:
-    """Fit base parameters and some faults, all with a prior of 0 +- 1."""
-    X = np.hstack([own.W, own.F[:, which]])
-    H = X.T @ X + np.eye(X.shape[1])
-    x = np.linalg.solve(H, X.T @ own.r)
-    fitted = float(np.sum((own.r - X @ x) ** 2))
-    kept = float(np.sum((other.r - np.hstack([other.W, other.F[:, which]]) @ x) ** 2))
-    last = np.zeros(len(x))
-    last[-1] = 1.0
-    error = float(np.sqrt(last @ np.linalg.solve(H, last)))
-    return _Trial(float(x[-1]), abs(float(x[-1])) / error, fitted, kept)
+def _try(own: Array, other: Array, b: int, which: Sequence[int]) -> _Trial:
+    """Fit b base parameters and some faults to triangular factors of [W F r]."""
+    columns = [*range(b), *(b + k for k in which)]
+    R = np.linalg.qr(own[:, [*columns, -1]], mode="r")
+    x = np.linalg.solve(R[:-1, :-1], R[:-1, -1])
+    kept = float(np.sum((other[:, -1] - other[:, columns] @ x) ** 2))
+    std_errors = abs(float(x[-1] * R[-2, -2]))
+    return _Trial(float(x[-1]), std_errors, float(R[-1, -1] ** 2), kept)
 
 
 def _names(found: Identification) -> list[tuple[str, str]]:
@@ -143,8 +130,12 @@ def _names(found: Identification) -> list[tuple[str, str]]:
     return [*whole, *zeros, *(("torque_scale", joint) for joint in joints)]
 
 
-def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> _Rows:
-    """Return rows spread over recordings."""
+def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> Array:
+    """Return rows [W F r] spread over recordings, over their usual residual, 0 if not used.
+
+    W is the regressor of the base parameters over their spread before the data, F has the columns
+    of the faults, r is what the result leaves.
+    """
     model, mapping, metrics = found.model, found.mapping, found.metrics().per_joint
     scale = [metrics[joint].rmse if joint in metrics else np.inf for joint in model.row_names]
     # over their spread before the data, C = U^T U, base parameters are of size 1
@@ -160,8 +151,7 @@ def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> _Rows:
         r = motion.tau - e.torques["estimate"][::step]
         columns = np.concatenate([Y, _faults(found, motion), r[:, :, None]], axis=2)
         parts.append((weight[:, :, None] * columns).reshape(-1, columns.shape[2]))
-    rows, b = np.vstack(parts), len(U)
-    return _Rows(rows[:, :b], rows[:, -1], rows[:, b:-1])
+    return np.vstack(parts)
 
 
 def _faults(found: Identification, motion: Trajectory) -> Array:
