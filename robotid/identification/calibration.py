@@ -115,7 +115,7 @@ def _finding(code: str, joint: str, fault: float, share: float) -> Finding:
 def _try(own: Array, other: Array, b: int, which: Sequence[int]) -> _Trial:
     """Fit b base parameters and some faults to triangular factors of [W F r]."""
     columns = [*range(b), *(b + k for k in which)]
-    R = np.linalg.qr(own[:, [*columns, -1]], mode="r")
+    R = np.asarray(np.linalg.qr(own[:, [*columns, -1]], mode="r"))
     x = np.linalg.solve(R[:-1, :-1], R[:-1, -1])
     kept = float(np.sum((other[:, -1] - other[:, columns] @ x) ** 2))
     std_errors = abs(float(x[-1] * R[-2, -2]))
