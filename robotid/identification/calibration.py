@@ -2,7 +2,7 @@
 
 Positions, velocities, accelerations and torques enter the equation of motion unlike masses do:
 gravity knows angles and no time, the torque of every joint knows the masses beyond it. With the
-torque f(q, v, a) of the result, a fault x of a recording adds its column to the base regressor:
+torque f(q, v, a) of weighted least squares, a fault x adds its column to the base regressor:
 
     zero of joint j off by x   -df/dq_j
     angles times 1 + x         -(f_q q + f_v v + f_a a)
@@ -41,6 +41,7 @@ _CERTAIN = 8.0  # standard errors from which a fault is believed,
 _CONFIRMED = 0.05  # if it explains this share of what is left of recordings kept apart
 _LEAST = {"position_offset": 0.01, "angle_scale": 0.01, "time_scale": 0.01, "torque_scale": 0.05}
 _TINY = 1e-12  # [N m or N] of an exact residual
+_FREE = 10.0  # spreads before the data that base parameters may move by
 _MOST = 4  # faults that are named
 _SAID = {
     "time_scale": "the motion obeys gravity with time stamps divided by {factor:.3f}; check the "
@@ -136,10 +137,10 @@ def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> Array:
     W is the regressor of the base parameters over their spread before the data, F has the columns
     of the faults, r is what the result leaves.
     """
-    model, mapping, metrics = found.model, found.mapping, found.metrics().per_joint
+    model, mapping, metrics = found.model, found.mapping, found.metrics("wls").per_joint
     scale = [metrics[joint].rmse if joint in metrics else np.inf for joint in model.row_names]
     # over their spread before the data, C = U^T U, base parameters are of size 1
-    U = np.asarray(np.linalg.qr((mapping.K * found.prior_std).T, mode="r"))
+    U = _FREE * np.asarray(np.linalg.qr((mapping.K * found.prior_std).T, mode="r"))
     step = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // _ROWS)
     parts = []
     for e in evaluations:
@@ -148,7 +149,7 @@ def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> Array:
         weight = e.recording.mask[::step] * np.sqrt(share) / np.maximum(scale, _TINY)  # (N, n)
         Y = joint_torque_regressor(model, motion.q, motion.v, motion.a, motion.direction)
         Y = Y.reshape(*weight.shape, -1)[:, :, mapping.independent] @ U.T
-        r = motion.tau - e.torques["estimate"][::step]
+        r = motion.tau - e.torques["wls"][::step]
         columns = np.concatenate([Y, _faults(found, motion), r[:, :, None]], axis=2)
         parts.append((weight[:, :, None] * columns).reshape(-1, columns.shape[2]))
     return np.vstack(parts)
@@ -158,9 +159,10 @@ def _faults(found: Identification, motion: Trajectory) -> Array:
     """Return the columns of the faults, shape (N, n, 2 + 2 n)."""
     model, n = found.model, len(found.model.joints)
     q, v, a = motion.q, motion.v, motion.a
+    pi = found.mapping.to_standard(found.wls.theta, found.prior, found.prior_std)
 
     def f(q: Array, v: Array, a: Array) -> Array:
-        return predict(model, [found.standard], replace(motion, q=q, v=v, a=a))[0]
+        return predict(model, [pi], replace(motion, q=q, v=v, a=a))[0]
 
     def slope(dq: Array, dv: Array, da: Array) -> Array:
         ahead, behind = (f(q + h * dq, v + h * dv, a + h * da) for h in (_STEP, -_STEP))

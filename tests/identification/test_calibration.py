@@ -16,7 +16,7 @@ def spoiled(ur5, spoil):
     for rng in np.random.default_rng(0).spawn(2):
         log = exact_log(ur5, truth(ur5), rng, samples=2000, rate=100.0, noise=NOISE)
         logs.append(spoil(replace(log, v=None, a=None)))
-    return identify(ur5, logs[:1], validation=logs[1:], doctor=False)
+    return identify(ur5, logs[:1], validation=logs[1:], doctor=False, estimator="wls")
 
 
 def elbow(x, change):
@@ -51,11 +51,10 @@ def test_a_fault_is_named_with_its_size_and_leaves_a_doubt(ur5, code):
 def test_a_clean_recording_of_another_robot_has_none(ur5):
     found = spoiled(ur5, lambda log: log)
     assert not [f for f in found.findings if f.code in FAULTS]
-    assert found.verdict.status == "good", found.verdict.reasons
 
 
 def test_without_a_kept_recording_nothing_is_confirmed_nor_named(ur5):
     spoil = FAULTS["time_scale"][0]
     log = exact_log(ur5, truth(ur5), np.random.default_rng(0), samples=2000, rate=100.0, noise=0.1)
-    found = identify(ur5, [spoil(replace(log, v=None, a=None))], doctor=False)
+    found = identify(ur5, [spoil(replace(log, v=None, a=None))], doctor=False, estimator="wls")
     assert not [f for f in found.findings if f.code in FAULTS]
