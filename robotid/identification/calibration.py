@@ -2,7 +2,7 @@
 
 Positions, velocities, accelerations and torques enter the equation of motion unlike masses do:
 gravity knows angles and no time, the torque of every joint knows the masses beyond it. With the
-torque f(q, v, a) of the result, a fault x of a recording adds its column to the base regressor:
+torque f(q, v, a) of weighted least squares, a fault x adds its column to the base regressor:
 
     zero of joint j off by x   -df/dq_j
     angles times 1 + x         -(f_q q + f_v v + f_a a)
@@ -41,6 +41,7 @@ _CERTAIN = 8.0  # standard errors from which a fault is believed,
 _CONFIRMED = 0.05  # if it explains this share of what is left of recordings kept apart
 _LEAST = {"position_offset": 0.01, "angle_scale": 0.01, "time_scale": 0.01, "torque_scale": 0.05}
 _TINY = 1e-12  # [N m or N] of an exact residual
+_FREE = 10.0  # spreads before the data that base parameters may move by
 _MOST = 4  # faults that are named
 _SAID = {
     "time_scale": "the motion obeys gravity with time stamps divided by {factor:.3f}; check the "
@@ -52,21 +53,6 @@ _SAID = {
     "torque_scale": "the torque of {joint} is {factor:.2f} x what the other torques imply; check "
     "its gain",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of recordings over their usual residual, 0 where they are not used.
-
-    Attributes:
-        W: Regressor of the base parameters over their spread before the data, shape (N n, b).
-        r: Residual of the result, shape (N n,).
-        F: Columns of the faults, shape (N n, k).
-    """
-
-    W: Array
-    r: Array
-    F: Array
 
 
 @dataclass(frozen=True)
@@ -89,12 +75,17 @@ def calibration_findings(found: Identification) -> list[Finding]:
     if found.model.free_flyer or not kept:
         return []
     names = _names(found)
+    b, size = len(found.base), len(found.base) + len(names)
     own, other = (_rows(found, some) for some in (found.fitted, kept))
+    own = np.vstack([own, np.eye(size, size + 1)])  # 0 +- 1 before the data
+    own, other = (np.asarray(np.linalg.qr(rows, mode="r")) for rows in (own, other))
     chosen: list[int] = []
     findings = []
-    before = _try(own, other, [])
+    before = _try(own, other, b, [])
     while len(chosen) < _MOST:
-        trials = {k: _try(own, other, [*chosen, k]) for k in range(len(names)) if k not in chosen}
+        trials = {
+            k: _try(own, other, b, [*chosen, k]) for k in range(len(names)) if k not in chosen
+        }
         sure = {
             k: trial
             for k, trial in trials.items()
@@ -122,17 +113,14 @@ def _finding(code: str, joint: str, fault: float, share: float) -> Finding:
     return Finding(code, "warning", joint or "recordings", message, evidence)
 
 
-def _try(own: _Rows, other: _Rows, which: Sequence[int]) -> _Trial:
-    """Fit base parameters and some faults, all with a prior of 0 +- 1."""
-    X = np.hstack([own.W, own.F[:, which]])
-    H = X.T @ X + np.eye(X.shape[1])
-    x = np.linalg.solve(H, X.T @ own.r)
-    fitted = float(np.sum((own.r - X @ x) ** 2))
-    kept = float(np.sum((other.r - np.hstack([other.W, other.F[:, which]]) @ x) ** 2))
-    last = np.zeros(len(x))
-    last[-1] = 1.0
-    error = float(np.sqrt(last @ np.linalg.solve(H, last)))
-    return _Trial(float(x[-1]), abs(float(x[-1])) / error, fitted, kept)
+def _try(own: Array, other: Array, b: int, which: Sequence[int]) -> _Trial:
+    """Fit b base parameters and some faults to triangular factors of [W F r]."""
+    columns = [*range(b), *(b + k for k in which)]
+    R = np.asarray(np.linalg.qr(own[:, [*columns, -1]], mode="r"))
+    x = np.linalg.solve(R[:-1, :-1], R[:-1, -1])
+    kept = float(np.sum((other[:, -1] - other[:, columns] @ x) ** 2))
+    std_errors = abs(float(x[-1] * R[-2, -2]))
+    return _Trial(float(x[-1]), std_errors, float(R[-1, -1] ** 2), kept)
 
 
 def _names(found: Identification) -> list[tuple[str, str]]:
@@ -143,12 +131,16 @@ def _names(found: Identification) -> list[tuple[str, str]]:
     return [*whole, *zeros, *(("torque_scale", joint) for joint in joints)]
 
 
-def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> _Rows:
-    """Return rows spread over recordings."""
-    model, mapping, metrics = found.model, found.mapping, found.metrics().per_joint
+def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> Array:
+    """Return rows [W F r] spread over recordings, over their usual residual, 0 if not used.
+
+    W is the regressor of the base parameters over their spread before the data, F has the columns
+    of the faults, r is what the result leaves.
+    """
+    model, mapping, metrics = found.model, found.mapping, found.metrics("wls").per_joint
     scale = [metrics[joint].rmse if joint in metrics else np.inf for joint in model.row_names]
     # over their spread before the data, C = U^T U, base parameters are of size 1
-    U = np.asarray(np.linalg.qr((mapping.K * found.prior_std).T, mode="r"))
+    U = _FREE * np.asarray(np.linalg.qr((mapping.K * found.prior_std).T, mode="r"))
     step = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // _ROWS)
     parts = []
     for e in evaluations:
@@ -157,20 +149,20 @@ def _rows(found: Identification, evaluations: Sequence[Evaluation]) -> _Rows:
         weight = e.recording.mask[::step] * np.sqrt(share) / np.maximum(scale, _TINY)  # (N, n)
         Y = joint_torque_regressor(model, motion.q, motion.v, motion.a, motion.direction)
         Y = Y.reshape(*weight.shape, -1)[:, :, mapping.independent] @ U.T
-        r = motion.tau - e.torques["estimate"][::step]
+        r = motion.tau - e.torques["wls"][::step]
         columns = np.concatenate([Y, _faults(found, motion), r[:, :, None]], axis=2)
         parts.append((weight[:, :, None] * columns).reshape(-1, columns.shape[2]))
-    rows, b = np.vstack(parts), len(U)
-    return _Rows(rows[:, :b], rows[:, -1], rows[:, b:-1])
+    return np.vstack(parts)
 
 
 def _faults(found: Identification, motion: Trajectory) -> Array:
     """Return the columns of the faults, shape (N, n, 2 + 2 n)."""
     model, n = found.model, len(found.model.joints)
     q, v, a = motion.q, motion.v, motion.a
+    pi = found.mapping.to_standard(found.wls.theta, found.prior, found.prior_std)
 
     def f(q: Array, v: Array, a: Array) -> Array:
-        return predict(model, [found.standard], replace(motion, q=q, v=v, a=a))[0]
+        return predict(model, [pi], replace(motion, q=q, v=v, a=a))[0]
 
     def slope(dq: Array, dv: Array, da: Array) -> Array:
         ahead, behind = (f(q + h * dq, v + h * dv, a + h * da) for h in (_STEP, -_STEP))

@@ -84,7 +84,10 @@ class Witness:
         if self.is_stated:
             return f"the scale rests on the mass that was stated: {self.figures}"
         if self.agrees:
-            return f"gravity and total mass agree with the URDF's within 5 %: {self.figures}"
+            return (
+                "the scale of the torques rests on the URDF's gravity and total mass, which agree "
+                f"within 5 %: {self.figures}"
+            )
         hint = ""
         if self.has_one_factor:
             hint = (

@@ -50,6 +50,7 @@ def test_the_structure_counts_parameters(result, identified):
         "rank": identified.determination.rank,
         "condition": pytest.approx(identified.wls.condition),
         "undetermined": list(identified.determination.undetermined),
+        "poorly_excited": identified.wls.condition > 1e3,
         "not_told_apart": identified.determination.to_list(),
     }
 

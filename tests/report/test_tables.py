@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from dataclasses import asdict
 from html import unescape
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
 from robotid.identification.information import information
+from robotid.identification.summary import verdict_cell
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import versions
 
@@ -53,7 +55,7 @@ def test_errors_are_those_of_estimate_wls_and_baselines(shown, identified, capti
             "URDF + drives %": percent(measured["urdf_with_drives"]),
             "gravity only %": percent(measured["gravity_only"]),
             "zero %": "100.0",
-            "verdict": identified.verdict.joints[joint].status,
+            "verdict": verdict_cell(joint, asdict(identified.verdict.joints[joint])),
             "remark": "",
         }
     # figures that are alike would hide a swap
