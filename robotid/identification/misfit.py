@@ -31,13 +31,15 @@ if TYPE_CHECKING:
 
 __all__ = ["Misfit", "find_misfits", "misfit_findings"]
 
-_ROWS = 3000  # of all logs that are read
+_ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
+_NUMBERS = 2**24  # of the regressor in them
 _PER_INDEPENDENT = 2.0  # rows for each that is independent behind the filter
 _STRETCHES = 16  # left out in turn
 _SHORTEST = 10  # independent rows in a stretch
 _FEWEST = 6  # stretches to judge by
 _TERMS = 3  # found of one joint, at most
-_CERTAIN = 3.0  # standard errors of the mean gain over the stretches
+_CERTAIN = 3.5  # standard errors of the mean gain over the stretches
+_NOTHING = 1e-300
 _LEAST = 0.1  # share of the squared residual from which a term is named
 _MOST = 0.25  # ... and from which it is a warning
 _ONE_SIDED = 0.5  # share from which a coupling is named that the other joint does not show
@@ -46,7 +48,7 @@ _MATTERS = 0.02  # ... and than this is no warning
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
-_WORSE = -0.05  # share of the validation's squared residual from which it contradicts
+_CONFIRMED = 0.25  # of the share, that a validation must show of it for a warning
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Misfit:
     def matters(self) -> bool:
         """Whether it is a warning."""
         explained = np.sqrt(self.share) * self.error
-        is_denied = self.confirmed is not None and self.confirmed < _WORSE
+        is_denied = self.confirmed is not None and self.confirmed < _CONFIRMED * self.share
         return bool(self.share >= _MOST and explained >= _MATTERS and not is_denied)
 
 
@@ -125,8 +127,8 @@ class _Sample:
         fitted: How many of the stretches are of fitted logs.
         W: Regressor of the base parameters over their spread before the data, shape (N, n, b).
         r: Residual of the estimate, shape (N, n).
-        A: W^T W by stretch and joint, shape (K, n, b, b).
-        B: W^T r likewise, shape (K, n, b).
+        A: W^T W of each stretch, all joints together, shape (K, b, b).
+        B: W^T r likewise, shape (K, b).
     """
 
     joints: tuple[str, ...]
@@ -146,10 +148,10 @@ def _take_sample(identification: "Identification") -> _Sample | None:
     """Return rows spread over the recordings; None if there are too few to judge by."""
     model = identification.model
     kept = [e for e in identification.validation if not e.is_refitted]
-    rows, independent = _spread_rows(identification.fitted, kept)
-    stretches = _stretches(rows, len(identification.fitted), independent)
-    count = len(identification.fitted)
-    own = sum(map(len, rows[:count]))  # rows that were fitted
+    rows, independent = _spread_rows(model, identification.fitted, kept)
+    sizes = [sum(map(len, some)) for some in (rows[: len(identification.fitted)], rows)]
+    own = sizes[0]  # rows that were fitted
+    stretches = _stretches(own, sizes[1] - own, independent)
     n_fitted = sum(part.stop <= own for part in stretches)
     if model.free_flyer or n_fitted < _FEWEST:
         return None
@@ -171,7 +173,7 @@ def _take_sample(identification: "Identification") -> _Sample | None:
     U = np.linalg.qr((mapping.K * identification.prior_std).T, mode="r")
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
     r = weight * r
-    by_joint = [(W[k].transpose(1, 2, 0), W[k].transpose(1, 0, 2), r[k].T) for k in stretches]
+    by_stretch = [(W[k].reshape(-1, len(mapping.K)), r[k].ravel()) for k in stretches]
     return _Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
@@ -182,18 +184,19 @@ def _take_sample(identification: "Identification") -> _Sample | None:
         fitted=n_fitted,
         W=W,
         r=r,
-        A=np.array([Wt @ W_k for Wt, W_k, _ in by_joint]),
-        B=np.array([(Wt @ r_k[:, :, None])[:, :, 0] for Wt, _, r_k in by_joint]),
+        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
+        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
     )
 
 
 def _spread_rows(
-    fitted: Sequence[Evaluation], kept: Sequence[Evaluation]
+    model: RobotModel, fitted: Sequence[Evaluation], kept: Sequence[Evaluation]
 ) -> tuple[list[Array], float]:
     """Return which rows of each recording are read, and the share of them that is independent."""
+    most = min(_ROWS, _NUMBERS // (model.n_rows * len(model.layout.names)))
     rows, shares = [], []
     for evaluations in (fitted, kept):
-        least = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // _ROWS)
+        least = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // most)
         for e in evaluations:
             share = independent_share(e.recording.signals)
             step = max(least, int(1.0 / (_PER_INDEPENDENT * share)), 1)
@@ -202,13 +205,13 @@ def _spread_rows(
     return rows, min(shares)
 
 
-def _stretches(rows: Sequence[Array], fitted: int, independent: float) -> tuple[slice, ...]:
-    """Return stretches of the rows of all recordings, of which the first few are fitted."""
-    length = max(sum(map(len, rows[:fitted])) / _STRETCHES, _SHORTEST / independent)
+def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
+    """Return how the rows of fitted and kept recordings are cut into stretches."""
     edges = [0]
-    for k in rows:
-        first, count = edges[-1], max(1, round(len(k) / length))
-        edges += [first + len(k) * (i + 1) // count for i in range(count)]
+    for rows in (fitted, kept):
+        count = min(_STRETCHES, max(1, int(rows * independent / _SHORTEST))) if rows else 0
+        first = edges[-1]
+        edges += [first + rows * (i + 1) // count for i in range(count)]
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
@@ -307,10 +310,10 @@ class _Trial:
 def _trials(sample: _Sample, j: int, Z: Array) -> tuple[_Trial, _Trial]:
     """Return trials of columns (N, c): fitted without the stretch that judges, and to all."""
     X = np.column_stack([sample.weight[:, [j]] * Z, sample.r[:, j]])
+    W, A = sample.W[:, j], sample.A
     D = np.array([X[k].T @ X[k] for k in sample.stretches])  # (K, c + 1, c + 1)
-    own_B = np.array([sample.W[k, j].T @ X[k] for k in sample.stretches])  # (K, b, c + 1)
-    own_A, B, A = sample.A[:, j], own_B.copy(), sample.A.sum(axis=1)
-    B[:, :, -1] = sample.B.sum(axis=1)  # other joints know of the base parameters, too
+    B = np.array([W[k].T @ X[k] for k in sample.stretches])  # (K, b, c + 1)
+    B[:, :, -1] = sample.B  # other joints know of the base parameters, too
     is_fitted = np.arange(len(D)) < sample.fitted
 
     def trial(used: Array) -> _Trial:
@@ -319,9 +322,9 @@ def _trials(sample: _Sample, j: int, Z: Array) -> tuple[_Trial, _Trial]:
         S = D_fit - B_fit.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
         S[..., c, c] += _RIDGE * D_fit[..., c, c]
-        cross = own_B.swapaxes(-1, -2) @ T
-        H = D - cross - cross.swapaxes(-1, -2) + T.swapaxes(-1, -2) @ own_A @ T
-        return _Trial(S, H)
+        every_T = np.broadcast_to(T, B.shape)
+        E = [X[k] - W[k] @ T_k for k, T_k in zip(sample.stretches, every_T, strict=True)]
+        return _Trial(S, np.array([E_k.T @ E_k for E_k in E]))
 
     apart = is_fitted & ~np.eye(len(D), dtype=bool)  # (K, K): what judges row k is fitted to
     return trial(apart.astype(float)), trial(is_fitted.astype(float))
@@ -343,25 +346,25 @@ def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
              for c, x, end in zip(own, columns, ends, strict=True)}  # fmt: skip
     apart, whole = _trials(sample, j, Z / length)
     chosen: list[int] = []
-    total = apart.left([])
+    total = before = apart.left([])
     for _ in range(_TERMS):
-        before = apart.left(chosen)
-        gains = {c: before - apart.left([*chosen, *place[c]]) for c in own}
-        best = _best(gains, place, total, sample.fitted)
+        left = {c: apart.left([*chosen, *place[c]]) for c in own}
+        best = _best(left, before, place, total, sample.fitted)
         if best is None:
             return
         misfit = _misfit(sample, j, best, place[best], chosen, whole, length)
-        share = float(gains[best][: sample.fitted].sum() / total[: sample.fitted].sum())
-        certainty = _certainty(gains[best])
-        chosen += place[best]
-        own = [c for c in own if c.code != best.code]
-        misfit = replace(misfit, share=share, certainty=certainty)
+        gain = (before - left[best])[: sample.fitted]
+        share = float(gain.sum() / total[: sample.fitted].sum())
+        misfit = replace(misfit, share=share, certainty=_certainty(before, left[best]))
         if np.sqrt(share) * misfit.error >= _SEEN:
             yield misfit
+        chosen += place[best]
+        before, own = left[best], [c for c in own if c.code != best.code]
 
 
 def _best(
-    gains: Mapping[Candidate, Array],
+    left: Mapping[Candidate, Array],
+    before: Array,
     place: Mapping[Candidate, Sequence[int]],
     total: Array,
     fitted: int,
@@ -369,18 +372,19 @@ def _best(
     """Return the simplest of the terms that explain as much as the best does; None without one."""
     least = _LEAST * total[:fitted].sum()
     sure = {
-        candidate: float(gain.sum())
-        for candidate, gain in gains.items()
-        if gain[:fitted].sum() > least and _certainty(gain) > _CERTAIN
+        candidate: float((before - after).sum())
+        for candidate, after in left.items()
+        if (before - after)[:fitted].sum() > least and _certainty(before, after) > _CERTAIN
     }
     alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE * total.sum()]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
 
 
-def _certainty(gain: Array) -> float:
-    """Return the mean of gains, one of each stretch, over its standard error."""
+def _certainty(before: Array, after: Array) -> float:
+    """Return the mean share that stretches gain, between -1 and 1, over its standard error."""
+    gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
     error = float(np.std(gain, ddof=1)) / np.sqrt(len(gain))
-    return float(gain.mean()) / error if error > 0 else 0.0
+    return float(gain.mean()) / max(error, _NOTHING)
 
 
 def _misfit(
