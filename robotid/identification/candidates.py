@@ -49,9 +49,10 @@ class Candidate:
     Attributes:
         name: Its name.
         code: Code of the finding that says it is missing.
-        columns: What its c parameters multiply in N rows, shape (N, c).
+        columns: What its c parameters multiply in N rows, shape (N, c). Scales in it are those of
+            the motion given, so that all rows are to be asked for at once.
         meaning: What it is, in words of a finding.
-        advice: What to do, beside knowing that the model has no such term.
+        advice: What the user can do, with {joint} for the joint; empty if nothing.
         units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
             is the torque of the term, root mean square.
         turns: Whether only a joint that turns has it.
@@ -80,7 +81,8 @@ def _stribeck(m: JointMotion) -> Array:
 
 
 def _presliding(m: JointMotion) -> Array:
-    return np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m.v)))
+    setting_in: Array = np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m.v)))
+    return setting_in
 
 
 def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
@@ -95,7 +97,8 @@ def _windup(m: JointMotion) -> Array:
 
 
 def _drift(m: JointMotion) -> Array:
-    return m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
+    drifting: Array = m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
+    return drifting
 
 
 def _coupled(m: JointMotion, other: JointMotion, ratio: float) -> Array:
@@ -107,34 +110,56 @@ def _coupled(m: JointMotion, other: JointMotion, ratio: float) -> Array:
 _FRICTION = "friction that is not viscous and Coulomb"
 #: The candidates of each joint, those of couplings aside.
 CANDIDATES = (
-    Candidate("coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
-              "set friction = 'viscous+coulomb' in [model]"),
-    Candidate("stribeck", "friction_shape", _stribeck,
-              f"{_FRICTION}, higher near standstill (Stribeck),",
-              "raise min_velocity to leave the slow rows out"),
-    Candidate("presliding", "friction_shape", _presliding,
-              f"{_FRICTION}, which sets in only with speed,",
-              "set friction_band, or raise min_velocity"),
-    Candidate("power", "friction_shape",
-              lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
-              f"{_FRICTION}, bent in speed as |v|^(1/3),"),
-    Candidate("cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
-              f"{_FRICTION}, bent in speed as v^3,"),
-    Candidate("load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
-              "friction that grows with the load", units=("N m/(N m)", "N/N")),
-    Candidate("periodic", "position_periodic", _periodic,
-              "a torque that repeats with the joint's position (cogging, an eccentric gear)",
-              turns=True),
-    Candidate("linear spring", "spring", lambda m: m.q[:, None],
-              "a spring on the joint", units=("N m/rad", "N/m")),
-    Candidate("counterbalance", "spring", lambda m: _periodic(m, 2),
-              "a counterbalance: a torque that follows the joint's position", turns=True),
-    Candidate("windup", "backlash", _windup,
-              "a torque that changes after each reversal, or with the side of the gear that is "
-              "loaded (backlash, windup),", "raise min_velocity to leave the reversals out"),
-    Candidate("drift", "drift", _drift,
-              "friction or an offset that drifts with time (a drive that warms up)",
-              "warm the robot up before recording, or cut the log with start"),
+    Candidate(
+        "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
+        "Set friction = 'viscous+coulomb' in [model]",
+    ),
+    Candidate(
+        "stribeck", "friction_shape", _stribeck,
+        f"{_FRICTION} but rises towards standstill (Stribeck)",
+        "Raise min_velocity to leave the slow rows out",
+    ),
+    Candidate(
+        "presliding", "friction_shape", _presliding, f"{_FRICTION} but sets in with speed",
+        "Set friction_band, or raise min_velocity to leave the slow rows out",
+    ),
+    Candidate(
+        "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
+        f"{_FRICTION} but bends with speed, as |v|^(1/3) does",
+    ),
+    Candidate(
+        "cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
+        f"{_FRICTION} but bends with speed, as v^3 does",
+    ),
+    Candidate(
+        "load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
+        "friction that grows with the load",
+        units=("N m per N m of load", "N per N of load"),
+    ),
+    Candidate(
+        "periodic", "position_periodic", _periodic,
+        "a torque that repeats with the joint's position (cogging, an eccentric gear)",
+        turns=True,
+    ),
+    Candidate(
+        "linear spring", "spring", lambda m: m.q[:, None], "a spring on the joint",
+        units=("N m/rad", "N/m"),
+    ),
+    Candidate(
+        "counterbalance", "spring", lambda m: _periodic(m, 2),
+        "a spring or counterbalance that follows the joint's position", turns=True,
+    ),
+    Candidate(
+        "windup", "backlash", _windup,
+        "a torque that changes after each reversal, or with the side of the gear that is loaded "
+        "(backlash, windup),",
+        "Raise min_velocity to leave the reversals out",
+    ),
+    Candidate(
+        "drift", "drift", _drift,
+        "friction or an offset that drifts with time (a drive that warms up)",
+        "Warm the robot up before recording, or cut the log with start",
+    ),
 )  # fmt: skip
 
 
@@ -146,10 +171,13 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
     """
     return tuple(
         Candidate(
-            f"{ratio:g} {name}", "coupling", partial(_coupled, other=other, ratio=ratio),
-            f"a drive that turns with {name}, too (coupled transmission),",
-            f"add [[coupling]] with ratios = {{ JOINT = 1.0, {name} = {ratio} }} to the job (the "
-            "size of the ratio stands in the data sheet)", coupled=name,
+            f"coupling {ratio:+g} {name}", "coupling",
+            partial(_coupled, other=other, ratio=ratio),
+            f"a drive that turns with {name}, too,",
+            "Add [[coupling]] to the job with ratios = "
+            f"{{{{ {{joint}} = 1.0, {name} = {ratio} }}}}, the size of the second from the data "
+            "sheet",
+            coupled=name,
         )
         for name, other in motion.others.items()
         for ratio in (1.0, -1.0)

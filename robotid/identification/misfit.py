@@ -12,9 +12,11 @@ before the data. What a term explains of the stretches left out, it explains bey
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import stdtr
 
 from robotid._typing import Array
 from robotid.findings import Finding
@@ -38,11 +40,11 @@ _STRETCHES = 16  # left out in turn
 _SHORTEST = 10  # independent rows in a stretch
 _FEWEST = 6  # stretches to judge by
 _TERMS = 3  # found of one joint, at most
-_CERTAIN = 3.5  # standard errors of the mean gain over the stretches
+_CHANCE = 3e-4  # that a term is named which is not there, each time that one is tried
 _NOTHING = 1e-300
 _LEAST = 0.1  # share of the squared residual from which a term is named
 _MOST = 0.25  # ... and from which it is a warning
-_ONE_SIDED = 0.5  # share from which a coupling is named that the other joint does not show
+_ONE_SIDED = 0.6  # share from which a coupling is named that the other joint does not show
 _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
 _OUTLIER = 12.0  # usual residuals from which a row is left out
@@ -60,7 +62,7 @@ class Misfit:
         term: The term.
         share: Share of the joint's squared residual that it explains in stretches that were left
             out of the fit, beyond the terms found before it [-].
-        certainty: That gain over its standard error [-].
+        chance: How likely that is without such a term [-].
         confirmed: The same share of the validation recordings; None without one.
         size: Its parameter, or the root mean square of its torque, as the term's units say.
         std_error: Standard error of the size.
@@ -71,7 +73,7 @@ class Misfit:
     joint: str
     term: Candidate
     share: float
-    certainty: float
+    chance: float
     confirmed: float | None
     size: float
     std_error: float
@@ -125,6 +127,7 @@ class _Sample:
         error: Usual residual over usual torque, shape (n,) [-].
         stretches: Which rows each of the K stretches has, those of the logs kept apart last.
         fitted: How many of the stretches are of fitted logs.
+        rows: How many of the rows are.
         W: Regressor of the base parameters over their spread before the data, shape (N, n, b).
         r: Residual of the estimate, shape (N, n).
         A: W^T W of each stretch, all joints together, shape (K, b, b).
@@ -138,6 +141,7 @@ class _Sample:
     error: Array
     stretches: tuple[slice, ...]
     fitted: int
+    rows: int
     W: Array
     r: Array
     A: Array
@@ -146,14 +150,13 @@ class _Sample:
 
 def _take_sample(identification: "Identification") -> _Sample | None:
     """Return rows spread over the recordings; None if there are too few to judge by."""
-    model = identification.model
+    model, mapping = identification.model, identification.mapping
     kept = [e for e in identification.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, identification.fitted, kept)
-    sizes = [sum(map(len, some)) for some in (rows[: len(identification.fitted)], rows)]
-    own = sizes[0]  # rows that were fitted
-    stretches = _stretches(own, sizes[1] - own, independent)
-    n_fitted = sum(part.stop <= own for part in stretches)
-    if model.free_flyer or n_fitted < _FEWEST:
+    own = sum(map(len, rows[: len(identification.fitted)]))
+    stretches = _stretches(own, sum(map(len, rows)) - own, independent)
+    number = sum(part.stop <= own for part in stretches)
+    if model.free_flyer or number < _FEWEST:
         return None
     parts = list(zip([*identification.fitted, *kept], rows, strict=True))
     motion = [_at(e.recording.trajectory, k) for e, k in parts]
@@ -161,16 +164,14 @@ def _take_sample(identification: "Identification") -> _Sample | None:
     tau = np.concatenate([m.tau for m in motion])
     r = tau - np.concatenate([e.torques["estimate"][k] for e, k in parts])
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
-    fitted = np.arange(len(tau)) < own
-    used = used & (np.abs(r) <= _OUTLIER * _usual_size(r, used & fitted[:, None]))
-    squares = [np.sum(x**2, axis=0, where=used & fitted[:, None]) for x in (r, tau)]
-    count = (used & fitted[:, None]).sum(axis=0)
-    scale = np.sqrt(squares[0] / np.maximum(count, 1))
+    used = used & (np.abs(r) <= _OUTLIER * _usual_size(r[:own], used[:own]))
+    squares = [np.sum(x[:own] ** 2, axis=0, where=used[:own]) for x in (r, tau)]
+    scale = np.sqrt(squares[0] / np.maximum(used[:own].sum(axis=0), 1))
     weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
-    size, mapping = model.layout.n_inertial, identification.mapping
+    size = model.layout.n_inertial
     load = Y[:, :, :size] @ identification.standard[:size]
     # over their spread before the data, C = U^T U, base parameters are of size 1
-    U = np.linalg.qr((mapping.K * identification.prior_std).T, mode="r")
+    U = np.asarray(np.linalg.qr((mapping.K * identification.prior_std).T, mode="r"))
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
     r = weight * r
     by_stretch = [(W[k].reshape(-1, len(mapping.K)), r[k].ravel()) for k in stretches]
@@ -181,7 +182,8 @@ def _take_sample(identification: "Identification") -> _Sample | None:
         weight=weight,
         error=np.sqrt(squares[0] / np.where(squares[1] > 0, squares[1], np.inf)),
         stretches=stretches,
-        fitted=n_fitted,
+        fitted=number,
+        rows=own,
         W=W,
         r=r,
         A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
@@ -217,8 +219,9 @@ def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
 
 def _at(motion: Trajectory, rows: Array) -> Trajectory:
     """Return some rows of a motion."""
-    names = ("t", "q", "v", "a", "tau", "segment", "direction")
-    parts = {x: None if getattr(motion, x) is None else getattr(motion, x)[rows] for x in names}
+    names = ["t", "q", "v", "a", "tau", "segment"]
+    names += [] if motion.direction is None else ["direction"]
+    parts: dict[str, Any] = {name: getattr(motion, name)[rows] for name in names}
     return replace(motion, **parts)
 
 
@@ -248,17 +251,11 @@ def _joint_motions(
         own = friction_directions(model.layout, m.v, m.direction)[:, :n]
         return own if own.shape[1] else np.sign(m.v)
 
-    every = {
-        "q": joined(lambda m: m.q),
-        "v": joined(lambda m: m.v),
-        "a": joined(lambda m: m.a),
-        "direction": joined(directions),
-        "load": load,
-        "travelled": joined(_travelled),
-    }
+    q, v, a = (joined(attrgetter(name)) for name in "qva")
+    signs, way = joined(directions), joined(_travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
     alone = [
-        JointMotion(**{name: x[:, j] for name, x in every.items()}, time=time)
+        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time)
         for j in range(len(model.joints))
     ]
     beside = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
@@ -321,7 +318,8 @@ def _trials(sample: _Sample, j: int, Z: Array) -> tuple[_Trial, _Trial]:
         T = np.linalg.solve(A_fit + np.eye(A.shape[-1]), B_fit)  # (..., b, c + 1)
         S = D_fit - B_fit.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
-        S[..., c, c] += _RIDGE * D_fit[..., c, c]
+        still = D_fit[..., c, c] == 0  # a column of a joint that does not move
+        S[..., c, c] += np.where(still, 1.0, _RIDGE * D_fit[..., c, c])
         every_T = np.broadcast_to(T, B.shape)
         E = [X[k] - W[k] @ T_k for k, T_k in zip(sample.stretches, every_T, strict=True)]
         return _Trial(S, np.array([E_k.T @ E_k for E_k in E]))
@@ -332,19 +330,17 @@ def _trials(sample: _Sample, j: int, Z: Array) -> tuple[_Trial, _Trial]:
 
 def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
     """Yield the terms that a joint's drive lacks, one after the other."""
-    motion, weight = sample.motions[j], sample.weight[:, j]
-    fitted = slice(0, sample.stretches[sample.fitted - 1].stop)
-    if not weight[fitted].any():
+    motion = sample.motions[j]
+    if not sample.weight[: sample.rows, j].any():
         return
     own = [c for c in (*CANDIDATES, *couplings(motion)) if not (c.turns and sample.slides[j])]
     columns = [candidate.columns(motion) for candidate in own]
-    Z = np.hstack(columns)
-    length = np.sqrt(np.mean(Z[fitted] ** 2, axis=0))
-    length[length == 0] = 1.0
     ends = np.cumsum([x.shape[1] for x in columns]).tolist()
-    place = {c: list(range(end - x.shape[1], end))
-             for c, x, end in zip(own, columns, ends, strict=True)}  # fmt: skip
-    apart, whole = _trials(sample, j, Z / length)
+    place = {
+        candidate: list(range(end - x.shape[1], end))
+        for candidate, x, end in zip(own, columns, ends, strict=True)
+    }
+    apart, whole = _trials(sample, j, np.hstack(columns))
     chosen: list[int] = []
     total = before = apart.left([])
     for _ in range(_TERMS):
@@ -352,12 +348,25 @@ def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
         best = _best(left, before, place, total, sample.fitted)
         if best is None:
             return
-        misfit = _misfit(sample, j, best, place[best], chosen, whole, length)
         gain = (before - left[best])[: sample.fitted]
         share = float(gain.sum() / total[: sample.fitted].sum())
-        misfit = replace(misfit, share=share, certainty=_certainty(before, left[best]))
-        if np.sqrt(share) * misfit.error >= _SEEN:
-            yield misfit
+        size, std_error, unit = _size(sample, j, best, whole, chosen, place[best])
+        kept = [
+            whole.left(which)[sample.fitted :].sum()
+            for which in ([], chosen, [*chosen, *place[best]])
+        ]
+        if np.sqrt(share) * sample.error[j] >= _SEEN:
+            yield Misfit(
+                joint=sample.joints[j],
+                term=best,
+                share=share,
+                chance=_chance(before, left[best], sample.fitted),
+                confirmed=float((kept[1] - kept[2]) / kept[0]) if kept[0] > 0 else None,
+                size=size,
+                std_error=std_error,
+                unit=unit,
+                error=float(sample.error[j]),
+            )
         chosen += place[best]
         before, own = left[best], [c for c in own if c.code != best.code]
 
@@ -374,65 +383,69 @@ def _best(
     sure = {
         candidate: float((before - after).sum())
         for candidate, after in left.items()
-        if (before - after)[:fitted].sum() > least and _certainty(before, after) > _CERTAIN
+        if (before - after)[:fitted].sum() > least and _chance(before, after, fitted) < _CHANCE
     }
     alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE * total.sum()]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
 
 
-def _certainty(before: Array, after: Array) -> float:
-    """Return the mean share that stretches gain, between -1 and 1, over its standard error."""
+def _chance(before: Array, after: Array, fitted: int) -> float:
+    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
+
+    By Student's test of the shares, each between -1 and 1, of the fitted logs' stretches or of all,
+    whichever is surer.
+    """
     gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
-    error = float(np.std(gain, ddof=1)) / np.sqrt(len(gain))
-    return float(gain.mean()) / max(error, _NOTHING)
+    chances = [
+        stdtr(len(x) - 1, -x.mean() / max(np.std(x, ddof=1) / np.sqrt(len(x)), _NOTHING))
+        for x in (gain, gain[:fitted])
+    ]
+    return float(min(chances))
 
 
-def _misfit(
-    sample: _Sample, j: int, term: Candidate, place: list[int], before: list[int],
-    whole: _Trial, length: Array,
-) -> Misfit:  # fmt: skip
-    """Return a term that was found, its size by all stretches."""
-    which = [*before, *place]
-    theta, new = whole.parameters(which), slice(len(before), None)
-    square = whole.S[which, :][:, which]
-    rows = whole.H[: sample.fitted, which, :]
-    scores = rows[:, :, -1] - rows[:, :, which] @ theta  # (K, k)
-    inverse = np.linalg.inv(square)
-    covariance = inverse @ (scores.T @ scores) @ inverse * len(scores) / (len(scores) - 1)
-    theta, covariance, square = theta[new], covariance[new, new], square[new, new]
-    unit = ("N m", "N")[int(sample.slides[j])]
+def _size(
+    sample: _Sample, j: int, term: Candidate, whole: _Trial, before: list[int], new: list[int]
+) -> tuple[float, float, str]:
+    """Return the size of a term beside those found before, its standard error and unit.
+
+    The error is that of scores which scatter from stretch to stretch, as noise of any colour does.
+    """
+    which, own = [*before, *new], slice(len(before), None)
+    theta, S = whole.parameters(which), whole.S[which][:, which]
+    H = whole.H[: sample.fitted, which]
+    scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
+    inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
+    covariance = few * (inverse @ (scores.T @ scores) @ inverse)[own, own]
+    theta, S = theta[own], S[own, own]
     if term.units is not None:
-        size, error = theta[0] / length[place[0]], np.sqrt(covariance[0, 0]) / length[place[0]]
-        unit = term.units[int(sample.slides[j])]
-    else:  # root mean square of the torque that base parameters cannot explain
-        count = (sample.weight[: sample.stretches[sample.fitted - 1].stop, j] ** 2).sum()
-        size = np.sqrt(theta @ square @ theta / count)
-        error = np.sqrt(theta @ square @ covariance @ square @ theta) / count / size
-    left = [whole.left(columns)[sample.fitted :].sum() for columns in ([], before, which)]
-    confirmed = float((left[1] - left[2]) / left[0]) if left[0] > 0 else None
-    return Misfit(
-        sample.joints[j], term, 0.0, 0.0, confirmed, float(size), float(error), unit,
-        float(sample.error[j]),
-    )  # fmt: skip
+        error = float(np.sqrt(covariance[0, 0]))
+        return float(theta[0]), error, term.units[int(sample.slides[j])]
+    # root mean square of the torque that base parameters cannot explain: size^2 = theta^T S theta
+    S = S / np.sum(sample.weight[: sample.rows, j] ** 2)
+    size, slope = float(np.sqrt(theta @ S @ theta)), S @ theta
+    error = float(np.sqrt(slope @ covariance @ slope)) / size
+    return size, error, ("N m rms", "N rms")[int(sample.slides[j])]
 
 
 def _finding(misfit: Misfit) -> Finding:
-    term = misfit.term
-    confirmed = "" if misfit.confirmed is None else (
-        f", {100 * max(misfit.confirmed, 0.0):.0f} % on the validation log"
-    )  # fmt: skip
-    advice = f"{term.advice}; else " if term.advice else ""
+    term, kept = misfit.term, misfit.confirmed
+    confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
+    done = term.advice.format(joint=misfit.joint)
     message = (
-        f"{misfit.joint}: {term.meaning} explains {100 * misfit.share:.0f} % of the squared "
-        f"residual{confirmed} ({misfit.size:.3g} +- {misfit.std_error:.2g} {misfit.unit}; the "
-        f"residual is {100 * misfit.error:.1f} % of the torque). The friction model has no such "
-        f"term: {advice}take this joint's friction intervals as too narrow"
+        f"{misfit.joint}: {term.meaning} would explain {100 * misfit.share:.0f} % of the squared "
+        f"residual{confirmed}, which is {100 * misfit.error:.1f} % of the torque; its size is "
+        f"{misfit.size:.3g} +- {misfit.std_error:.2g} {misfit.unit}. "
+        f"{done or 'The model has no such term yet'}: as it is, the friction intervals of this "
+        "joint are too narrow"
     )
     evidence = {
-        "share": misfit.share, "certainty": misfit.certainty, "size": misfit.size,
-        "std_error": misfit.std_error, "error_pct": 100 * misfit.error,
-    }  # fmt: skip
-    if misfit.confirmed is not None:
-        evidence["validation_share"] = misfit.confirmed
+        "share_pct": 100 * misfit.share,
+        "error_pct": 100 * misfit.error,
+        "size": misfit.size,
+        "std_error": misfit.std_error,
+        "chance": misfit.chance,
+    }
+    if kept is not None:
+        evidence["validation_share_pct"] = 100 * kept
     severity = "warning" if misfit.matters else "note"
-    return Finding(term.code, severity, misfit.joint, message.replace("JOINT", misfit.joint), evidence)
+    return Finding(term.code, severity, misfit.joint, message, evidence)

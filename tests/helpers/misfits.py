@@ -1,6 +1,6 @@
-"""Logs of drives that do more than the model of friction says, with the finding that must say so."""
+"""Logs of drives that do more than the friction model says, and the finding that must say so."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
