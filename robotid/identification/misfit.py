@@ -31,7 +31,7 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["Misfit", "find_misfits", "misfit_findings"]
+__all__ = ["Misfit", "find_misfits", "misfit_findings", "outranked"]
 
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
 _NUMBERS = 2**24  # of the regressor in them
@@ -47,6 +47,9 @@ _MOST = 0.25  # ... and from which it is a warning
 _ONE_SIDED = 0.6  # share from which a coupling is named that the other joint does not show
 _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
+_MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
+_OF_POSITION = ("position_periodic", "spring")
+_OF_MASSES = ("current_for_torque", "payload", "urdf_mismatch")
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
@@ -113,6 +116,29 @@ def find_misfits(identification: "Identification") -> tuple[Misfit, ...]:
         m for m in found
         if not m.term.coupled or m.share > _ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
+
+
+def outranked(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
+    """Return what the doctor found, but for what a missing term explains that the fit found.
+
+    A joint whose torque follows its position by a spring or a gear has the wrong weight for the
+    doctor, who knows neither; a torque that a term explains is not unexplained.
+
+    Args:
+        found: What was found before the fit.
+        of_fit: What was found of the fit.
+    """
+    main = [
+        f for f in of_fit
+        if f.severity == "warning" and f.evidence.get("share_pct", 0.0) > _MAIN
+    ]  # fmt: skip
+    joints = {f.where for f in main}
+    hidden = _OF_MASSES if any(f.code in _OF_POSITION for f in main) else ()
+    return [
+        f for f in found
+        if f.code not in hidden
+        and not (f.code == "unexplained_torque" and f.where.rpartition(": ")[2] in joints)
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
