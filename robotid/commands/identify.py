@@ -17,7 +17,7 @@ from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
 from robotid.findings import Finding
 from robotid.identification.findings import fit_findings, locked_findings, log_findings
-from robotid.identification.misfit import outranked
+from robotid.identification.misfit import settled
 from robotid.identification.pipeline import Identification, conclude
 from robotid.identification.recordings import Recordings
 from robotid.identification.verdict import doubts_of
@@ -119,9 +119,8 @@ def _identify(
     findings += log_findings([log.head for log in (*fitted, *kept)])
     findings += impossible_inertials(model)
     # what the motion excites the fit tells from all rows: finding "undetermined"
-    of_fit = fit_findings(identification)
     told = [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
-    findings += [*outranked(told, of_fit), *of_fit]
+    findings += settled(told, fit_findings(identification))
     counted = [finding for finding in findings if finding.code not in job.ignore]
     names = [
         Path(e.recording.log.path).name for e in identification.validation if not e.is_refitted

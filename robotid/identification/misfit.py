@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.rows import independent_share
@@ -31,7 +31,7 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["Misfit", "find_misfits", "misfit_findings", "outranked"]
+__all__ = ["Misfit", "find_misfits", "misfit_findings", "settled"]
 
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
 _NUMBERS = 2**24  # of the regressor in them
@@ -49,7 +49,7 @@ _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
 _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
 _OF_POSITION = ("position_periodic", "spring")
-_OF_MASSES = ("current_for_torque", "payload", "urdf_mismatch")
+_OF_MASSES = ("current_for_torque", "urdf_mismatch")
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
@@ -118,27 +118,36 @@ def find_misfits(identification: "Identification") -> tuple[Misfit, ...]:
     )  # fmt: skip
 
 
-def outranked(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
-    """Return what the doctor found, but for what a missing term explains that the fit found.
+def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
+    """Return what was found before the fit and of the fit, without guesses that a term explains.
 
-    A joint whose torque follows its position by a spring or a gear has the wrong weight for the
-    doctor, who knows neither; a torque that a term explains is not unexplained.
+    The doctor knows no springs: a joint whose torque follows its position weighs wrong for him, or
+    its torque fits nothing. The term that explains it is a warning then, however little is left.
 
     Args:
         found: What was found before the fit.
         of_fit: What was found of the fit.
     """
-    main = [
-        f for f in of_fit
-        if f.severity == "warning" and f.evidence.get("share_pct", 0.0) > _MAIN
-    ]  # fmt: skip
-    joints = {f.where for f in main}
-    hidden = _OF_MASSES if any(f.code in _OF_POSITION for f in main) else ()
-    return [
-        f for f in found
-        if f.code not in hidden
-        and not (f.code == "unexplained_torque" and f.where.rpartition(": ")[2] in joints)
-    ]  # fmt: skip
+    kept, terms = list(found), []
+    for term in of_fit:
+        guesses = [f for f in kept if _explains(term, f)]
+        kept = [f for f in kept if f not in guesses]
+        if guesses:
+            codes = listed(dict.fromkeys(f.code for f in guesses))
+            message = f"{term.message}. It explains {codes}, and may have gone into masses in part"
+            evidence = {**term.evidence, "replaces": float(len(guesses))}
+            term = replace(term, severity="warning", message=message, evidence=evidence)
+        terms.append(term)
+    return kept + terms
+
+
+def _explains(term: Finding, guess: Finding) -> bool:
+    """Return whether a term that the fit found explains what was found before the fit."""
+    if term.evidence.get("share_pct", 0.0) < _MAIN:
+        return False
+    if guess.code == "unexplained_torque":
+        return guess.where.rpartition(": ")[2] == term.where
+    return guess.code in _OF_MASSES and term.code in _OF_POSITION
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,13 +414,14 @@ def _best(
     fitted: int,
 ) -> Candidate | None:
     """Return the simplest of the terms that explain as much as the best does; None without one."""
-    least = _LEAST * total[:fitted].sum()
+    whole = float(total[:fitted].sum())
+    gains = {c: float((before - after)[:fitted].sum()) / whole for c, after in left.items()}
     sure = {
-        candidate: float((before - after).sum())
-        for candidate, after in left.items()
-        if (before - after)[:fitted].sum() > least and _chance(before, after, fitted) < _CHANCE
+        candidate: gain
+        for candidate, gain in gains.items()
+        if gain > _LEAST and _chance(before, left[candidate], fitted) < _CHANCE
     }
-    alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE * total.sum()]
+    alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
 
 

@@ -10,9 +10,11 @@ from helpers.paths import ROOT
 from robotid.commands.identify import run_job
 from robotid.commands.job import job_from_settings, read_job
 from robotid.commands.logs import survey_logs
+from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
 from robotid.identification import misfit
-from robotid.identification.misfit import find_misfits, misfit_findings, outranked
+from robotid.identification.findings import fit_findings
+from robotid.identification.misfit import find_misfits, misfit_findings, settled
 from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import Recordings
 from robotid.identification.settings import EstimatorSettings
@@ -146,7 +148,7 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
     assert by_joint[LIFT].status == "good"
 
 
-def test_a_term_outranks_what_the_doctor_guessed_of_its_torque():
+def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(ur5):
     guesses = [
         Finding("urdf_mismatch", "warning", "run.csv", ""),
         Finding("unexplained_torque", "warning", f"run.csv: {LIFT}", ""),
@@ -154,13 +156,33 @@ def test_a_term_outranks_what_the_doctor_guessed_of_its_torque():
         Finding("clipped", "warning", f"run.csv: {LIFT}", ""),
     ]
 
-    def kept(code, share, severity="warning"):
-        term = Finding(code, severity, LIFT, "", {"share_pct": share})
-        return [guesses.index(f) for f in outranked(guesses, [term])]
+    def said(code, share):
+        term = Finding(code, "note", LIFT, "It is.", {"share_pct": share, "error_pct": 1.0})
+        *kept, term = settled(guesses, [term])
+        return [guesses.index(f) for f in kept], term
 
-    assert kept("spring", 90.0) == [2, 3]
-    assert kept("load_friction", 90.0) == [0, 2, 3]
-    assert kept("spring", 40.0) == kept("spring", 90.0, "note") == [0, 1, 2, 3]
+    kept, term = said("spring", 90.0)
+    assert kept == [2, 3]
+    assert (term.severity, term.evidence["replaces"]) == ("warning", 2.0)
+    assert "It explains urdf_mismatch, unexplained_torque, and" in term.message
+    assert [doubt.joint for doubt in doubts_of([term], ur5.joints)] == [LIFT]
+    assert said("load_friction", 90.0)[0] == [0, 2, 3]
+    assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(
+        "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("effect", "seed", "size", "guess"),
+    [("counterbalance", 5, 3.0, "current_for_torque"), ("periodic", 1, 2.0, "urdf_mismatch")],
+)
+def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, size, guess):
+    logs = [log_with(ur5, seed, effect, 1, part=k, size=size) for k in (0, 1)]
+    guesses = check_logs(ur5, logs[:1], validation=logs[1:])
+    assert guess in {finding.code for finding in guesses}
+    found = identify(ur5, logs[:1], validation=logs[1:])
+    said = {f.code for f in settled(guesses, fit_findings(found)) if f.severity != "note"}
+    assert said == {EFFECTS[effect].code}
 
 
 def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
