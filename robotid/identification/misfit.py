@@ -468,10 +468,10 @@ def _finding(misfit: Misfit) -> Finding:
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
     done = term.advice.format(joint=misfit.joint)
     message = (
-        f"{misfit.joint}: {term.meaning} would explain {100 * misfit.share:.0f} % of the squared "
-        f"residual{confirmed}, which is {100 * misfit.error:.1f} % of the torque; its size is "
-        f"{misfit.size:.3g} +- {misfit.std_error:.2g} {misfit.unit}. "
-        f"{done or 'The model has no such term yet'}: as it is, the friction intervals of this "
+        f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
+        f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"
+        f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
+        f"{done or 'The model has no such term yet'}; as it is, the friction intervals of this "
         "joint are too narrow"
     )
     evidence = {

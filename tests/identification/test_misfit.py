@@ -22,6 +22,7 @@ from robotid.identification.verdict import doubts_of
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
 
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 
@@ -71,6 +72,26 @@ def test_the_size_holds_the_truth(ur5, effect, joint, size, unit):
     # the load is that of an estimate without the term, which is some per cent off
     assert abs(found.size - size) < 3.0 * found.std_error + 0.02 * size
     assert found.std_error < 0.03 * size
+
+
+def test_the_size_of_several_columns_is_their_torque(ur5):
+    """A torque that no base parameter explains is seen as it was added, root mean square."""
+    log, clean = (log_with(ur5, 1, effect, 3, noise=0.0) for effect in ("periodic", None))
+    added = np.sqrt(np.mean((log.tau - clean.tau)[:, 3] ** 2))
+    (found,) = find_misfits(identified(ur5, 1, "periodic", 3))
+    # gravity explains a part of a slow harmonic
+    assert 0.6 * added < found.size < 1.05 * added
+    assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
+
+
+def test_coulomb_friction_that_was_left_out_is_asked_for(ur5):
+    model = RobotModel.from_urdf(ur5.tree.path, terms=("armature", "viscous", "offset"))
+    logs = [log_with(ur5, 1, part=k) for k in (0, 1)]
+    found = misfit_findings(identify(model, logs[:1], validation=logs[1:]))
+    assert {finding.where for finding in found if finding.severity == "warning"} == set(ur5.joints)
+    for finding in found:
+        assert (finding.code, finding.evidence["share_pct"] > 50) == ("friction_shape", True)
+        assert "Set friction = 'viscous+coulomb' in [model]" in finding.message
 
 
 @pytest.mark.parametrize("memory", [0, 30, 100])
