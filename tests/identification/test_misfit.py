@@ -203,7 +203,8 @@ def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, 
     assert guess in {finding.code for finding in guesses}
     found = identify(ur5, logs[:1], validation=logs[1:])
     said = {f.code for f in settled(guesses, fit_findings(found)) if f.severity != "note"}
-    assert said == {EFFECTS[effect].code}
+    assert EFFECTS[effect].code in said
+    assert not said & {"urdf_mismatch", "current_for_torque", "unexplained_torque"}
 
 
 def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
