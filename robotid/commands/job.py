@@ -86,6 +86,11 @@ class Job(Settings):
     mimic: str = setting(
         "independent", "independent, or coupled: a mimic joint moves with its leader"
     )
+    snap_angles: bool = setting(
+        False,
+        "whether rounded angles of the URDF's joints, 3.1416, become the multiple of pi/12 that "
+        "they round",
+    )
     signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
     terms: tuple[str, ...] = setting(
         DRIVE_TERMS,
@@ -163,6 +168,7 @@ class Job(Settings):
             gravity=self.gravity,
             terms=self.terms,
             couplings=self.couplings,
+            snap_angles=self.snap_angles,
         )
 
     def read(self, entry: LogEntry, model: "RobotModel") -> Log:

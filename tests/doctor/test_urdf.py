@@ -7,7 +7,7 @@ import pytest
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import ModelError
 from robotid.robot.examples import example_urdf
-from robotid.robot.tree import read_with_yourdfpy
+from robotid.robot.urdf_text import read_with_yourdfpy
 
 CLEAN = """<robot name="two">
   <link name="base"/>
@@ -154,7 +154,7 @@ def test_a_rounded_angle_is_named_with_its_exact_value(tmp_path):
     # the axes stay parallel: the number of parameters does not suffer
     (finding,) = found(inspected(tmp_path, ('rpy="0 0 0"', 'rpy="0 -3.1416 0.1"')), "rounded_rpy")
     assert (finding["joint"], finding["severity"]) == ("shoulder", "note")
-    assert f"write {-math.pi!r} for -3.1416; the number of identifiable" in finding["message"]
+    assert f"write {-math.pi!r} for -3.1416; the identifiable" in finding["message"]
 
 
 def test_a_rounded_angle_that_tilts_an_axis_is_a_warning(tmp_path):
@@ -219,7 +219,7 @@ def test_what_is_no_number_is_named(tmp_path, old, new, kind, name, said):
     inspection = inspected(tmp_path, (old, new))
     (finding,) = found(inspection, "not_a_number")
     assert (finding[kind], finding["severity"]) == (name, "error")
-    assert f"{kind} {name!r}: {said}, wanted finite numbers" in finding["message"]
+    assert f"{kind} {name!r}: {said}, wanted " in finding["message"]
     content = inspection.to_dict()
     assert content["structure"] is None
     assert content["base_groups"] == []

@@ -13,7 +13,8 @@ from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.robot.tree import read_tree, read_with_yourdfpy
+from robotid.robot.tree import read_tree
+from robotid.robot.urdf_text import read_with_yourdfpy
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>
