@@ -285,7 +285,9 @@ def _inertia(values: Array) -> pin.Inertia:
     if values[0] != 0.0:
         return pin.Inertia.FromDynamicParameters(values)
     xx, xy, yy, xz, yz, zz = values[4:]
-    return pin.Inertia(0.0, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    massless = pin.Inertia.Zero()
+    massless.inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # impossible ones, too
+    return massless
 
 
 def _choose_joints(

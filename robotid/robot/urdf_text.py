@@ -4,6 +4,7 @@ Everything that takes a number from a URDF takes it from here, so that no text i
 reader and nothing for another.
 """
 
+import logging
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -184,6 +185,7 @@ def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
     """
     import yourdfpy
 
+    logging.getLogger("yourdfpy").addHandler(logging.NullHandler())  # its remarks say nothing new
     try:
         return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # it checks nothing by itself: a fault of the file is any of them
