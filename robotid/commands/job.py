@@ -147,8 +147,8 @@ class Job(Settings):
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
-                "of a floating base; fix the base (free_flyer = false), or build the rows from "
-                "your own Trajectory with RobotModel.from_urdf(..., free_flyer=True)"
+                "of a floating base; fix the base (free_flyer = false), or make the rows yourself, "
+                "joint_torque_regressor(RobotModel.from_urdf(..., free_flyer=True), q, v, a)"
             )
 
     def model(self) -> "RobotModel":

@@ -59,7 +59,7 @@ class RobotModel:
 
     def __repr__(self) -> str:
         return (
-            f"<RobotModel {self.name}: {len(self.joints)} joints, {', '.join(self.joints)}; "
+            f"<RobotModel {self.name}: {len(self.joints)} joints, {listed(self.joints)}; "
             f"{len(self.layout.names)} standard parameters>"
         )
 
@@ -108,7 +108,7 @@ class RobotModel:
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
-                "nothing to identify; a body that flies has with free_flyer=True (--free-flyer)"
+                "nothing to identify; a body that flies has ten parameters with free_flyer=True"
             )
         followers = _followers(tree) if mimic == "coupled" else {}
         full = _build(tree, free_flyer, gravity)

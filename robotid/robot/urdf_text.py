@@ -63,6 +63,8 @@ def parse_urdf(path: str | Path) -> ET.Element:
             f"{path.name} has {size / 2**20:.0f} MiB, wanted a URDF of at most "
             f"{_MOST_BYTES // 2**20} MiB; meshes and logs go into files of their own"
         )
+    if b"<!ENTITY" in content:  # a few of them can stand for more than the memory holds
+        raise ModelError(f"{path.name} declares entities, which other readers of URDFs do not know")
     try:
         robot = ET.fromstring(content)  # in one piece: in pieces a long name takes its square
     except (ET.ParseError, LookupError, ValueError) as error:  # the latter two: its encoding

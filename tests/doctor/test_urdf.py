@@ -3,10 +3,14 @@ import math
 
 import numpy as np
 import pytest
+from helpers.synthetic import exact_log, truth
 
+from robotid.doctor.diagnosis import check_logs
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import ModelError
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 from robotid.robot.urdf_text import read_with_yourdfpy
 
 CLEAN = """<robot name="two">
@@ -182,6 +186,37 @@ def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
     assert severity == {"hold": "note", "elbow": "warning"}
 
 
+COARSE = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.14 0 0"/>')
+
+
+def test_a_coarsely_rounded_angle_changes_the_base_and_snapping_mends_it(tmp_path):
+    rounded = inspected(tmp_path, COARSE)
+    (finding,) = found(rounded, "rounded_rpy")
+    exact = inspected(tmp_path, (COARSE[0], COARSE[1].replace("3.14", repr(math.pi))))
+    more = rounded.structure.base, exact.structure.base
+    assert more[0] > more[1]
+    assert f"makes {more[0]} base parameters of {more[1]}, and only noise" in finding["message"]
+    assert "snap_angles = true (--snap-angles) takes the exact angles" in finding["message"]
+    inspected(tmp_path, COARSE)
+    snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
+    assert len(structural_mapping(snapped).K) == more[1]
+    assert snapped.tree.joints[1].rpy == (math.pi, 0.0, 0.0)
+
+
+def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
+    for angle, expected in (("3.14", 1), ("3.1416", 1), (repr(math.pi), 0), ("3.13", 0)):
+        inspected(tmp_path, (COARSE[0], COARSE[1].replace("3.14", angle)))
+        model = RobotModel.from_urdf(tmp_path / "two.urdf")
+        log = exact_log(model, truth(model), rng)
+        findings = [f for f in check_logs(model, [log]) if f.code == "rounded_rpy"]
+        assert len(findings) == expected, angle
+        if findings:
+            assert (findings[0].severity, findings[0].where) == ("warning", "two.urdf")
+            assert "rounds angles of the joints elbow: the file" in findings[0].message
+        snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
+        assert not [f for f in check_logs(snapped, [log]) if f.code == "rounded_rpy"]
+
+
 def test_a_mimic_joint_is_named(tmp_path):
     mimic = '<mimic joint="shoulder" multiplier="-2"/></joint>\n</robot>'
     (finding,) = found(inspected(tmp_path, ("</joint>\n</robot>", mimic)), "mimic_joint")
@@ -279,9 +314,7 @@ def test_what_yourdfpy_cannot_read_is_a_finding(tmp_path):
 
 
 def test_the_condition_number_is_that_of_unit_columns(tmp_path):
-    from robotid.regressor.base_parameters import structural_mapping
     from robotid.regressor.torque import random_regressor
-    from robotid.robot.model import RobotModel
 
     structure = inspected(tmp_path).structure
     model = RobotModel.from_urdf(tmp_path / "two.urdf")
