@@ -14,7 +14,7 @@ from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
-from robotid.doctor.urdf_angles import rounded_robot
+from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import Finding, by_severity, listed, log_finding
 from robotid.identification.verdict import DOUBTFUL, is_outvoted

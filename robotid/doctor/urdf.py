@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid.doctor.urdf_angles import rounded_angles
+from robotid.doctor.urdf_base import faint_parameters, rounded_angles
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
@@ -119,7 +119,10 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
     findings += _link_findings(model)
     findings += audit_links(model)
-    findings += rounded_angles(model, full)
+    rounded = list(rounded_angles(model, full))
+    findings += rounded
+    if not any(finding.severity == "warning" for finding in rounded):
+        findings += faint_parameters(model, full)
     structure = Structure(
         standard=model.layout.n_inertial,
         base_inertial=len(inertial.K),

@@ -26,6 +26,11 @@ CLEAN = """<robot name="two">
     <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/></joint>
 </robot>"""
 
+LONG = """<link name="l{0}"><inertial><origin xyz="0.1 0.02 0.03"/><mass value="1"/>
+  <inertia ixx="1" iyy="1" izz="1.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="j{0}" type="continuous"><parent link="l{1}"/><child link="l{0}"/>
+  <origin xyz="0.5 0 0.1" rpy="{2!r} 0 0.3"/><axis xyz="0 0 1"/></joint>"""
+
 TOOL = """<link name="tool">{inertial}</link><joint name="hold" type="fixed">
   <parent link="lower"/><child link="tool"/></joint></robot>"""
 INERTIAL = """<inertial><mass value="{m}"/>
@@ -322,3 +327,15 @@ def test_the_condition_number_is_that_of_unit_columns(tmp_path):
     W = W[:, structural_mapping(model).independent]
     unit = np.linalg.cond(W / np.linalg.norm(W, axis=0))
     assert structure.condition == pytest.approx(unit, rel=0.5)  # other states, same size
+
+
+def test_a_chain_whose_last_joints_are_hardly_felt_is_named(tmp_path):
+    links = "".join(LONG.format(k, k - 1, math.pi / 2 * (k % 2)) for k in range(1, 61))
+    (tmp_path / "long.urdf").write_text(f'<robot name="long"><link name="l0"/>{links}</robot>')
+    inspection = inspect_urdf(tmp_path / "long.urdf")
+    (finding,) = found(inspection, "faint_parameters")
+    assert inspection.structure.base_inertial == 7 * 60 - 8
+    faint, base = finding["evidence"]["faint"], inspection.structure.base
+    assert faint > 0
+    assert f"{faint:.0f} parameters load the joints less than 1e-4 as much" in finding["message"]
+    assert f"left out of the {base} base parameters" in finding["message"]

@@ -1,4 +1,4 @@
-"""Angles that a URDF rounds, 3.1416 for pi, and what they do to the base parameters."""
+"""What makes a robot's base parameters uncertain: rounded angles, 3.1416 for pi; faint ones."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +11,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint, Tree
 from robotid.robot.urdf_text import exact_angle
 
-__all__ = ["rounded_angles", "rounded_robot"]
+__all__ = ["faint_parameters", "rounded_angles", "rounded_robot"]
 
 _NOISE = 1e-10  # pivots below this share of the largest are rounding
 _ADVICE = "snap_angles = true (--snap-angles) takes the exact angles"
@@ -58,6 +58,31 @@ def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
         yield Finding("rounded_rpy", "warning", where, message, {"joints": float(len(joints))})
 
 
+def faint_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
+    """Yield a warning if parameters lie between those that motion shows and those it cannot.
+
+    Args:
+        model: The robot.
+        mapping: Its base parameters.
+
+    Yields:
+        "faint_parameters" of the file.
+    """
+    if faint := _between(mapping):
+        where = Path(model.tree.path).name
+        message = (
+            f"{where}: {faint} parameters load the joints less than 1e-4 as much as others, and "
+            f"are left out of the {len(mapping.K)} base parameters; identify fewer of the "
+            f"{len(model.joints)} joints at a time"
+        )
+        yield Finding("faint_parameters", "warning", f"file {where}", message, {"faint": faint})
+
+
+def _between(mapping: BaseMapping) -> int:
+    """Return how many pivots are neither rounding nor large enough to count."""
+    return int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
+
+
 def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
     """Return the rounded angles of each joint that has some, as written, and what they round."""
     rounded = {}
@@ -75,7 +100,7 @@ def _effect(model: RobotModel, mapping: BaseMapping) -> str:
     options = {**model.options, "couplings": model.layout.couplings}
     meant = structural_mapping(RobotModel.from_urdf(model.tree, **options, snap_angles=True))
     more = len(mapping.K) - len(meant.K)
-    seeming = int(np.sum(mapping.pivots > _NOISE)) - int(np.sum(meant.pivots > _NOISE))
+    seeming = _between(mapping) - _between(meant)
     if more:
         return (
             f"the file's rounding makes {len(mapping.K)} base parameters of {len(meant.K)}, and "
