@@ -302,11 +302,11 @@ def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys)
     words = ["identify", str(source), str(tmp_path / "log.csv"), "--estimator", "wls", "--json"]
     assert main([*words, "--out", str(tmp_path / "plain")]) == 0
     plain = json.loads(capsys.readouterr().out)
-    (finding,) = [f for f in plain["findings"] if f["code"] == "rounded_rpy"]
+    (finding,) = [f for f in plain["warnings"] if f["code"] == "rounded_rpy"]
     assert "--snap-angles" in finding["message"]
     assert main([*words, "--out", str(tmp_path / "snapped"), "--snap-angles"]) == 0
     snapped = json.loads(capsys.readouterr().out)
-    assert "rounded_rpy" not in {f["code"] for f in snapped["findings"]}
+    assert "rounded_rpy" not in {f["code"] for f in snapped["warnings"]}
     assert snapped["settings"]["snap_angles"] is True
     assert snapped["structure"]["base"] == len(structural_mapping(model).K)
     assert plain["structure"]["base"] > snapped["structure"]["base"]
