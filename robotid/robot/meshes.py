@@ -169,7 +169,7 @@ def thin(surfaces: Sequence[Surface], most: int) -> list[Surface]:
         most: Triangles that may be left of all of them.
     """
     extents = [float(np.ptp(s.vertices, axis=0).max()) for s in surfaces if len(s.faces)]
-    cell = _FIRST_CELL * max(extents, default=1.0)
+    cell = _FIRST_CELL * (max(extents, default=0.0) or 1.0)
     left = [_clustered(surface, 1e-3 * cell) for surface in surfaces]  # joins equal corners
     while sum(len(s.faces) for s in left) > most:
         left = [_clustered(surface, cell) for surface in surfaces]

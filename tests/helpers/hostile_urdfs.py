@@ -20,6 +20,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.geometry import geometry_half_spaces
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
+from robotid.viewer.scene import robot_scene
 
 __all__ = ["HostileUrdf", "run_urdf", "urdf_inputs"]
 
@@ -58,6 +59,7 @@ def run_urdf(case: HostileUrdf, folder: Path) -> None:
             with contextlib.suppress(RobotIdError):
                 in_words(geometry_half_spaces, model, shape)
         in_words(check_mass_matrix, model, pi, poses=10)
+        in_words(robot_scene, model)
         in_words(write_urdf, model, pi, folder / "new.urdf", dynamics=True)
 
 

@@ -3,9 +3,10 @@
 import os
 import subprocess
 import sys
+from xml.sax.saxutils import quoteattr
 
 import pytest
-from helpers.hostile_urdfs import run_urdf, urdf_inputs
+from helpers.hostile_urdfs import FILES, MESHES, HostileUrdf, run_urdf, urdf_inputs
 from hypothesis import HealthCheck, given, settings
 
 from robotid.doctor.urdf import inspect_urdf
@@ -15,6 +16,8 @@ from robotid.robot.meshes import find_mesh, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
 
+CHAIN = """<link name="l{0}"/>
+<joint name="j{0}" type="{2}"><parent link="l{1}"/><child link="l{0}"/></joint>"""
 FEW = int(os.environ.get("ROBOTID_FUZZ", "40"))  # inputs; benchmarks/bench_fuzz.py tries thousands
 
 
@@ -23,6 +26,16 @@ FEW = int(os.environ.get("ROBOTID_FUZZ", "40"))  # inputs; benchmarks/bench_fuzz
 @given(urdf_inputs())
 def test_nothing_but_its_own_words_comes_of_a_hostile_urdf(tmp_path_factory, case):
     run_urdf(case, tmp_path_factory.mktemp("hostile"))
+
+
+@pytest.mark.parametrize("mesh", MESHES, ids=range(len(MESHES)))
+def test_no_path_of_a_mesh_breaks_anything(tmp_path, mesh):
+    path, scale = quoteattr(mesh), "0 0 0" if mesh == "good.stl" else "1 1 1"
+    shape = f"<geometry><mesh filename={path} scale='{scale}'/></geometry>"
+    text = f"<robot name='r'><link name='l0'/>{CHAIN.format(1, 0, 'revolute')}</robot>"
+    shapes = f"<visual>{shape}</visual><collision>{shape}</collision>"
+    content = text.replace('<link name="l1"/>', f'<link name="l1">{shapes}</link>')
+    run_urdf(HostileUrdf(content.encode(), dict(FILES)), tmp_path)
 
 
 DOORS = {
@@ -100,10 +113,6 @@ def test_a_process_without_stderr_reads_a_robot():
         [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True
     )
     assert run.stdout == "6\n"
-
-
-CHAIN = """<link name="l{0}"/>
-<joint name="j{0}" type="{2}"><parent link="l{1}"/><child link="l{0}"/></joint>"""
 
 
 def chain(tmp_path, count, kind="revolute", more=""):
