@@ -24,6 +24,7 @@ __all__ = ["MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
 MOVABLE = ("revolute", "continuous", "prismatic")
 _ZERO = (0.0, 0.0, 0.0)
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_LIGHTEST = 1e-15  # [kg] of a link that has a mass: what is divided by it stays finite
 _DEEPEST = 500  # joints from the root to a link; Pinocchio goes down them by recursion
 _TAKEN = ("universe", "root_joint")  # Pinocchio's names of the world and of a floating base
 
@@ -283,6 +284,8 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
     (value,) = read_numbers(mass, "value", at)
     if value < 0:
         raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; correct the sign")
+    if 0 < value < _LIGHTEST:
+        raise ModelError(f"{at} mass is {value:g} kg, wanted 0 or at least {_LIGHTEST:g}")
     moments = tuple(read_numbers(inertia, key, at)[0] for key in _MOMENTS)
     return Inertial(value, com, rpy, moments)
 

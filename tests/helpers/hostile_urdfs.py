@@ -17,7 +17,7 @@ from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import RobotIdError
 from robotid.export.urdf import write_urdf
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.robot.geometry import geometry_half_spaces
+from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.mass_matrix import check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.viewer.scene import robot_scene
@@ -55,6 +55,7 @@ def run_urdf(case: HostileUrdf, folder: Path) -> None:
         in_words(structural_mapping, model)
         pi = model.standard_parameters()
         assert np.isfinite(pi).all()
+        in_words(body_boxes, model)
         for shape in ("box", "hull"):
             with contextlib.suppress(RobotIdError):
                 in_words(geometry_half_spaces, model, shape)
@@ -162,7 +163,9 @@ def robots(draw) -> ET.Element:
         if draw(st.integers(0, 3)):
             inertial = ET.SubElement(link, "inertial")
             ET.SubElement(inertial, "origin", xyz="0.1 0 0.02", rpy="0 0.3 0")
-            ET.SubElement(inertial, "mass", value=draw(st.sampled_from(["1", "2.5", "0", "1e-9"])))
+            ET.SubElement(
+                inertial, "mass", value=draw(st.sampled_from(["1", "2.5", "0", "1e-9", "1e-15"]))
+            )
             ET.SubElement(
                 inertial, "inertia", ixx="0.1", ixy="0", ixz="0", iyy="0.1", iyz="0", izz="0.12"
             )

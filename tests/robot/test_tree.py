@@ -98,6 +98,13 @@ def test_a_negative_mass_is_refused(chain):
         read_tree(path)
 
 
+def test_a_mass_that_nothing_can_be_divided_by_is_refused(chain):
+    path = chain(("revolute", ""))
+    path.write_text(path.read_text().replace('mass value="1"', 'mass value="5e-324"'))
+    with pytest.raises(ModelError, match=r"mass is 4\.94066e-324 kg, wanted 0 or at least 1e-15"):
+        read_tree(path)
+
+
 def test_pinocchio_gets_the_tree_alone_and_the_whole_file_is_kept(chain):
     path = chain(("revolute", LIMIT.format(-1, 2)), ("fixed", ""))
     shown = '<visual><geometry><box size="1 2 3"/></geometry></visual></link>'
