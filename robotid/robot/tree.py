@@ -16,12 +16,13 @@ from typing import Any
 
 from robotid.exceptions import ModelError
 from robotid.findings import listed
-from robotid.robot.urdf_text import LARGEST, parse_urdf, read_numbers, write_exact_angles
+from robotid.robot.urdf_text import parse_urdf, read_numbers, write_exact_angles
 
 __all__ = ["MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
 
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
+_ENDLESS = 200.0  # [rad or m] a stated range this wide is none: no cable winds 30 turns
 _ZERO = (0.0, 0.0, 0.0)
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _LIGHTEST = 1e-15  # [kg] of a link that has a mass: what is divided by it stays finite
@@ -85,8 +86,11 @@ class Joint:
 
     @property
     def has_limits(self) -> bool:
-        """Whether the URDF states a range of positions; lower = upper = 0, or 1e308, state none."""
-        return -LARGEST <= self.lower < self.upper <= LARGEST
+        """Whether the URDF states a range of positions.
+
+        lower = upper = 0 states none, and neither does a range that no joint has, as +-10000 rad.
+        """
+        return 0.0 < self.upper - self.lower < _ENDLESS
 
     @property
     def turns_freely(self) -> bool:
