@@ -24,7 +24,7 @@ __all__ = ["GRAVITY", "RobotModel"]
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _STRONGEST = 100.0  # [m/s^2] beyond it, what accelerations show is lost beside what gravity shows
-_MOST_JOINTS = 300  # memory grows with their square, time with their cube: 0.7 GB, 90 s
+_MOST_JOINTS = 300  # memory grows with their square, time with their cube: 2 GiB, 75 s
 _MOST = 1e30  # largest size of a parameter, SI units: products of a few of them stay finite
 _UNIT = 1e-6  # how far from 1 the length of a quaternion may be
 
