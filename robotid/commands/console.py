@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robotid.findings import listed
+
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
@@ -178,7 +180,7 @@ def _print_lines(*lines: str) -> None:
 
 
 def _print_inspection(content: dict[str, Any]) -> None:
-    print(f"{content['robot']}: joints {', '.join(content['joints'])}")
+    print(f"{content['robot']}: joints {listed(content['joints'])}")
     if content["structure"]:
         s = content["structure"]
         print(

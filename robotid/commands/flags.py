@@ -37,6 +37,7 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--estimator": ("estimator.name", {"metavar": "NAME"}),
     "--joints": ("joints", {"metavar": "A,B,..."}),
     "--lock": ("locked", {"metavar": "JOINT=POSITION", "action": "append"}),
+    "--snap-angles": ("snap_angles", {"action": "store_const", "const": True}),
     "--gain": ("torque.gains", {"metavar": "JOINT=N_M_PER_A", "action": "append"}),
     "--rate": ("signals.rate", {"metavar": "HZ", "type": float}),
     "--cutoff": ("signals.cutoff", {"metavar": "HZ"}),

@@ -86,6 +86,11 @@ class Job(Settings):
     mimic: str = setting(
         "independent", "independent, or coupled: a mimic joint moves with its leader"
     )
+    snap_angles: bool = setting(
+        False,
+        "whether rounded angles of the URDF's joints, 3.1416, become the multiple of pi/12 that "
+        "they round",
+    )
     signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
     terms: tuple[str, ...] = setting(
         DRIVE_TERMS,
@@ -142,8 +147,8 @@ class Job(Settings):
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
-                "of a floating base; fix the base (free_flyer = false), or build the rows from "
-                "your own Trajectory with RobotModel.from_urdf(..., free_flyer=True)"
+                "of a floating base; fix the base (free_flyer = false), or make the rows yourself, "
+                "joint_torque_regressor(RobotModel.from_urdf(..., free_flyer=True), q, v, a)"
             )
 
     def model(self) -> "RobotModel":
@@ -163,6 +168,7 @@ class Job(Settings):
             gravity=self.gravity,
             terms=self.terms,
             couplings=self.couplings,
+            snap_angles=self.snap_angles,
         )
 
     def read(self, entry: LogEntry, model: "RobotModel") -> Log:

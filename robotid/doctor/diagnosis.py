@@ -13,6 +13,7 @@ from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
+from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, log_finding
 from robotid.logs.data import Log, Trajectory
@@ -81,7 +82,9 @@ def diagnose(
     if probes:
         names = ", ".join(log.name for log in fitted)
         moving = [probe.motion for probe in probes]
-        findings += check_excitation(model, structural_mapping(model), moving, signals, names)
+        mapping = structural_mapping(model)
+        findings += check_excitation(model, mapping, moving, signals, names)
+        findings += rounded_robot(model, mapping)
     return by_severity(findings)
 
 

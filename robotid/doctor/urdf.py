@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid.doctor.urdf_base import faint_parameters, rounded_angles
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
@@ -17,13 +18,11 @@ from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import MOVABLE, Joint, Tree, numbers, parse_urdf, read_with_yourdfpy
+from robotid.robot.tree import MOVABLE
+from robotid.robot.urdf_text import number_fault, numbers, parse_urdf, read_with_yourdfpy
 
 __all__ = ["Inspection", "Structure", "inspect_urdf"]
 
-_ROUNDED = 1e-3  # [rad] nearer to a multiple of pi/2 than this is meant to be one
-_EXACT = 1e-7  # [rad] nearer than this is one
-_NOISE = 1e-10  # pivots below this share of the largest are rounding
 # the attributes that hold numbers, by the element they are in
 _NUMBERS = {
     ("link", "inertial/mass"): ("value",),
@@ -120,7 +119,10 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     full, inertial = structural_mapping(model), structural_mapping(model, inertial_only=True)
     findings += _link_findings(model)
     findings += audit_links(model)
-    findings += _rounded_angles(model, full)
+    rounded = list(rounded_angles(model, full))
+    findings += rounded
+    if not any(finding.severity == "warning" for finding in rounded):
+        findings += faint_parameters(model, full)
     structure = Structure(
         standard=model.layout.n_inertial,
         base_inertial=len(inertial.K),
@@ -144,16 +146,14 @@ def _numbers(robot: ET.Element) -> Iterator[Finding]:
     for (kind, inside), keys in _NUMBERS.items():
         for owner in robot.findall(kind):
             element = owner.find(inside)
-            for key in keys if element is not None else ():
-                text = element.get(key) if element is not None else None
-                if text is None or numbers(text):
-                    continue
-                name = owner.get("name", "")
-                message = (
-                    f"{kind} {name!r}: {inside.replace('/', ' ')} {key} is {text!r}, wanted finite "
-                    "numbers with a decimal point and blanks between them; write the true value"
-                )
-                yield Finding("not_a_number", "error", f"{kind} {name}", message)
+            if element is None:
+                continue
+            name, part = owner.get("name", ""), inside.removesuffix(element.tag).replace("/", " ")
+            for key in keys:
+                fault = number_fault(element, key) if key in element.attrib else None
+                if fault is not None:
+                    message = f"{kind} {name!r}: {part}{fault}; write the true value"
+                    yield Finding("not_a_number", "error", f"{kind} {name}", message)
 
 
 def _joint_findings(path: Path) -> Iterator[Finding]:
@@ -187,14 +187,15 @@ def _no_limits(joint: Any) -> Iterator[Finding]:  # noqa: ANN401
 
 
 def _negative(joint: Any, key: str, text: str | None) -> Iterator[Finding]:  # noqa: ANN401
-    if not text or not numbers(text) or float(text) >= 0:
+    value = numbers(text or "", 1, math.inf)
+    if not value or value[0] >= 0:
         return
     harm = "Pinocchio refuses such a file" if key == "friction" else "simulators gain energy by it"
     message = (
         f"joint {joint.name!r} has {key} {text}, wanted 0 or more; robotid does not use it, but "
         f"{harm}: correct the sign"
     )
-    yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message, {key: float(text)})
+    yield Finding(f"negative_{key}", "warning", f"joint {joint.name}", message, {key: value[0]})
 
 
 def _mimic(joint: Any, names: set[str]) -> Finding:  # noqa: ANN401
@@ -249,48 +250,6 @@ def _missing(link: str, having: list[str]) -> Finding:
         "its body counts as massless; add an estimate of mass, centre and inertia"
     )
     return Finding("missing_inertial", "warning", f"link {link}", message)
-
-
-def _rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield the joint angles that a URDF rounds, 3.1416 for pi, and what they do to the rank."""
-    seeming = int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
-    carrying = _carrying(model.tree)
-    for joint in model.tree.robot.findall("joint"):
-        origin, name = joint.find("origin"), joint.get("name", "")
-        angles = origin.get("rpy", "0 0 0").split() if origin is not None else []
-        exact = {word: value for word in angles if (value := _exact(float(word))) is not None}
-        if not exact:
-            continue
-        wanted = ", ".join(f"{value!r} for {word}" for word, value in exact.items())
-        severity, effect = "note", "the number of identifiable parameters does not change"
-        if seeming > 0 and name in carrying:
-            severity = "warning"
-            effect = (
-                f"the file's rounding makes {seeming} more parameters look identifiable, though "
-                "only noise would fix their values; robotid leaves them out, other tools may not"
-            )
-        message = f"joint {name!r} has rpy {' '.join(angles)!r}, rounded: write {wanted}; {effect}"
-        evidence = {"largest_error": max(abs(float(word) - exact[word]) for word in exact)}
-        yield Finding("rounded_rpy", severity, f"joint {name}", message, evidence)
-
-
-def _carrying(tree: Tree) -> set[str]:
-    """Return the joints that move or carry one that does: their angles shape the dynamics."""
-    arriving = {joint.child: joint for joint in tree.joints}
-    carrying: set[str] = set()
-    for joint in tree.movable:
-        at: Joint | None = joint
-        while at is not None and at.name not in carrying:
-            carrying.add(at.name)
-            at = arriving.get(at.parent)
-    return carrying
-
-
-def _exact(angle: float) -> float | None:
-    """Return the multiple of pi/2 that an angle is a rounded form of, None if it is of none."""
-    turns = round(angle / (math.pi / 2))
-    exact = turns * math.pi / 2
-    return exact if turns and _EXACT < abs(angle - exact) < _ROUNDED else None
 
 
 def _plain(finding: Finding) -> Mapping[str, Any]:

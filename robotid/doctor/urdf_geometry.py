@@ -46,8 +46,8 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     if unread and next(model.tree.robot.iter("mesh"), None) is not None:
         message = (
             f"the geometry of {len(unread)} bodies, as {unread[0]!r}, is missing or in meshes that "
-            "are not found: their mass and centre of mass were not compared with it; set "
-            "ROS_PACKAGE_PATH to compare them"
+            "are not found or cannot be read: their mass and centre of mass were not compared with "
+            "it; set ROS_PACKAGE_PATH to compare them"
         )
         yield Finding("geometry_unread", "note", f"link {unread[0]}", message)
 
@@ -138,8 +138,10 @@ def _copies(model: RobotModel, points: dict[str, Array]) -> Iterator[Finding]:
             groups.append([link])
     for group in groups:
         boxes = np.sort([np.ptp(points[link], axis=0) for link in group], axis=1)
+        if len(group) < 2 or not boxes.any() or inertials[group[0]].mass <= 0:
+            continue
         spread = float(np.max(np.abs(boxes - boxes[0])) / np.max(boxes))
-        if len(group) < 2 or spread < _SIZE or inertials[group[0]].mass <= 0:
+        if spread < _SIZE:
             continue
         message = (
             f"the links {listed(group)} have the same mass, centre of mass and inertia, but other "

@@ -10,6 +10,7 @@ from robotid.findings import Finding
 from robotid.robot.bodies import link_places
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Inertial
+from robotid.robot.urdf_text import numbers
 
 __all__ = ["impossible_inertial", "impossible_inertials", "negative_masses"]
 
@@ -24,16 +25,14 @@ def negative_masses(robot: ET.Element) -> Iterator[Finding]:
     """
     for link in robot.findall("link"):
         mass = link.find("inertial/mass")
-        try:
-            value = float(mass.get("value", "nan")) if mass is not None else 0.0
-        except ValueError:  # a finding of its own
-            continue
-        if value < 0:
-            name = link.get("name", "")
-            message = (
-                f"link {name!r} has the mass {value:g} kg, wanted more than 0; correct the sign"
-            )
-            yield Finding("negative_mass", "error", f"link {name}", message, {"mass": value})
+        text = "" if mass is None else mass.get("value", "")
+        for value in numbers(text, 1):  # what is no number is a finding of its own
+            if value < 0:
+                name = link.get("name", "")
+                message = (
+                    f"link {name!r} has the mass {value:g} kg, wanted more than 0; correct the sign"
+                )
+                yield Finding("negative_mass", "error", f"link {name}", message, {"mass": value})
 
 
 def impossible_inertials(model: RobotModel) -> list[Finding]:

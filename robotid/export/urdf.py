@@ -23,7 +23,8 @@ from robotid.robot.bodies import LinkPlace, held_parameters, link_places
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
-from robotid.robot.tree import read_tree, read_with_yourdfpy
+from robotid.robot.tree import read_tree
+from robotid.robot.urdf_text import read_with_yourdfpy
 from robotid.versions import __version__
 
 __all__ = ["load_identified", "read_sidecar", "write_urdf"]
@@ -41,7 +42,8 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     """Write standard parameters into a copy of the model's URDF, and a sidecar beside it.
 
     The link that a body's joint moves gets the body's inertial; links joined to it by fixed
-    joints lose theirs, since the sum holds it; links behind locked joints keep theirs. Both files
+    joints lose theirs, since the sum holds it; links behind locked joints keep theirs. Angles that
+    the model has in exact form (``snap_angles``) are written so. Both files
     are read back and must give the torque of pi before they are put in place.
 
     Args:
@@ -64,7 +66,7 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     original, places = source.read_bytes(), link_places(model)
     written = _link_parameters(model, pi)
     document = xml_splice.parse(original, source.name)
-    edits = _inertial_edits(document, written, places)
+    edits = _inertial_edits(document, written, places) + _angle_edits(document, model)
     if dynamics:
         edits += _dynamics_edits(document, model, pi)
     content = xml_splice.apply(document, edits)
@@ -166,14 +168,8 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
     layout, first = model.layout, model.layout.n_inertial
     values = dict(zip(layout.names, map(float, pi), strict=True))
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
-    followers = {j.name for j in model.tree.movable if j.mimic and model.mimic == "coupled"}
     return {
-        "joints": list(model.joints),
-        "locked": {j: float(x) for j, x in model.locked.items() if j not in followers},
-        "gravity": [float(g) for g in model.pin_model.gravity.linear],
-        "free_flyer": model.free_flyer,
-        "mimic": model.mimic,
-        "terms": list(layout.terms),
+        **model.options,
         "drives": {j: {t: values[f"{j}.{t}"] for t in layout.terms} for j in layout.joints},
         "couplings": [
             {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
@@ -255,6 +251,19 @@ def _inertial_edits(
             edits.append(xml_splice.replace(document, inertials[0], _inertial(written[name])))
         elif name in written:
             edits.append(xml_splice.insert(document, link, _inertial(written[name])))
+    return edits
+
+
+def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
+    """Return the changes that write the angles of joints which the model has in exact form."""
+    used = {j.get("name"): j.find("origin") for j in model.tree.robot.findall("joint")}
+    edits: list[Edit] = []
+    for joint in document.root.find_all("joint"):
+        origin = used.get(joint.attributes.get("name", ""))
+        rpy = "" if origin is None else origin.get("rpy", "")
+        for element in joint.find_all("origin")[:1]:
+            if element.attributes.get("rpy", "") != rpy:
+                edits += xml_splice.set_attributes(document, element, {"rpy": rpy})
     return edits
 
 

@@ -48,7 +48,7 @@ def joint_torque_regressor(
         Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
 
     Raises:
-        DataError: If a shape does not fit the model.
+        DataError: If a shape does not fit the model, or a value is not finite.
 
     References:
         Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
@@ -57,6 +57,11 @@ def joint_torque_regressor(
     wanted = (len(q), model.n_rows)
     if v.shape != wanted or a.shape != wanted:
         raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+    for name, values in (("v", v), ("a", a)):
+        if not np.isfinite(values).all():
+            k, j = np.argwhere(~np.isfinite(values))[0]
+            row = model.row_names[j]
+            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
     Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
     _write_inertial(model, q, v, a, Y[:, :, : model.layout.n_inertial])
     _write_drives(model, v, a, direction, Y[:, :, model.layout.n_inertial :])

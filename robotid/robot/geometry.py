@@ -9,7 +9,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.robot.bodies import link_places
-from robotid.robot.meshes import Shape, find_mesh, read_shapes
+from robotid.robot.meshes import Shape, find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
@@ -201,10 +201,11 @@ def _shape_points(shape: Shape, urdf: Path) -> Array | None:
     path = find_mesh(shape.file, urdf) if shape.kind == "mesh" else None
     if path is None:
         return None
-    import trimesh
-
-    vertices: Array = np.array(trimesh.load_mesh(path).vertices)
-    return vertices * size
+    try:
+        surfaces = read_surfaces(path)
+    except ValueError:  # said by "geometry_unread"
+        return None
+    return np.vstack([s.vertices for s in surfaces]) * size if surfaces else None
 
 
 def _moved(points: Array, H: Array) -> Array:

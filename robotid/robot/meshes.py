@@ -14,9 +14,12 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import MissingDependencyError
 from robotid.robot.examples import example_urdfs
-from robotid.robot.tree import numbers
+from robotid.robot.urdf_text import LARGEST, numbers
 
 __all__ = ["Shape", "Surface", "find_mesh", "read_shapes", "read_surfaces", "thin"]
+
+_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off", ".glb", ".gltf")
+_MOST_BYTES = 2**28  # of a mesh; a link's has 2**20
 
 GREY = (0.6, 0.65, 0.7, 1.0)  # what has no colour
 _CREASE = np.radians(30.0)  # faces that meet at a sharper angle than this show an edge
@@ -85,7 +88,8 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     """Return the file of a mesh, None if there is none.
 
     A path with ``package://`` or none is looked for in ROS_PACKAGE_PATH, in the URDF's folder and
-    those above it, and in example-robot-data, with the name of its package and without it.
+    those above it, and in example-robot-data, with the name of its package and without it; a path
+    in a package does not leave it by "..". Folders, pipes and devices are no meshes.
 
     Args:
         name: What the URDF calls it.
@@ -93,24 +97,26 @@ def find_mesh(name: str, urdf: str | Path) -> Path | None:
     """
     if name.startswith("file://"):
         path = Path(name.removeprefix("file://"))
-        return path if path.is_file() else None
+        return path if os.path.isfile(path) else None
     is_package = re.match(r"(package|model)://", name) is not None
     inside = re.sub(r"^(package|model)://", "", name).lstrip("/")
     whole = Path(name)
     if not is_package and whole.is_absolute():
-        return whole if whole.is_file() else None
+        return whole if os.path.isfile(whole) else None
+    if is_package and ".." in Path(inside).parts:
+        return None
     _, _, without = inside.partition("/")
     for folder in _folders(Path(urdf)):
-        if (folder / inside).is_file():
+        if os.path.isfile(folder / inside):  # unlike Path.is_file, it never raises
             return folder / inside
         # the folder may be that of the package, whatever it is called here
-        if is_package and without and (folder / without).is_file():
+        if is_package and without and os.path.isfile(folder / without):
             return folder / without
     return None
 
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
-    """Read a mesh: STL, DAE, OBJ, PLY or what else trimesh reads.
+    """Read a mesh: STL, DAE, OBJ, PLY, OFF or glTF.
 
     Args:
         path: The file.
@@ -119,15 +125,24 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
         Its surfaces [m], none if it holds no triangles.
 
     Raises:
-        ValueError: If the file cannot be read.
+        ValueError: If the file cannot be read, is larger than 256 MiB, or a corner of it is no
+            finite place.
     """
-    import trimesh
-
+    if path.suffix.lower() not in _FORMATS:
+        raise ValueError(f"{path.name} is no mesh, wanted {', '.join(_FORMATS)}")
+    # the readers of the formats raise errors of every kind
     try:
-        scene = trimesh.load_scene(path)
-    # the readers of the formats raise errors of every kind; the mesh is decoration
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"it has more than {_MOST_BYTES // 2**20} MiB")
+        return _read_surfaces(path)
     except Exception as error:
         raise ValueError(f"{path.name} cannot be read: {error}") from error
+
+
+def _read_surfaces(path: Path) -> tuple[Surface, ...]:
+    import trimesh
+
+    scene = trimesh.load_scene(path)
     metres = 1.0
     if path.suffix.lower() == ".dae":  # the one format that states its unit
         metres = float(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
@@ -136,6 +151,8 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
             rgba = _mesh_colour(mesh.visual)
             surface = Surface(metres * np.asarray(mesh.vertices), np.asarray(mesh.faces), rgba)
+            if not np.abs(surface.vertices).max(initial=0.0) <= LARGEST:
+                raise ValueError("a corner lies nowhere, or too far away")
             by_colour.setdefault(rgba, []).append(surface)
     return tuple(_joined(surfaces) for surfaces in by_colour.values())
 
@@ -152,7 +169,7 @@ def thin(surfaces: Sequence[Surface], most: int) -> list[Surface]:
         most: Triangles that may be left of all of them.
     """
     extents = [float(np.ptp(s.vertices, axis=0).max()) for s in surfaces if len(s.faces)]
-    cell = _FIRST_CELL * max(extents, default=1.0)
+    cell = _FIRST_CELL * (max(extents, default=0.0) or 1.0)
     left = [_clustered(surface, 1e-3 * cell) for surface in surfaces]  # joins equal corners
     while sum(len(s.faces) for s in left) > most:
         left = [_clustered(surface, cell) for surface in surfaces]
@@ -180,32 +197,32 @@ def _geometry(element: ET.Element) -> tuple[str, tuple[float, ...], str]:
         get = shape.get
         match shape.tag:
             case "mesh":
-                size, count = numbers(get("scale", "1 1 1")), 3
+                size = numbers(get("scale", "1 1 1"), 3)
             case "box":
-                size, count = numbers(get("size", "")), 3
+                size = numbers(get("size", ""), 3)
             case "cylinder":
-                size, count = numbers(f"{get('radius', '')} {get('length', '')}"), 2
+                size = numbers(f"{get('radius', '')} {get('length', '')}", 2)
             case "sphere":
-                size, count = numbers(get("radius", "")), 1
+                size = numbers(get("radius", ""), 1)
             case _:
                 continue
-        if len(size) == count and (shape.tag != "mesh" or get("filename")):
+        if size and (shape.tag != "mesh" or get("filename")):
             return shape.tag, size, get("filename", "")
     return "", (), ""
 
 
 def _colour(material: ET.Element) -> tuple[float, ...] | None:
     colour = material.find("color")
-    rgba = () if colour is None else numbers(colour.get("rgba", ""))
-    return tuple(min(max(x, 0.0), 1.0) for x in rgba) if len(rgba) == 4 else None
+    rgba = () if colour is None else numbers(colour.get("rgba", ""), 4)
+    return tuple(min(max(x, 0.0), 1.0) for x in rgba) or None
 
 
 def _placement(origin: ET.Element | None) -> tuple[Array, bool]:
     """Return the pose, shape (4, 4), and whether it is understood."""
     M = np.eye(4)
     pose = {} if origin is None else origin.attrib
-    xyz, rpy = (numbers(pose.get(key, "0 0 0")) for key in ("xyz", "rpy"))
-    known = len(xyz) == len(rpy) == 3
+    xyz, rpy = (numbers(pose.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
+    known = bool(xyz and rpy)
     if known:
         M[:3, :3], M[:3, 3] = pin.rpy.rpyToMatrix(*rpy), xyz
     return M, known

@@ -1,6 +1,7 @@
 """The robot: a kinematic tree with Pinocchio's dynamics and named standard parameters."""
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +15,18 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.findings import listed
 from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
+from robotid.robot.urdf_text import LARGEST
 
 __all__ = ["GRAVITY", "RobotModel"]
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
+_STRONGEST = 100.0  # [m/s^2] beyond it, what accelerations show is lost beside what gravity shows
+_MOST_JOINTS = 300  # memory grows with their square, time with their cube: 2 GiB, 75 s
+_MOST = 1e30  # largest size of a parameter, SI units: products of a few of them stay finite
+_UNIT = 1e-6  # how far from 1 the length of a quaternion may be
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +59,14 @@ class RobotModel:
 
     def __repr__(self) -> str:
         return (
-            f"<RobotModel {self.name}: {len(self.joints)} joints, {', '.join(self.joints)}; "
+            f"<RobotModel {self.name}: {len(self.joints)} joints, {listed(self.joints)}; "
             f"{len(self.layout.names)} standard parameters>"
         )
 
     @classmethod
     def from_urdf(
         cls,
-        path: str | Path,
+        path: str | Path | Tree,
         *,
         joints: Sequence[str] | None = None,
         locked: Mapping[str, float] | None = None,
@@ -68,11 +75,12 @@ class RobotModel:
         gravity: Sequence[float] = GRAVITY,
         terms: Sequence[str] = DRIVE_TERMS,
         couplings: Sequence[Coupling] = (),
+        snap_angles: bool = False,
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
 
         Args:
-            path: The URDF file.
+            path: The URDF file, or what was read of it.
             joints: Names of the joints that move, in the order wanted; all movable ones, in
                 Pinocchio's order, if None.
             locked: Positions of joints held still [rad or m]; a joint that is neither in
@@ -83,22 +91,32 @@ class RobotModel:
             gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
             terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
             couplings: Drives that turn with several joints.
+            snap_angles: Whether angles of joints that the file rounds, 3.1416, become the multiple
+                of pi/12 that they round; see ``exact_angle`` for which are taken as rounded.
 
         Returns:
             The model.
 
         Raises:
-            ModelError: If the URDF cannot be used, or a joint is not in it.
+            ModelError: If the URDF cannot be used, a joint is not in it, or a number is not usable.
             SettingsError: If a term or a coupling is unknown.
         """
-        tree = read_tree(path)
+        tree = path if isinstance(path, Tree) else read_tree(path)
+        tree = tree.snapped() if snap_angles else tree
         if mimic not in ("independent", "coupled"):
             raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
+        if not (tree.movable or free_flyer):
+            raise ModelError(
+                f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
+                "nothing to identify; a body that flies has ten parameters with free_flyer=True"
+            )
         followers = _followers(tree) if mimic == "coupled" else {}
         full = _build(tree, free_flyer, gravity)
         first = 2 if free_flyer else 1  # Pinocchio's joint 0 is the world, 1 may be the base
         free = [name for name in list(full.names)[first:] if name not in followers]
         moving, positions = _choose_joints(tree, free, joints, locked or {}, followers)
+        if not moving and not free_flyer:
+            raise ModelError("all joints are locked, so there is nothing to identify; free one")
         reduced = _reduce(full, positions)
         G, shift = _velocity_map(reduced, moving, followers, free_flyer)
         child = {joint.name: joint.child for joint in tree.movable}
@@ -117,6 +135,19 @@ class RobotModel:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, locked=MappingProxyType(state["locked"]))
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What of ``from_urdf``'s arguments makes this model of its tree, couplings aside."""
+        followers = {j.name for j in self.tree.movable if j.mimic and self.mimic == "coupled"}
+        return {
+            "joints": list(self.joints),
+            "locked": {j: float(x) for j, x in self.locked.items() if j not in followers},
+            "gravity": [float(g) for g in self.pin_model.gravity.linear],
+            "free_flyer": self.free_flyer,
+            "mimic": self.mimic,
+            "terms": list(self.layout.terms),
+        }
 
     @property
     def name(self) -> str:
@@ -176,11 +207,14 @@ class RobotModel:
             A new model; the drive terms have no place in it.
 
         Raises:
-            DataError: If pi has another length.
+            DataError: If pi has another length, or a value that is no finite number below 1e30.
         """
         size = self.layout.n_inertial
         if pi.shape not in ((size,), (len(self.layout.names),)):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(self.layout.names)},)")
+        for i in np.flatnonzero(~(np.abs(pi[:size]) <= _MOST)).tolist():
+            name, unit = self.layout.names[i], self.layout.units[i]
+            raise DataError(f"{name} is {pi[i]:g} {unit}, wanted a finite number below {_MOST:g}")
         copy = pin.Model(self.pin_model)
         for i, values in enumerate(pi[:size].reshape(-1, 10)):
             copy.inertias[i + 1] = _inertia(values)
@@ -196,12 +230,24 @@ class RobotModel:
             Configurations, shape (N, nq): a continuous joint as cosine and sine.
 
         Raises:
-            DataError: If q has another width.
+            DataError: If q has another width, is not finite, or a quaternion is not of length 1.
         """
         base = 7 if self.free_flyer else 0
         wanted = base + len(self.joints)
         if q.ndim != 2 or q.shape[1] != wanted:
             raise DataError(f"q has shape {q.shape}, wanted (N, {wanted})")
+        if not (np.abs(q).max(initial=0.0) <= LARGEST):  # not NaN either
+            row, column = np.argwhere(~(np.abs(q) <= LARGEST))[0].tolist()
+            raise DataError(
+                f"q[{row}, {column}] is {q[row, column]:g}, wanted a number within +-{LARGEST:g}"
+            )
+        if self.free_flyer:
+            sizes = np.linalg.norm(q[:, 3:7], axis=1)
+            for row in np.flatnonzero(np.abs(sizes - 1.0) > _UNIT).tolist():
+                raise DataError(
+                    f"q[{row}, 3:7], the quaternion of the base, has length {sizes[row]:g}, wanted "
+                    "1; it is stated as qx qy qz qw"
+                )
         first = 6 if self.free_flyer else 0
         angles = q[:, base:] @ self.velocity_map[first:, first:].T + self.position_offset[first:]
         if self.pin_model.nq == self.pin_model.nv:
@@ -239,7 +285,9 @@ def _inertia(values: Array) -> pin.Inertia:
     if values[0] != 0.0:
         return pin.Inertia.FromDynamicParameters(values)
     xx, xy, yy, xz, yz, zz = values[4:]
-    return pin.Inertia(0.0, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    massless = pin.Inertia.Zero()
+    massless.inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # impossible ones, too
+    return massless
 
 
 def _choose_joints(
@@ -255,8 +303,20 @@ def _choose_joints(
     both = [name for name in moving if name in locked]
     if both:
         raise ModelError(f"joints {listed(both)} are both identified and locked; choose one")
-    if len(set(moving)) != len(moving) or not moving:
+    if len(set(moving)) != len(moving):
         raise ModelError(f"joints to identify must be named once each, got {listed(moving)}")
+    if len(moving) > _MOST_JOINTS:
+        raise ModelError(
+            f"{Path(tree.path).name}: {len(moving)} joints move, wanted at most {_MOST_JOINTS}; "
+            "name those that are to be identified (joints), or lock others"
+        )
+    for name, position in locked.items():
+        is_number = isinstance(position, int | float | np.number)
+        if not is_number or not abs(position) <= LARGEST:
+            raise ModelError(
+                f"joint {name!r} is locked at {position!r}, wanted a number within +-{LARGEST:g} "
+                "[rad or m]"
+            )
     positions = {name: float(locked.get(name, 0.0)) for name in free if name not in moving}
     _check_mimic(tree, moving, positions, followers)
     for name, (leader, ratio, offset) in followers.items():
@@ -305,6 +365,11 @@ def _followers(tree: Tree) -> dict[str, tuple[str, float, float]]:
                 break
             seen.add(leader)
             leader, ratio, offset = up[0], ratio * up[1], ratio * up[2] + offset
+        if not max(abs(ratio), abs(offset)) <= LARGEST:
+            raise ModelError(
+                f"joint {joint.name!r} mimics {leader!r} in the end with multiplier {ratio:g} and "
+                f"offset {offset:g}, wanted numbers within +-{LARGEST:g}; correct the <mimic>"
+            )
         resolved[joint.name] = (leader, ratio, offset)
     return resolved
 
@@ -324,16 +389,32 @@ def _check_mimic(
 
 
 def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
+    acceleration = _gravity(gravity)
     root = (pin.JointModelFreeFlyer(),) if free_flyer else ()
-    try:
-        model = pin.buildModelFromXML(tree.xml, *root)
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"{Path(tree.path).name}: Pinocchio refuses it: {error}") from error
-    acceleration = np.asarray(gravity, dtype=float)
-    if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
-        raise ModelError(f"gravity is {listed(gravity)}, wanted three finite numbers [m/s^2]")
+    refused = ""
+    with caught_messages() as messages:
+        try:
+            model = pin.buildModelFromXML(tree.xml, *root)
+        except (ValueError, RuntimeError) as error:
+            refused = str(error)
+    if refused or messages:  # what it complains of, it leaves out
+        said = "; ".join([*messages, *([refused] if refused else [])])
+        raise ModelError(f"{Path(tree.path).name}: Pinocchio refuses it: {said}")
     model.gravity.linear = acceleration
     return model
+
+
+def _gravity(gravity: Sequence[float]) -> Array:
+    try:
+        acceleration = np.asarray(gravity, dtype=float)
+    except (TypeError, ValueError):
+        acceleration = np.full(3, math.nan)
+    if acceleration.shape != (3,) or not (np.abs(acceleration) <= _STRONGEST).all():
+        shown = listed(gravity) if isinstance(gravity, list | tuple) else repr(gravity)
+        raise ModelError(
+            f"gravity is {shown}, wanted three finite numbers within +-{_STRONGEST:g} [m/s^2]"
+        )
+    return acceleration
 
 
 def _reduce(model: pin.Model, positions: Mapping[str, float]) -> pin.Model:

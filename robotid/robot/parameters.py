@@ -10,6 +10,7 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
+from robotid.robot.urdf_text import LARGEST
 
 __all__ = [
     "INERTIAL_TERMS",
@@ -76,6 +77,12 @@ class ParameterLayout:
                     f"coupling {coupling.name!r} names the joints {listed(missing)}, which are "
                     f"not identified; joints: {listed(self.joints)}"
                 )
+            for joint, ratio in coupling.ratios:
+                if not abs(ratio) <= LARGEST:
+                    raise SettingsError(
+                        f"coupling {coupling.name!r}: the ratio of joint {joint!r} is {ratio!r}, "
+                        f"wanted a number within +-{LARGEST:g} [-]"
+                    )
             if coupling.name in self.joints:
                 raise SettingsError(
                     f"coupling {coupling.name!r} has the name of a joint; give it another name"

@@ -2,12 +2,13 @@
 
 Pinocchio's parser wants meshes' neighbours, limits and ``<dynamics>`` to be right, although the
 dynamics never use them, and only prints what it misses. So the XML is read here, every fault that
-matters is refused by name, and Pinocchio gets the kinematic tree alone.
+matters is refused by name, and Pinocchio gets the kinematic tree alone, in the numbers read here.
 """
 
+import copy
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -15,20 +16,18 @@ from typing import Any
 
 from robotid.exceptions import ModelError
 from robotid.findings import listed
+from robotid.robot.urdf_text import parse_urdf, read_numbers, write_exact_angles
 
-__all__ = [
-    "MOVABLE",
-    "Inertial",
-    "Joint",
-    "Tree",
-    "numbers",
-    "parse_urdf",
-    "read_tree",
-    "read_with_yourdfpy",
-]
+__all__ = ["MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
 
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
+_ENDLESS = 200.0  # [rad or m] a stated range this wide is none: no cable winds 30 turns
+_ZERO = (0.0, 0.0, 0.0)
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_LIGHTEST = 1e-15  # [kg] of a link that has a mass: what is divided by it stays finite
+_DEEPEST = 500  # joints from the root to a link; Pinocchio goes down them by recursion
+_TAKEN = ("universe", "root_joint")  # Pinocchio's names of the world and of a floating base
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,9 @@ class Joint:
         velocity: Velocity limit [rad/s or m/s], inf if none is stated.
         effort: Effort limit [N m or N], inf if none is stated.
         mimic: Name of the joint it mimics, multiplier [-], offset [rad or m]; or None.
+        xyz: Origin in the parent's frame [m].
+        rpy: Roll, pitch, yaw there [rad].
+        axis: Direction that it turns about or slides along, of any length.
     """
 
     name: str
@@ -73,6 +75,9 @@ class Joint:
     velocity: float = math.inf
     effort: float = math.inf
     mimic: tuple[str, float, float] | None = None
+    xyz: tuple[float, ...] = _ZERO
+    rpy: tuple[float, ...] = _ZERO
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
 
     @property
     def is_movable(self) -> bool:
@@ -81,8 +86,11 @@ class Joint:
 
     @property
     def has_limits(self) -> bool:
-        """Whether the URDF states a range of positions; lower = upper = 0 states none."""
-        return math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper
+        """Whether the URDF states a range of positions.
+
+        lower = upper = 0 states none, and neither does a range that no joint has, as +-10000 rad.
+        """
+        return 0.0 < self.upper - self.lower < _ENDLESS
 
     @property
     def turns_freely(self) -> bool:
@@ -125,11 +133,21 @@ class Tree:
 
     @property
     def xml(self) -> str:
-        """A URDF with nothing but the links, inertials and joints."""
+        """A URDF with nothing but the links, inertials and joints, its numbers as read here."""
         minimal = ET.Element("robot", name=self.name)
-        minimal.extend(_copy(link, ("inertial",)) for link in self.robot.findall("link"))
-        minimal.extend(_minimal_joint(joint) for joint in self.robot.findall("joint"))
+        for link in self.links:
+            element = ET.SubElement(minimal, "link", name=link)
+            if link in self.inertials:
+                _add_inertial(element, self.inertials[link])
+        for joint in self.joints:
+            _add_joint(minimal, joint)
         return ET.tostring(minimal, encoding="unicode")
+
+    def snapped(self) -> "Tree":
+        """Return the same robot with the exact angles that its joints' origins round."""
+        robot = copy.deepcopy(self.robot)
+        write_exact_angles(robot)
+        return _tree(robot, self.path)
 
 
 def read_tree(path: str | Path) -> Tree:
@@ -139,13 +157,14 @@ def read_tree(path: str | Path) -> Tree:
         path: The URDF file. Meshes are not looked for.
 
     Raises:
-        ModelError: If the file is missing, is no URDF, is no tree, has no movable joint, or if a
-            number that the dynamics use is missing, not a number or not finite.
+        ModelError: If the file is missing, is no URDF, is no tree, or if a number that the dynamics
+            use is missing, or is not what urdfdom reads the same way.
     """
-    source = Path(path)
-    robot = parse_urdf(source)
-    where = source.name
-    name = robot.get("name")
+    return _tree(parse_urdf(path), str(path))
+
+
+def _tree(robot: ET.Element, path: str) -> Tree:
+    where, name = Path(path).name, robot.get("name")
     if not name:
         raise ModelError(
             f'{where}: <robot> has no name; write <robot name="..."> in its first line'
@@ -153,40 +172,13 @@ def read_tree(path: str | Path) -> Tree:
     links = _unique(robot.findall("link"), "link", where)
     elements = _unique(robot.findall("joint"), "joint", where)
     joints = tuple(_joint(element, links, where) for element in elements.values())
-    if not any(joint.is_movable for joint in joints):
-        raise ModelError(
-            f"{where}: robot {name!r} has no movable joint, so there is nothing to identify"
-        )
     root = _root(tuple(links), joints, where)
     inertials = {
         link: _inertial(inertial, f"{where}: link {link!r}: inertial")
         for link, element in links.items()
         if (inertial := element.find("inertial")) is not None
     }
-    return Tree(str(source), name, root, tuple(links), joints, MappingProxyType(inertials), robot)
-
-
-def parse_urdf(path: str | Path) -> ET.Element:
-    """Return the ``<robot>`` of a URDF file, whatever is in it.
-
-    Args:
-        path: The URDF file.
-
-    Raises:
-        ModelError: If the file is missing, or is no XML or another one.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise ModelError(f"there is no URDF file {str(path)!r}")
-    if path.suffix == ".xacro":
-        raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
-    try:
-        robot = ET.parse(path).getroot()
-    except (ET.ParseError, LookupError, ValueError) as error:  # the latter two: its encoding
-        raise ModelError(f"{path.name} is not well-formed XML: {error}") from error
-    if robot.tag != "robot":
-        raise ModelError(f"{path.name}: the top element is <{robot.tag}>, wanted <robot>")
-    return robot
+    return Tree(path, name, root, tuple(links), joints, MappingProxyType(inertials), robot)
 
 
 def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.Element]:
@@ -195,6 +187,10 @@ def _unique(elements: list[ET.Element], kind: str, where: str) -> dict[str, ET.E
         name = element.get("name")
         if not name:
             raise ModelError(f"{where}: a <{kind}> has no name; give it one")
+        if kind == "joint" and name in _TAKEN:
+            raise ModelError(
+                f"{where}: a joint is named {name!r}, a name that Pinocchio has taken; rename it"
+            )
         if name in named:
             raise ModelError(f"{where}: two {kind}s are named {name!r}; names must be unique")
         named[name] = element
@@ -215,116 +211,107 @@ def _joint(element: ET.Element, links: dict[str, ET.Element], where: str) -> Joi
         ends[end] = tag.get("link", "") if tag is not None else ""
         if ends[end] not in links:
             raise ModelError(f"{at} has the {end} link {ends[end]!r}, which the file does not hold")
-    origin, axis = element.find("origin"), element.find("axis")
-    if origin is not None:
-        for key in ("xyz", "rpy"):
-            _numbers(origin.get(key, "0 0 0"), 3, f"{at}: origin {key}")
-    if axis is not None and kind != "fixed":
-        direction = _numbers(axis.get("xyz", "1 0 0"), 3, f"{at}: axis xyz")
-        if math.hypot(*direction) < 1e-9:
-            raise ModelError(f"{at}: axis xyz is zero; give it a direction")
-    limit, mimic = element.find("limit"), element.find("mimic")
-    bounds = {}
-    if limit is not None and kind != "fixed":
-        keys = ("velocity", "effort") + (("lower", "upper") if kind != "continuous" else ())
-        for key in keys:
-            if (text := limit.get(key)) is not None:
-                (bounds[key],) = _numbers(text, 1, f"{at}: limit {key}")
-    return Joint(name, kind, ends["parent"], ends["child"], **bounds, mimic=_mimic(mimic, at))
+    xyz, rpy = _pose(element, f"{at}:")
+    if kind == "fixed":
+        return Joint(name, kind, ends["parent"], ends["child"], xyz=xyz, rpy=rpy)
+    axis, limit = element.find("axis"), element.find("limit")
+    direction = (1.0, 0.0, 0.0) if axis is None else read_numbers(axis, "xyz", f"{at}:")
+    if math.hypot(*direction) < 1e-9:
+        raise ModelError(f"{at}: axis xyz is zero; give it a direction")
+    keys = ("velocity", "effort") + (("lower", "upper") if kind != "continuous" else ())
+    bounds = {
+        key: read_numbers(limit, key, f"{at}:")[0]
+        for key in keys
+        if limit is not None and limit.get(key) is not None
+    }
+    mimic = _mimic(element.find("mimic"), at)
+    return Joint(
+        name, kind, ends["parent"], ends["child"], **bounds,
+        mimic=mimic, xyz=xyz, rpy=rpy, axis=direction,
+    )  # fmt: skip
+
+
+def _pose(element: ET.Element, at: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return xyz and rpy of an element's origin."""
+    origin = element.find("origin")
+    if origin is not None and origin.get("quat_xyzw") is not None:
+        raise ModelError(f"{at} origin has quat_xyzw, wanted rpy; write its angles as rpy")
+    return read_numbers(origin, "xyz", at, _ZERO), read_numbers(origin, "rpy", at, _ZERO)
 
 
 def _mimic(element: ET.Element | None, at: str) -> tuple[str, float, float] | None:
     if element is None:
         return None
-    multiplier, offset = (
-        _numbers(element.get(key, default), 1, f"{at}: mimic {key}")[0]
-        for key, default in (("multiplier", "1"), ("offset", "0"))
-    )
+    (multiplier,) = read_numbers(element, "multiplier", f"{at}:", (1.0,))
+    (offset,) = read_numbers(element, "offset", f"{at}:", (0.0,))
     return element.get("joint", ""), multiplier, offset
 
 
 def _root(links: tuple[str, ...], joints: tuple[Joint, ...], where: str) -> str:
-    parent: dict[str, str] = {}
+    """Return the link that no joint moves, after checking that all others hang on it."""
+    children: dict[str, list[str]] = {link: [] for link in links}
+    moved: set[str] = set()
     for joint in joints:
-        if joint.child in parent:
+        if joint.child in moved:
             raise ModelError(
                 f"{where}: link {joint.child!r} is the child of two joints; a URDF is a tree, so "
                 "closed chains must be opened"
             )
-        parent[joint.child] = joint.parent
-    roots = [link for link in links if link not in parent]
+        moved.add(joint.child)
+        children[joint.parent].append(joint.child)
+    level = roots = [link for link in links if link not in moved]
     if len(roots) != 1:
-        raise ModelError(f"{where}: a URDF has one root link, but this one has {listed(roots)}")
+        raise ModelError(f"{where}: a URDF has one root link, but this one has {listed(roots, 9)}")
+    reached, depth = set(roots), 0
+    while level:
+        level = [child for link in level for child in children[link]]
+        reached.update(level)
+        depth += 1
+        if depth > _DEEPEST:
+            raise ModelError(
+                f"{where}: a chain has more than {_DEEPEST} joints, one behind the other; robotid "
+                f"handles {_DEEPEST}"
+            )
+    if circle := [link for link in links if link not in reached]:
+        raise ModelError(
+            f"{where}: the links {listed(circle, 9)} hang on each other in a circle, not on the "
+            f"root link {roots[0]!r}; correct the parent of one of their joints"
+        )
     return roots[0]
 
 
 def _inertial(inertial: ET.Element, at: str) -> Inertial:
-    mass, inertia, origin = (inertial.find(tag) for tag in ("mass", "inertia", "origin"))
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
         raise ModelError(f"{at} needs both <mass> and <inertia>; add the missing one")
-    pose = origin.attrib if origin is not None else {}
-    com, rpy = (_numbers(pose.get(key, "0 0 0"), 3, f"{at} origin {key}") for key in ("xyz", "rpy"))
-    moments = [
-        _numbers(inertia.get(key, "0"), 1, f"{at} {key}")[0]
-        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    ]
-    (value,) = _numbers(mass.get("value", ""), 1, f"{at} mass")
+    com, rpy = _pose(inertial, at)
+    (value,) = read_numbers(mass, "value", at)
     if value < 0:
         raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; correct the sign")
-    return Inertial(value, com, rpy, tuple(moments))
+    if 0 < value < _LIGHTEST:
+        raise ModelError(f"{at} mass is {value:g} kg, wanted 0 or at least {_LIGHTEST:g}")
+    moments = tuple(read_numbers(inertia, key, at)[0] for key in _MOMENTS)
+    return Inertial(value, com, rpy, moments)
 
 
-def numbers(text: str) -> tuple[float, ...]:
-    """Return the numbers of an attribute, none if a word is no finite number.
-
-    Args:
-        text: The attribute, numbers with blanks between them.
-    """
-    try:
-        values = tuple(float(word) for word in text.split())
-    except ValueError:
-        return ()
-    return values if all(map(math.isfinite, values)) else ()
+def _text(values: Sequence[float]) -> str:
+    return " ".join(map(repr, values))
 
 
-def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
-    values = numbers(text)
-    if len(values) != count:
-        raise ModelError(f"{what} is {text!r}, wanted {count} finite number(s)")
-    return values
+def _add_inertial(link: ET.Element, inertial: Inertial) -> None:
+    element = ET.SubElement(link, "inertial")
+    ET.SubElement(element, "origin", xyz=_text(inertial.com), rpy=_text(inertial.rpy))
+    ET.SubElement(element, "mass", value=repr(inertial.mass))
+    moments = dict(zip(_MOMENTS, map(repr, inertial.inertia), strict=True))
+    ET.SubElement(element, "inertia", moments)
 
 
-def _copy(element: ET.Element, children: tuple[str, ...]) -> ET.Element:
-    copy = ET.Element(element.tag, element.attrib)
-    copy.extend(child for tag in children if (child := element.find(tag)) is not None)
-    return copy
-
-
-def _minimal_joint(element: ET.Element) -> ET.Element:
-    copy = _copy(element, ("origin", "parent", "child", "axis"))
-    if element.get("type") in MOVABLE:
+def _add_joint(robot: ET.Element, joint: Joint) -> None:
+    element = ET.SubElement(robot, "joint", name=joint.name, type=joint.type)
+    ET.SubElement(element, "origin", xyz=_text(joint.xyz), rpy=_text(joint.rpy))
+    ET.SubElement(element, "parent", link=joint.parent)
+    ET.SubElement(element, "child", link=joint.child)
+    if joint.is_movable:
+        ET.SubElement(element, "axis", xyz=_text(joint.axis))
         # the parser demands limits; the dynamics do not use them, `Joint` keeps the stated ones
-        ET.SubElement(copy, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")
-    return copy
-
-
-def read_with_yourdfpy(path: str | Path) -> Any:  # noqa: ANN401
-    """Read a URDF with yourdfpy, a reader that shares no line with this package's.
-
-    Args:
-        path: The URDF file. Meshes are not loaded.
-
-    Returns:
-        yourdfpy's ``Robot``: its damping and friction are text, and None what is not stated.
-
-    Raises:
-        ModelError: If yourdfpy cannot read the file.
-    """
-    import yourdfpy
-
-    try:
-        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    # it checks nothing by itself, so a fault of the file comes out as one of these
-    except (AttributeError, IndexError, KeyError, SyntaxError, TypeError, ValueError) as error:
-        fault = f"{type(error).__name__}: {error}"
-        raise ModelError(f"yourdfpy cannot read {Path(path).name}: {fault}") from error
+        ET.SubElement(element, "limit", lower="-1e9", upper="1e9", velocity="1e9", effort="1e9")

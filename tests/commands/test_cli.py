@@ -9,6 +9,7 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.export.urdf import load_identified
 from robotid.logs.read import write_log
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -289,6 +290,26 @@ def test_a_job_file_states_its_logs_itself(logs, tmp_path, capsys):
     assert "verdict: good" in capsys.readouterr().out
     assert main(["identify", str(job), "--cutoff", "5"]) == 2
     assert "is a job file, which states its logs and settings itself" in capsys.readouterr().err
+
+
+def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys):
+    source = tmp_path / "arm.urdf"
+    text = example_urdf("xarm7.urdf").read_text().replace("1.5708", "1.57")
+    source.write_text(text)
+    model = RobotModel.from_urdf(source, snap_angles=True)
+    pi = truth(model)
+    write_log(exact_log(model, pi, rng, samples=400), tmp_path / "log.csv")
+    words = ["identify", str(source), str(tmp_path / "log.csv"), "--estimator", "wls", "--json"]
+    assert main([*words, "--out", str(tmp_path / "plain")]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    (finding,) = [f for f in plain["warnings"] if f["code"] == "rounded_rpy"]
+    assert "--snap-angles" in finding["message"]
+    assert main([*words, "--out", str(tmp_path / "snapped"), "--snap-angles"]) == 0
+    snapped = json.loads(capsys.readouterr().out)
+    assert "rounded_rpy" not in {f["code"] for f in snapped["warnings"]}
+    assert snapped["settings"]["snap_angles"] is True
+    assert snapped["structure"]["base"] == len(structural_mapping(model).K)
+    assert plain["structure"]["base"] > snapped["structure"]["base"]
 
 
 def test_no_log_is_wrong_usage(capsys):

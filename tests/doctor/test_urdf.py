@@ -3,11 +3,15 @@ import math
 
 import numpy as np
 import pytest
+from helpers.synthetic import exact_log, truth
 
+from robotid.doctor.diagnosis import check_logs
 from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import ModelError
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
-from robotid.robot.tree import read_with_yourdfpy
+from robotid.robot.model import RobotModel
+from robotid.robot.urdf_text import read_with_yourdfpy
 
 CLEAN = """<robot name="two">
   <link name="base"/>
@@ -21,6 +25,11 @@ CLEAN = """<robot name="two">
   <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
     <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/></joint>
 </robot>"""
+
+LONG = """<link name="l{0}"><inertial><origin xyz="0.1 0.02 0.03"/><mass value="1"/>
+  <inertia ixx="1" iyy="1" izz="1.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="j{0}" type="continuous"><parent link="l{1}"/><child link="l{0}"/>
+  <origin xyz="0.5 0 0.1" rpy="{2!r} 0 0.3"/><axis xyz="0 0 1"/></joint>"""
 
 TOOL = """<link name="tool">{inertial}</link><joint name="hold" type="fixed">
   <parent link="lower"/><child link="tool"/></joint></robot>"""
@@ -154,7 +163,7 @@ def test_a_rounded_angle_is_named_with_its_exact_value(tmp_path):
     # the axes stay parallel: the number of parameters does not suffer
     (finding,) = found(inspected(tmp_path, ('rpy="0 0 0"', 'rpy="0 -3.1416 0.1"')), "rounded_rpy")
     assert (finding["joint"], finding["severity"]) == ("shoulder", "note")
-    assert f"write {-math.pi!r} for -3.1416; the number of identifiable" in finding["message"]
+    assert f"write {-math.pi!r} for -3.1416; the identifiable" in finding["message"]
 
 
 def test_a_rounded_angle_that_tilts_an_axis_is_a_warning(tmp_path):
@@ -180,6 +189,37 @@ def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
     inspection = inspected(tmp_path, ("</robot>", frame), tilted)
     severity = {f["joint"]: f["severity"] for f in found(inspection, "rounded_rpy")}
     assert severity == {"hold": "note", "elbow": "warning"}
+
+
+COARSE = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.14 0 0"/>')
+
+
+def test_a_coarsely_rounded_angle_changes_the_base_and_snapping_mends_it(tmp_path):
+    rounded = inspected(tmp_path, COARSE)
+    (finding,) = found(rounded, "rounded_rpy")
+    exact = inspected(tmp_path, (COARSE[0], COARSE[1].replace("3.14", repr(math.pi))))
+    more = rounded.structure.base, exact.structure.base
+    assert more[0] > more[1]
+    assert f"makes {more[0]} base parameters of {more[1]}, and only noise" in finding["message"]
+    assert "snap_angles = true (--snap-angles) takes the exact angles" in finding["message"]
+    inspected(tmp_path, COARSE)
+    snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
+    assert len(structural_mapping(snapped).K) == more[1]
+    assert snapped.tree.joints[1].rpy == (math.pi, 0.0, 0.0)
+
+
+def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
+    for angle, expected in (("3.14", 1), ("3.1416", 1), (repr(math.pi), 0), ("3.13", 0)):
+        inspected(tmp_path, (COARSE[0], COARSE[1].replace("3.14", angle)))
+        model = RobotModel.from_urdf(tmp_path / "two.urdf")
+        log = exact_log(model, truth(model), rng)
+        findings = [f for f in check_logs(model, [log]) if f.code == "rounded_rpy"]
+        assert len(findings) == expected, angle
+        if findings:
+            assert (findings[0].severity, findings[0].where) == ("warning", "two.urdf")
+            assert "rounds angles of the joints elbow: the file" in findings[0].message
+        snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
+        assert not [f for f in check_logs(snapped, [log]) if f.code == "rounded_rpy"]
 
 
 def test_a_mimic_joint_is_named(tmp_path):
@@ -219,7 +259,7 @@ def test_what_is_no_number_is_named(tmp_path, old, new, kind, name, said):
     inspection = inspected(tmp_path, (old, new))
     (finding,) = found(inspection, "not_a_number")
     assert (finding[kind], finding["severity"]) == (name, "error")
-    assert f"{kind} {name!r}: {said}, wanted finite numbers" in finding["message"]
+    assert f"{kind} {name!r}: {said}, wanted " in finding["message"]
     content = inspection.to_dict()
     assert content["structure"] is None
     assert content["base_groups"] == []
@@ -279,9 +319,7 @@ def test_what_yourdfpy_cannot_read_is_a_finding(tmp_path):
 
 
 def test_the_condition_number_is_that_of_unit_columns(tmp_path):
-    from robotid.regressor.base_parameters import structural_mapping
     from robotid.regressor.torque import random_regressor
-    from robotid.robot.model import RobotModel
 
     structure = inspected(tmp_path).structure
     model = RobotModel.from_urdf(tmp_path / "two.urdf")
@@ -289,3 +327,15 @@ def test_the_condition_number_is_that_of_unit_columns(tmp_path):
     W = W[:, structural_mapping(model).independent]
     unit = np.linalg.cond(W / np.linalg.norm(W, axis=0))
     assert structure.condition == pytest.approx(unit, rel=0.5)  # other states, same size
+
+
+def test_a_chain_whose_last_joints_are_hardly_felt_is_named(tmp_path):
+    links = "".join(LONG.format(k, k - 1, math.pi / 2 * (k % 2)) for k in range(1, 61))
+    (tmp_path / "long.urdf").write_text(f'<robot name="long"><link name="l0"/>{links}</robot>')
+    inspection = inspect_urdf(tmp_path / "long.urdf")
+    (finding,) = found(inspection, "faint_parameters")
+    assert inspection.structure.base_inertial == 7 * 60 - 8
+    faint, base = finding["evidence"]["faint"], inspection.structure.base
+    assert faint > 0
+    assert f"{faint:.0f} parameters load the joints less than 1e-4 as much" in finding["message"]
+    assert f"left out of the {base} base parameters" in finding["message"]

@@ -4,16 +4,24 @@ import os
 import re
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from helpers.robots import motion
 
+from robotid.doctor.urdf import inspect_urdf
+from robotid.estimators import OLS
 from robotid.exceptions import DataError, ModelError
 from robotid.export import urdf
 from robotid.export.urdf import load_identified, read_sidecar, write_urdf
-from robotid.regressor.torque import random_regressor
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.factors import compress
+from robotid.regressor.torque import build_problem, random_regressor
 from robotid.robot.bodies import link_places
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.robot.tree import read_tree, read_with_yourdfpy
+from robotid.robot.tree import read_tree
+from robotid.robot.urdf_text import read_with_yourdfpy
 
 # three joints; a tool on a fixed joint, a frame without inertial, and much that is no dynamics
 RICH = """\ufeff<?xml version="1.0" encoding="utf-8"?>
@@ -462,3 +470,40 @@ def test_a_real_robot_with_locked_joints_survives_the_round_trip(recordings, tmp
     assert {link: after[link] for link in held & set(before)} == {
         link: before[link] for link in held & set(before)
     }
+
+
+@pytest.mark.parametrize("name", ["iris_simple.urdf", "quadrotor_base.urdf"])
+def test_a_body_that_flies_is_ten_parameters_that_its_motion_shows(tmp_path, rng, name):
+    model = RobotModel.from_urdf(example_urdf(name), free_flyer=True)
+    assert repr(model).endswith("0 joints, none; 10 standard parameters>")
+    structure = inspect_urdf(model.tree.path, free_flyer=True).structure
+    assert (structure.standard, structure.base, structure.undetermined) == (10, 10, ())
+    truth = model.standard_parameters() * 1.3
+    heavy = model.with_parameters(truth).pin_model
+    flight, data = motion(model, rng, 40), heavy.createData()
+    instants = zip(flight.q, flight.v, flight.a, strict=True)
+    flight.tau = np.array([pin.rnea(heavy, data, *instant) for instant in instants])
+    mapping = structural_mapping(model)
+    estimate = OLS().fit(compress(mapping.reduce(build_problem(model, flight))))
+    np.testing.assert_allclose(estimate.theta, mapping.to_base(truth), rtol=1e-9, atol=1e-12)
+    sidecar = write_urdf(model, truth, tmp_path / "new.urdf")
+    _, read_back = load_identified(tmp_path / "new.urdf", sidecar)
+    np.testing.assert_allclose(read_back, truth, rtol=1e-12, atol=1e-15)
+
+
+def test_snapped_angles_are_written_and_nothing_else_of_the_joints(tmp_path, rng):
+    source = tmp_path / "xarm.urdf"
+    source.write_bytes(example_urdf("xarm7.urdf").read_bytes())
+    model = RobotModel.from_urdf(source, snap_angles=True)
+    pi = possible_parameters(model, rng)
+    sidecar = write_urdf(model, pi, tmp_path / "new.urdf")
+    loaded, read_back = load_identified(tmp_path / "new.urdf", sidecar)  # without snapping
+    assert_same_torque(model, pi, loaded, read_back)
+    rpy = {joint.name: joint.rpy for joint in loaded.tree.joints}
+    assert rpy["joint2"] == (-np.pi / 2, 0.0, 0.0)
+    kept = re.compile(rb"<inertial.*?</inertial>|rpy=\"[^\"]*\"", re.DOTALL)
+    before, after = (kept.sub(b"", f.read_bytes()) for f in (source, tmp_path / "new.urdf"))
+    assert before.split() == after.split()
+    plain = RobotModel.from_urdf(source)
+    write_urdf(plain, pi, tmp_path / "plain.urdf")
+    assert read_tree(tmp_path / "plain.urdf").joints == plain.tree.joints

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+from helpers.hostile_urdfs import FILES
 from helpers.synthetic import exact_log, truth
 
+from robotid.doctor.urdf import inspect_urdf
 from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
@@ -154,3 +156,40 @@ def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_bo
     reach = np.sqrt(3.0 * (J[2, 2] / J[3, 3] - centre**2))
     assert body_boxes(small)["one"][1][2] == pytest.approx(centre + reach, abs=1e-9)
     assert centre + reach > 1.01 + 0.05 * 1.5
+
+
+BROKEN = {
+    "box without size": "<collision><geometry><box/></geometry></collision>",
+    "nothing": "<collision><geometry/></collision>",
+    "unknown shape": '<collision><geometry><capsule radius="1"/></geometry></collision>',
+    "size of text": '<collision><geometry><box size="1 1 1_0"/></geometry></collision>',
+    "garbage": MESH.format("garbage.stl"),
+    "counts": MESH.format("counts.ply"),
+    "no mesh": MESH.format("arm.urdf"),
+    "folder": MESH.format("folder.stl"),
+    "nowhere": MESH.format("nan.stl"),
+}
+
+
+@pytest.mark.parametrize("shape", BROKEN.values(), ids=BROKEN)
+def test_geometry_that_cannot_be_read_bounds_nothing_and_is_named(tmp_path, shape):
+    (tmp_path / "garbage.stl").write_bytes(b"\xff\x00solid")
+    (tmp_path / "counts.ply").write_bytes(FILES["counts.ply"])
+    (tmp_path / "nan.stl").write_bytes(FILES["nan.stl"])
+    (tmp_path / "folder.stl").mkdir()
+    model = arm(tmp_path, one=shape, flange=BOX)
+    assert body_points(model) == {}
+    with pytest.raises(SettingsError, match="com_within is 'hull', but no link has geometry in"):
+        geometry_half_spaces(model, "hull")
+    codes = {finding.code for finding in inspect_urdf(model.tree.path).findings}
+    assert ("geometry_unread" in codes) == ("mesh" in shape)
+
+
+def test_boxes_without_extent_have_no_size_to_compare(tmp_path):
+    point = '<collision><geometry><box size="0 0 0"/></geometry></collision>'
+    path = tmp_path / "arm.urdf"
+    text = URDF.format(one=point, flange=point).replace('type="fixed"', 'type="continuous"')
+    one, flange = (text.split("<inertial>")[k].split("</inertial>")[0] for k in (1, 2))
+    path.write_text(text.replace(flange, one))
+    codes = {finding.code for finding in inspect_urdf(path).findings}
+    assert "copied_inertial" not in codes

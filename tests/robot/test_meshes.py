@@ -6,7 +6,7 @@ import trimesh
 from robotid.robot.examples import example_urdfs
 from robotid.robot.meshes import Surface, find_mesh, read_shapes, read_surfaces, thin
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import parse_urdf
+from robotid.robot.urdf_text import parse_urdf
 from robotid.viewer.scene import robot_scene
 
 URDF = """<robot name="r">

@@ -150,9 +150,9 @@ def test_a_wrong_request_names_what_is_wrong(tmp_path, options, message):
 
 
 FAULTS = {
-    "NaN mass": ('value="2"', 'value="nan"', "link 'upper': inertial mass is 'nan'"),
+    "NaN mass": ('value="2"', 'value="nan"', "link 'upper': inertial mass value is 'nan'"),
     "negative mass": ('value="2"', 'value="-2"', "link 'upper': inertial mass is -2 kg, wanted"),
-    "text for a number": ('ixx="0.1"', 'ixx="0,1"', "link 'upper': inertial ixx is '0,1'"),
+    "text for a number": ('ixx="0.1"', 'ixx="0,1"', "link 'upper': inertial inertia ixx is '0,1'"),
     "two numbers in xyz": ('"0.5 0 0"', '"0.5 0"', "joint 'elbow': origin xyz is '0.5 0'"),
     "no axis": ('axis xyz="0 1 0"', 'axis xyz="0 0 0"', "axis xyz is zero"),
     "planar joint": ('type="revolute"', 'type="planar"', "has type 'planar'"),

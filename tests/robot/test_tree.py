@@ -8,7 +8,8 @@ import pytest
 
 from robotid.exceptions import ModelError
 from robotid.robot.model import RobotModel
-from robotid.robot.tree import numbers, parse_urdf, read_tree
+from robotid.robot.tree import read_tree
+from robotid.robot.urdf_text import numbers, parse_urdf
 
 LINK = """<link name="{0}"><inertial><origin xyz="0.1 0 0"/><mass value="{1}"/>
   <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
@@ -97,6 +98,13 @@ def test_a_negative_mass_is_refused(chain):
         read_tree(path)
 
 
+def test_a_mass_that_nothing_can_be_divided_by_is_refused(chain):
+    path = chain(("revolute", ""))
+    path.write_text(path.read_text().replace('mass value="1"', 'mass value="5e-324"'))
+    with pytest.raises(ModelError, match=r"mass is 4\.94066e-324 kg, wanted 0 or at least 1e-15"):
+        read_tree(path)
+
+
 def test_pinocchio_gets_the_tree_alone_and_the_whole_file_is_kept(chain):
     path = chain(("revolute", LIMIT.format(-1, 2)), ("fixed", ""))
     shown = '<visual><geometry><box size="1 2 3"/></geometry></visual></link>'
@@ -110,6 +118,7 @@ def test_pinocchio_gets_the_tree_alone_and_the_whole_file_is_kept(chain):
 
 
 def test_numbers_are_all_finite_or_none():
-    assert numbers(" 1 -2.5e0\t3 ") == (1.0, -2.5, 3.0)
-    for text in ("", "1 x", "1 nan", "inf", "1,5"):
-        assert numbers(text) == ()
+    assert numbers(" 1 -2.5e0  +.3 ", 3) == (1.0, -2.5, 0.3)
+    assert numbers(" 1.E+1", 1) == (10.0,)
+    for text in ("", "1 2", "1 2 3 4", "1 2 x", "1 2 nan", "1 2 1,5", "1\t2\t3", "1 2 1e10"):
+        assert numbers(text, 3) == ()

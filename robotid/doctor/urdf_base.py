@@ -1,0 +1,126 @@
+"""What makes a robot's base parameters uncertain: rounded angles, 3.1416 for pi; faint ones."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from robotid.findings import Finding, listed
+from robotid.regressor.base_parameters import BaseMapping, structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint, Tree
+from robotid.robot.urdf_text import exact_angle
+
+__all__ = ["faint_parameters", "rounded_angles", "rounded_robot"]
+
+_NOISE = 1e-10  # pivots below this share of the largest are rounding
+_ADVICE = "snap_angles = true (--snap-angles) takes the exact angles"
+
+
+def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
+    """Yield the angles of joints that a URDF rounds.
+
+    Args:
+        model: The robot as its file has it.
+        mapping: Its base parameters.
+
+    Yields:
+        "rounded_rpy" of each joint, with its exact angles. It is a warning where the rounding
+        changes how many parameters are, or look, identifiable; a note elsewhere.
+    """
+    rounded = _rounded(model.tree)
+    effect = _effect(model, mapping) if rounded else ""
+    carrying = _carrying(model.tree)
+    for name, exact in rounded.items():
+        wanted = ", ".join(f"{value!r} for {word}" for word, value in exact.items())
+        is_felt = bool(effect) and name in carrying
+        more = f"{effect}; {_ADVICE}" if is_felt else "the identifiable parameters do not change"
+        message = f"joint {name!r} has rounded angles in its rpy: write {wanted}; {more}"
+        evidence = {"largest_error": max(abs(float(word) - exact[word]) for word in exact)}
+        severity = "warning" if is_felt else "note"
+        yield Finding("rounded_rpy", severity, f"joint {name}", message, evidence)
+
+
+def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
+    """Yield one warning if the angles that a URDF rounds change the identifiable parameters.
+
+    Args:
+        model: The robot as its file has it.
+        mapping: Its base parameters.
+
+    Yields:
+        "rounded_rpy" of the file, with the joints.
+    """
+    joints = [name for name in _rounded(model.tree) if name in _carrying(model.tree)]
+    if joints and (effect := _effect(model, mapping)):
+        where = Path(model.tree.path).name
+        message = f"{where} rounds angles of the joints {listed(joints, 6)}: {effect}; {_ADVICE}"
+        yield Finding("rounded_rpy", "warning", where, message, {"joints": float(len(joints))})
+
+
+def faint_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
+    """Yield a warning if parameters lie between those that motion shows and those it cannot.
+
+    Args:
+        model: The robot.
+        mapping: Its base parameters.
+
+    Yields:
+        "faint_parameters" of the file.
+    """
+    if faint := _between(mapping):
+        where = Path(model.tree.path).name
+        message = (
+            f"{where}: {faint} parameters load the joints less than 1e-4 as much as others, and "
+            f"are left out of the {len(mapping.K)} base parameters; identify fewer of the "
+            f"{len(model.joints)} joints at a time"
+        )
+        yield Finding("faint_parameters", "warning", f"file {where}", message, {"faint": faint})
+
+
+def _between(mapping: BaseMapping) -> int:
+    """Return how many pivots are neither rounding nor large enough to count."""
+    return int(np.sum(mapping.pivots > _NOISE)) - len(mapping.K)
+
+
+def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
+    """Return the rounded angles of each joint that has some, as written, and what they round."""
+    rounded = {}
+    for joint in tree.robot.findall("joint"):
+        origin = joint.find("origin")
+        words = origin.get("rpy", "").split() if origin is not None else []
+        exact = {word: angle for word in words if (angle := exact_angle(word)) is not None}
+        if exact:
+            rounded[joint.get("name", "")] = exact
+    return rounded
+
+
+def _effect(model: RobotModel, mapping: BaseMapping) -> str:
+    """Return what the rounding does to the base parameters, "" if nothing."""
+    options = {**model.options, "couplings": model.layout.couplings}
+    meant = structural_mapping(RobotModel.from_urdf(model.tree, **options, snap_angles=True))
+    more = len(mapping.K) - len(meant.K)
+    seeming = _between(mapping) - _between(meant)
+    if more:
+        return (
+            f"the file's rounding makes {len(mapping.K)} base parameters of {len(meant.K)}, and "
+            "only noise would fix the values of the others"
+        )
+    if seeming > 0:
+        return (
+            f"the file's rounding makes {seeming} more parameters look identifiable, though "
+            "only noise would fix their values; robotid leaves them out, other tools may not"
+        )
+    return ""
+
+
+def _carrying(tree: Tree) -> set[str]:
+    """Return the joints that move or carry one that does: their angles shape the dynamics."""
+    arriving = {joint.child: joint for joint in tree.joints}
+    carrying: set[str] = set()
+    for joint in tree.movable:
+        at: Joint | None = joint
+        while at is not None and at.name not in carrying:
+            carrying.add(at.name)
+            at = arriving.get(at.parent)
+    return carrying
