@@ -12,6 +12,7 @@ import numpy as np
 from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.findings import Finding, listed
 from robotid.identification.calibration import calibration_findings
+from robotid.identification.misfit import misfit_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
 from robotid.robot.geometry import body_points
@@ -61,6 +62,7 @@ def fit_findings(identification: Identification) -> list[Finding]:
     findings += calibration_findings(identification)
     findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
+    findings += misfit_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

@@ -23,6 +23,7 @@ from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
 from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
+from robotid.identification.misfit import settled
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -330,7 +331,7 @@ def conclude(
         fit = _fitted(recordings, choice)
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
-    told = refuted([*told, *fit_findings(fit)], fit.predictions, fit.witness)
+    told = refuted(settled(told, fit_findings(fit)), fit.predictions, fit.witness)
     alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
