@@ -1,12 +1,13 @@
 """What a log shows of its own clock and of its joints' motion, without a model of the robot."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
+from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["check_clock", "check_rest", "runs_of"]
 
@@ -14,7 +15,7 @@ _JITTER = 0.05  # spread of the steps over their median from which jitter is rep
 _GAP = 2.5  # a step longer than this many median steps is a gap
 _LONG = 0.05  # [s] ... if it is longer than this, too
 _STALE = 0.05  # share of stale rows that is more than a blemish
-_STILL = 0.02  # [rad/s or m/s] slower than this a joint stands still
+_STILL = 0.02  # [rad/s] slower than this a joint stands still
 _REST = 1.0  # [s] a rest this long at an end is reported
 _STATIC = 1e-3  # [rad or m] a joint that moves less than this does not move
 _HARDLY = 0.2  # [rad] a joint that moves less than this hardly does
@@ -39,18 +40,18 @@ def check_clock(log: Log) -> Iterator[Finding]:
     yield from _stale_rows(log, step)
 
 
-def check_rest(log: Log, motion: Trajectory, prismatic: Collection[str] = ()) -> Iterator[Finding]:
+def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterator[Finding]:
     """Yield how long the robot rests at the ends of a log, and joints that do not move, or hardly.
 
     Args:
         log: The log.
         motion: Its smooth motion, positions without full turns.
-        prismatic: Names of the joints that slide.
+        layout: Which joints slide, and how far.
 
     Yields:
         At most one note "standstill"; a warning "static_joint" or a note "hardly_moves" per joint.
     """
-    speed = np.abs(motion.v)
+    speed = np.abs(motion.v) / layout.drive_speeds[: len(log.joints)]
     yield from _standstill(log, motion.t[(speed > _STILL).any(axis=1)])
     for j, joint in enumerate(log.joints):
         reach = float(np.ptp(motion.q[:, j]))
@@ -61,7 +62,7 @@ def check_rest(log: Log, motion: Trajectory, prismatic: Collection[str] = ()) ->
                 f"{joint} stands still (range {reach:.2g}): its friction, its inertia and much of "
                 "what it carries cannot be identified from this log; move it, or lock it"
             )
-        elif reach < (_HARDLY_SLIDES if joint in prismatic else _HARDLY) or share < _MOVING:
+        elif reach < (_HARDLY_SLIDES if joint in layout.prismatic else _HARDLY) or share < _MOVING:
             code, severity = "hardly_moves", "note"
             message = (
                 f"{joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} % of the "

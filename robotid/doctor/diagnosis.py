@@ -144,7 +144,7 @@ def _examine_log(
     except DataError as error:
         findings.append(Finding(error.code, "error", name, str(error)))
         return None, None
-    findings += check_rest(log, motion, model.layout.prismatic)
+    findings += check_rest(log, motion, model.layout)
     probe = take_probe(model, motion)
     if probe is None:
         message = "too little moves to judge torques by; record motion of every joint"

@@ -29,6 +29,7 @@ __all__ = [
 
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
+_ENDLESS = 200.0  # [rad or m] a stated range this wide is none: no cable winds 30 turns
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,11 @@ class Joint:
 
     @property
     def has_limits(self) -> bool:
-        """Whether the URDF states a range of positions; lower = upper = 0 states none."""
-        return math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper
+        """Whether the URDF states a range of positions.
+
+        lower = upper = 0 states none, and neither does a range that no joint has, as +-10000 rad.
+        """
+        return 0.0 < self.upper - self.lower < _ENDLESS
 
     @property
     def turns_freely(self) -> bool:
