@@ -14,6 +14,7 @@ __all__ = ["check_clock", "check_rest", "runs_of"]
 _JITTER = 0.05  # spread of the steps over their median from which jitter is reported
 _GAP = 2.5  # a step longer than this many median steps is a gap
 _LONG = 0.05  # [s] ... if it is longer than this, too
+_SET = 1.0  # [s] a gap this long over which the position goes on as in one step is none
 _STALE = 0.05  # share of stale rows that is more than a blemish
 _STILL = 0.02  # [rad/s] slower than this a joint stands still
 _REST = 1.0  # [s] a rest this long at an end is reported
@@ -30,8 +31,9 @@ def check_clock(log: Log) -> Iterator[Finding]:
         log: The log.
 
     Yields:
-        Notes "rate" and "jitter"; at most one "gap", a warning if one is long, and one
-        "stale_rows", of rows that repeat the one before in every channel.
+        Notes "rate" and "jitter"; at most one "gap", a warning if one is long, one warning
+        "clock_step" if the clock was set while it logged, and one "stale_rows", of rows that
+        repeat the one before in every channel.
     """
     step = np.diff(log.t)
     median = float(np.median(step))
@@ -107,6 +109,19 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
+    is_set = np.array([step[k] > _SET and _goes_on(log.q, k) for k in gaps], dtype=bool)
+    if is_set.any():
+        k = int(gaps[is_set][0])
+        jump = float(step[k]) - median
+        message = (
+            f"the clock jumps by {jump:.6g} s at t = {log.t[k]:.10g} s while the position goes on "
+            "as in one step: the clock was set while it logged, and both sides are taken for "
+            f"stretches of their own; take {jump:.6g} s off the later time stamps, or log a "
+            "monotonic clock"
+        )
+        evidence = {"jump": jump, "at": float(log.t[k]), "steps": float(is_set.sum())}
+        yield log_finding(log.name, "clock_step", "warning", message, **evidence)
+        gaps = gaps[~is_set]
     if len(gaps) == 0:
         return
     at = int(gaps[np.argmax(step[gaps])])
@@ -118,6 +133,15 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
         "without interruption if you can"
     )
     yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
+
+
+def _goes_on(q: Array, k: int) -> bool:
+    """Return whether the position goes from row k to the next as far as in the steps around."""
+    if not 2 <= k < len(q) - 3:
+        return False
+    around = (q[k] - q[k - 2] + q[k + 3] - q[k + 1]) / 4
+    own, size = q[k + 1] - q[k], float(np.linalg.norm(around))
+    return size > 0 and float(np.linalg.norm(own - around)) < 0.5 * size
 
 
 def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
+from robotid.doctor.torque_channels import check_torque_channels
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
 from robotid.exceptions import DataError, SettingsError
@@ -26,9 +27,9 @@ __all__ = ["CODES", "alarming", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "joint_axis", "joint_order", "locked_position", "position_offset",
-    "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
-    "velocity_scale",
+    "gravity", "gravity_compensated", "joint_axis", "joint_order", "locked_position",
+    "position_offset", "position_order", "position_sign", "spikes", "torque_order", "torque_sign",
+    "unlike_velocity", "unsigned_torque", "velocity_order", "velocity_scale",
 )  # fmt: skip
 
 
@@ -135,6 +136,8 @@ def _examine_log(
     name = log.name
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
     findings += [*check_clock(log), *check_channels(log, signals)]
+    sizes = list(check_torque_channels(log))
+    findings += sizes
     if model.free_flyer:
         message = "torques of a robot with a floating base are not judged"
         findings.append(log_finding(name, "floating_base", "note", message))
@@ -150,6 +153,8 @@ def _examine_log(
         message = "too little moves to judge torques by; record motion of every joint"
         findings.append(log_finding(name, "no_motion", "warning", message))
         return motion, None
+    if any(finding.severity == "error" for finding in sizes):
+        return motion, probe  # no physics fits torques without signs
     torques = list(check_torques(probe, name))
     findings += torques
     if not any(finding.severity == "error" for finding in torques):

@@ -21,6 +21,9 @@ _POOR = 0.08  # a share above this lets other readings of the positions be tried
 _CLEARLY = 2.0  # gain in misfit, a factor 7, over what needs no other position
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero position may be off
 _EARTH = 9.81  # [m/s^2]
+_RINGING = 0.05  # of its top, that the filter makes a torque of one sign pass 0
+_TURNS = 8  # of signs and fit
+_FOLDED = 0.3  # share of what is unexplained that must be left to take a torque for a size
 _CONSTANT = 1e-9  # of its size: a torque that varies less does not, but for rounding
 
 
@@ -29,8 +32,9 @@ class Explanation:
     """What would have to be otherwise, and how well the torques are explained then.
 
     Attributes:
-        kind: "stated", "payload", "torque_sign", "torque_order", "gravity", "joint_order",
-            "joint_axis", "position_order", "position_sign" or "position_offset".
+        kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
+            "gravity_compensated", "joint_order", "joint_axis", "position_order", "position_sign"
+            or "position_offset".
         share: Unexplained share of each torque's variance, shape (n,).
         joints: Indices of the joints concerned.
         values: "torque_order": which joint each torque column belongs to; "gravity": the vector
@@ -83,7 +87,9 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
     share = unexplained(probe)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
-    others = [_signs(own), _order(share), _gravity(probe)]
+    others = [
+        _signs(own), _unsigned(probe, own), _order(share), _gravity(probe), _compensated(probe)
+    ]  # fmt: skip
     loaded = Explanation("payload", np.minimum(_own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         # more readings are tried, and with fewer rows: one of them must be clearly better
@@ -95,6 +101,38 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
 def _signs(own: Array) -> Explanation:
     turned = np.flatnonzero(own[:, 1] < own[:, 0])
     return Explanation("torque_sign", own.min(axis=1), tuple(turned.tolist()))
+
+
+def _unsigned(probe: Probe, own: Array) -> Explanation:
+    """Return the torques that are never negative as sizes of torques of either sign.
+
+    The signs are those of what physics makes of the signed torque, in turn, from the URDF's on.
+    """
+    share, joints = own[:, 0].copy(), []
+    loads = _link_loads(probe, None)
+    for j, tau in enumerate(probe.tau.T):
+        if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
+            continue
+        X = np.hstack([loads[:, j], probe.drive(j)])
+        sign = np.sign(loads[:, j].sum(axis=1))
+        for _ in range(_TURNS):
+            predicted = _nonnegative_prediction(X, sign * tau)
+            sign = np.where(predicted < 0, -1.0, 1.0)
+        R, T = _compressed(X, (sign * tau)[:, None])
+        size = float(np.sum((sign * tau - (sign * tau).mean()) ** 2))
+        found = _nonnegative_misfit(R, T[:, 0]) / size if size > 0 else 1.0
+        if found < _FOLDED * own[j].min():
+            share[j] = found
+            joints.append(j)
+    return Explanation("unsigned_torque", share, tuple(joints))
+
+
+def _compensated(probe: Probe) -> Explanation:
+    """Return the torques as what is left of others without the gravity that the URDF has."""
+    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial]
+    gravity = np.tensordot(probe.gravity, probe.G, axes=1) @ pi  # (N, n)
+    share = _own_share(replace(probe, tau=probe.tau + gravity))
+    return Explanation("gravity_compensated", share)
 
 
 def _order(share: Array) -> Explanation:
@@ -226,6 +264,16 @@ def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:
     used = size > 1e-9 * size.max(initial=1e-300)
     R = np.asarray(np.linalg.qr(np.hstack([X[:, used] / size[used], tau]), mode="r"))
     return R[:, : used.sum()], R[:, used.sum() :]
+
+
+def _nonnegative_prediction(X: Array, tau: Array) -> Array:
+    """Return what columns with factors >= 0 make of a torque, shape (N,)."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=0)
+    columns = X / np.where(size > 0, size, 1.0)
+    predicted: Array = columns @ nnls(columns, tau)[0]
+    return predicted
 
 
 def _nonnegative_misfit(R: Array, tau: Array) -> float:

@@ -63,13 +63,13 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         name: What the log is called.
 
     Yields:
-        Errors "torque_sign", "torque_order", "joint_order", "joint_axis", "position_order",
-        "position_sign", "position_offset" or "gravity", or else what ``check_loads`` yields;
-        and "unexplained_torque".
+        Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
+        "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated",
+        or else what ``check_loads`` yields; and "unexplained_torque".
     """
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
-    if best.kind != "torque_sign" and loaded.misfit < best.misfit:
+    if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
         best = stated  # a load explains it better
     make = _FINDINGS.get(best.kind)
     found = list(make(_Reading(probe, stated, best, name))) if make else []
@@ -93,6 +93,20 @@ def _sign(reading: _Reading) -> Iterator[Finding]:
         )
         evidence = {"unexplained": before, "unexplained_if_negated": after}
         yield log_finding(reading.log, "torque_sign", "error", message, joint, **evidence)
+
+
+def _unsigned(reading: _Reading) -> Iterator[Finding]:
+    for j, joint in zip(reading.best.joints, reading.joints, strict=True):
+        before, after = reading.stated.share[j], reading.best.share[j]
+        if after > _EXPLAINED:
+            continue
+        message = (
+            f"the torque of {joint} is a size without its sign: as it is, {100 * before:.0f} % of "
+            f"its variance cannot be explained, with the signs of the motion {100 * after:.2g} %; "
+            f"log tau_{joint} with its sign"
+        )
+        evidence = {"unexplained": before, "unexplained_with_signs": after}
+        yield log_finding(reading.log, "unsigned_torque", "error", message, joint, **evidence)
 
 
 def _exchanged(reading: _Reading) -> Iterator[Finding]:
@@ -139,17 +153,25 @@ def _position(reading: _Reading) -> Iterator[Finding]:
     yield reading.finding(message, joint)
 
 
+def _compensated(reading: _Reading) -> Iterator[Finding]:
+    if not reading.is_certain:
+        return
+    before, after = reading.stated.share.max(), reading.best.share.max()
+    message = (
+        "the torques hold no gravity: read so, the unexplained share of the worst falls from "
+        f"{100 * before:.2g} to {100 * after:.2g} %. If gravity is compensated before they are "
+        "logged, log the whole torque of the motors; if the robot moves in a horizontal plane or "
+        "floats, state gravity = [0, 0, 0]"
+    )
+    yield replace(reading.finding(message, ""), code="gravity_compensated")
+
+
 def _gravity(reading: _Reading) -> Iterator[Finding]:
     g, believed, gain = np.array(reading.best.values), reading.probe.gravity, reading.gain
     size = float(np.linalg.norm(believed))
     if not g.any():
         if size > 0 and reading.is_certain:
-            message = (
-                "the torques hold no gravity: without it they are explained best; they may be "
-                "those of a gravity-compensated channel: log the torque of the motor, or state "
-                "gravity = [0, 0, 0] for what is left"
-            )
-            yield log_finding(reading.log, "gravity", "error", message, gain=gain)
+            yield from _compensated(reading)
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
@@ -169,6 +191,8 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
 
 _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
     "torque_sign": _sign,
+    "unsigned_torque": _unsigned,
+    "gravity_compensated": _compensated,
     "torque_order": _exchanged,
     "joint_order": _exchanged,
     "position_order": _exchanged,
@@ -180,7 +204,7 @@ _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
 
 
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
-    if best.kind == "torque_sign":
+    if best.kind in ("torque_sign", "unsigned_torque"):
         return any(loaded.share[j] < _EXCUSED for j in best.joints)
     return loaded.misfit - best.misfit < _CERTAIN
 

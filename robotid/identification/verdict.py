@@ -25,6 +25,8 @@ _WORDS = {
     "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "
     "in another unit, masses and inertias are wrong in the same proportion",
     "gravity": "the direction of gravity may be stated wrongly",
+    "gravity_compensated": "the torque may be logged without gravity",
+    "held_torque": "the torque is held for {rows:.0f} rows at a time, so it is late and stepped",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
@@ -36,6 +38,7 @@ _WORDS = {
     "torque_order": "the torque may be that of another joint",
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
+    "unsigned_torque": "the torque may be a size without its sign",
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
     "lack a load",
 }

@@ -46,8 +46,9 @@ class SignalSettings(Settings):
     )
     velocity: str = setting(
         "auto",
-        "measured, differentiated (from the position), or auto: measured if the log has it and it "
-        "lags the position by less than 20 ms",
+        "measured, differentiated (from the position), or auto: measured if the log has it, it "
+        "is fine and that of its position, and predicts torque in stretches that were not fitted "
+        "as well as differentiated",
         among=_MEASURED,
     )
     acceleration: str = setting(
