@@ -16,7 +16,7 @@ _GAP = 2.5  # a step longer than this many median steps is a gap
 _LONG = 0.05  # [s] ... if it is longer than this, too
 _SET = 1.0  # [s] a gap this long over which the position goes on as in one step is none
 _STALE = 0.05  # share of stale rows that is more than a blemish
-_STILL = 0.02  # [rad/s] slower than this a joint stands still
+_STILL = 0.02  # [rad/s, of a slider at rest m/s] slower than this a joint stands still
 _REST = 1.0  # [s] a rest this long at an end is reported
 _STATIC = 1e-3  # [rad or m] a joint that moves less than this does not move
 _HARDLY = 0.2  # [rad] a joint that moves less than this hardly does
@@ -54,7 +54,8 @@ def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterato
         At most one note "standstill"; a warning "static_joint" or a note "hardly_moves" per joint.
     """
     speed = np.abs(motion.v) / layout.drive_speeds[: len(log.joints)]
-    yield from _standstill(log, motion.t[(speed > _STILL).any(axis=1)])
+    # a slider that twitches by a millimetre is at rest, too
+    yield from _standstill(log, motion.t[(np.abs(motion.v) > _STILL).any(axis=1)])
     for j, joint in enumerate(log.joints):
         reach = float(np.ptp(motion.q[:, j]))
         share = float(np.mean(speed[:, j] > _STILL))

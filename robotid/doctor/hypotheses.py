@@ -14,7 +14,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
 
-__all__ = ["Explanation", "explanations", "unexplained"]
+__all__ = ["Explanation", "compensated", "explanations", "unexplained"]
 
 _FLOOR = 1e-3  # an unexplained share below this is as good as none
 _POOR = 0.08  # a share above this lets other readings of the positions be tried
@@ -33,8 +33,7 @@ class Explanation:
 
     Attributes:
         kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
-            "gravity_compensated", "joint_order", "joint_axis", "position_order", "position_sign"
-            or "position_offset".
+            "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset".
         share: Unexplained share of each torque's variance, shape (n,).
         joints: Indices of the joints concerned.
         values: "torque_order": which joint each torque column belongs to; "gravity": the vector
@@ -50,6 +49,23 @@ class Explanation:
     def misfit(self) -> float:
         """The sum of the logarithms of the unexplained shares: lower is better."""
         return float(np.sum(np.log(self.share + _FLOOR)))
+
+
+def compensated(probe: Probe) -> tuple[Probe, Array]:
+    """Return a motion with the URDF's gravity added to its torques, and what stays unexplained.
+
+    Args:
+        probe: The motion.
+
+    Returns:
+        The motion, and what no physics explains as shares of the variance of the torques as logged,
+        shape (n,).
+    """
+    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial]
+    whole = replace(probe, tau=probe.tau + np.tensordot(probe.gravity, probe.G, axes=1) @ pi)
+    size, logged = _variation(whole), _variation(probe)
+    share = _own_share(whole) * np.divide(size, logged, out=np.zeros_like(size), where=logged > 0)
+    return whole, np.minimum(share, 1.0)
 
 
 def unexplained(probe: Probe, gravity: Array | None = None) -> Array:
@@ -87,9 +103,7 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
     share = unexplained(probe)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
-    others = [
-        _signs(own), _unsigned(probe, own), _order(share), _gravity(probe), _compensated(probe)
-    ]  # fmt: skip
+    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe)]
     loaded = Explanation("payload", np.minimum(_own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         # more readings are tried, and with fewer rows: one of them must be clearly better
@@ -125,14 +139,6 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
             share[j] = found
             joints.append(j)
     return Explanation("unsigned_torque", share, tuple(joints))
-
-
-def _compensated(probe: Probe) -> Explanation:
-    """Return the torques as what is left of others without the gravity that the URDF has."""
-    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial]
-    gravity = np.tensordot(probe.gravity, probe.G, axes=1) @ pi  # (N, n)
-    share = _own_share(replace(probe, tau=probe.tau + gravity))
-    return Explanation("gravity_compensated", share)
 
 
 def _order(share: Array) -> Explanation:

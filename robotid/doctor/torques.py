@@ -7,7 +7,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.hypotheses import Explanation, explanations
-from robotid.doctor.loads import check_loads
+from robotid.doctor.loads import NO_GRAVITY, check_loads
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
 
@@ -153,25 +153,13 @@ def _position(reading: _Reading) -> Iterator[Finding]:
     yield reading.finding(message, joint)
 
 
-def _compensated(reading: _Reading) -> Iterator[Finding]:
-    if not reading.is_certain:
-        return
-    before, after = reading.stated.share.max(), reading.best.share.max()
-    message = (
-        "the torques hold no gravity: read so, the unexplained share of the worst falls from "
-        f"{100 * before:.2g} to {100 * after:.2g} %. If gravity is compensated before they are "
-        "logged, log the whole torque of the motors; if the robot moves in a horizontal plane or "
-        "floats, state gravity = [0, 0, 0]"
-    )
-    yield replace(reading.finding(message, ""), code="gravity_compensated")
-
-
 def _gravity(reading: _Reading) -> Iterator[Finding]:
     g, believed, gain = np.array(reading.best.values), reading.probe.gravity, reading.gain
     size = float(np.linalg.norm(believed))
     if not g.any():
         if size > 0 and reading.is_certain:
-            yield from _compensated(reading)
+            code = "gravity_compensated"
+            yield log_finding(reading.log, code, "error", NO_GRAVITY, gain=gain)
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
@@ -192,7 +180,6 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
 _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
     "torque_sign": _sign,
     "unsigned_torque": _unsigned,
-    "gravity_compensated": _compensated,
     "torque_order": _exchanged,
     "joint_order": _exchanged,
     "position_order": _exchanged,
