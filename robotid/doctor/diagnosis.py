@@ -158,5 +158,5 @@ def _examine_log(
     torques = list(check_torques(probe, name))
     findings += torques
     if not any(finding.severity == "error" for finding in torques):
-        findings += check_torque_delay(model, motion, signals, name)
+        findings += check_torque_delay(model, log, signals, name)
     return motion, probe
