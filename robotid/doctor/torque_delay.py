@@ -23,8 +23,8 @@ __all__ = ["check_torque_delay"]
 _LONGEST = 0.1  # [s] delays are sought up to this
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
-_FINEST = 0.001  # [s] an estimate is not better than this
-_HELD = 0.1  # [samples] ... nor than this
+_FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
+_HELD = 0.1  # [samples] ... or a torque that is held from row to row
 _SURE = 3.0  # standard errors from which a delay is reported
 _LATE = 0.03  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
 _HELPS = 0.15  # share of what is unexplained that it must take away
@@ -149,7 +149,7 @@ def check_torque_delay(
     delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
     if not np.isfinite([delay, error, gain]).all():
         return
-    error = max(error, _FINEST, _HELD * step)
+    error = float(np.hypot(error, max(_FINEST, _HELD * step)))
     is_sure = abs(delay) > _SURE * error and gain > (_HELPS if abs(delay) > _LATE else 0.0)
     late = f"{1e3 * abs(delay):.1f} +- {1e3 * error:.1f} ms {'late' if delay > 0 else 'early'}"
     total = delay + signals.torque_delay
