@@ -109,9 +109,7 @@ def unlike_velocities(log: Log) -> dict[str, float]:
     median = float(np.median(dt))
     usual = dt < _GAP * median
     length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
-    step = np.diff(log.q, axis=0)
-    turn = np.abs(np.abs(step) - 2 * np.pi) < 0.1 * 2 * np.pi  # a full turn taken out
-    moved = _means(np.where(usual & ~turn, step, 0.0), length)
+    moved = _means(np.where(usual, np.diff(np.unwrap(log.q, axis=0), axis=0), 0.0), length)
     swept = _means(np.where(usual, dt * (v[1:] + v[:-1]) / 2, 0.0), length)
     reach = round(_LONGEST / median)
     shifts = [k for k in range(-reach, reach + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]
@@ -161,7 +159,7 @@ def _alike(moved: Array, swept: Array, shift: int) -> float:
     """Return the correlation of one with the other so many rows later, whatever its sign."""
     n = len(moved)
     late, early = slice(max(shift, 0), n + min(shift, 0)), slice(max(-shift, 0), n - max(shift, 0))
-    a, b = moved[early] - moved[early].mean(), swept[late] - swept[late].mean()
+    a, b = moved[early], swept[late]  # not centred: a joint may turn at one speed
     size = float(np.sqrt((a @ a) * (b @ b)))
     return abs(float(a @ b)) / size if size > 0 else 0.0
 
