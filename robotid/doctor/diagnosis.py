@@ -11,6 +11,7 @@ from typing import Any
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.motions import check_excitation, check_repeated_motion
+from robotid.doctor.mounted import check_payload_change
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_channels import check_torque_channels
 from robotid.doctor.torque_delay import check_torque_delay
@@ -77,10 +78,12 @@ def diagnose(
     findings: list[Finding] = []
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
-    for log, (motion, _) in zip(kept, motions[len(fitted) :], strict=True):
+    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+    for log, (motion, probe) in zip(kept, motions[len(fitted) :], strict=True):
         if motion is not None:
             findings += check_repeated_motion(first, motion, log.name)
-    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+        if probe is not None and probes:
+            findings += check_payload_change(probes, probe, log.name)
     if probes:
         names = ", ".join(log.name for log in fitted)
         moving = [probe.motion for probe in probes]

@@ -14,7 +14,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
 
-__all__ = ["Explanation", "compensated", "explanations", "unexplained"]
+__all__ = ["Explanation", "compensated", "explanations", "own_share", "unexplained"]
 
 _FLOOR = 1e-3  # an unexplained share below this is as good as none
 _POOR = 0.08  # a share above this lets other readings of the positions be tried
@@ -64,7 +64,7 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
     pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial]
     whole = replace(probe, tau=probe.tau + np.tensordot(probe.gravity, probe.G, axes=1) @ pi)
     size, logged = _variation(whole), _variation(probe)
-    share = _own_share(whole) * np.divide(size, logged, out=np.zeros_like(size), where=logged > 0)
+    share = own_share(whole) * np.divide(size, logged, out=np.zeros_like(size), where=logged > 0)
     return whole, np.minimum(share, 1.0)
 
 
@@ -104,7 +104,7 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
     others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe)]
-    loaded = Explanation("payload", np.minimum(_own_share(probe, any_load=True), stated.share))
+    loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         # more readings are tried, and with fewer rows: one of them must be clearly better
         bound = min(e.misfit for e in [stated, *others]) - _CLEARLY
@@ -159,7 +159,7 @@ def _gravity(probe: Probe) -> Explanation:
     n = len(probe.model.joints)
 
     def explained(g: Array) -> Explanation:
-        share = _own_share(probe, g)
+        share = own_share(probe, g)
         return Explanation("gravity", share, tuple(range(n)), tuple(g.tolist()))
 
     axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
@@ -194,19 +194,19 @@ def _positions(probe: Probe) -> Iterator[Explanation]:
         yield Explanation("joint_order", share[np.arange(n), order, 0], pair)
     turning = [j for j in range(n) if probe.model.joints[j] not in probe.model.layout.prismatic]
     for j in turning:
-        share = _own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
+        share = own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
         yield Explanation("position_sign", share, (j,))
     for j in range(n):
         turned = small.with_motion(_moved(small, j, -1.0, 0.0))
         sign = np.where(np.arange(n) == j, -1.0, 1.0)
-        yield Explanation("joint_axis", _own_share(replace(turned, tau=sign * small.tau)), (j,))
+        yield Explanation("joint_axis", own_share(replace(turned, tau=sign * small.tau)), (j,))
     offsets = [_offset(small, j, offset) for j in turning for offset in _OFFSETS]
     if offsets:
         yield _refined(small, min(offsets, key=lambda e: e.misfit))
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:
-    share = _own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
+    share = own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
     return Explanation("position_offset", share, (j,), (offset,))
 
 
@@ -231,10 +231,13 @@ def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Arr
     return q, v, a
 
 
-def _own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
+def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
     """Return the share that each joint's own physics leaves of its torque, shape (n,).
 
-    With any load, the last link may also have any mass more, and any centre of it.
+    Args:
+        probe: The motion.
+        gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+        any_load: Whether the last link may also have any mass more, and any centre of it.
     """
     loads = _link_loads(probe, gravity)
     if any_load:

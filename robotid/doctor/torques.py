@@ -8,6 +8,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.doctor.hypotheses import Explanation, explanations
 from robotid.doctor.loads import NO_GRAVITY, check_loads
+from robotid.doctor.mounted import check_unmounted_parts
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
 
@@ -65,7 +66,7 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     Yields:
         Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
         "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated",
-        or else what ``check_loads`` yields; and "unexplained_torque".
+        or else what ``check_unmounted_parts`` or ``check_loads`` yields; and "unexplained_torque".
     """
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
@@ -77,7 +78,11 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         # what a load on the last link would explain as well is no error for certain
         yield replace(finding, severity="warning") if _is_excused(best, loaded) else finding
     if not found:
-        yield from check_loads(probe, loaded.share, name)
+        loads = list(check_loads(probe, loaded.share, name))
+        if not {finding.code for finding in loads} - {"payload"}:
+            parts = list(check_unmounted_parts(probe, loaded.share, name))
+            loads = parts or loads
+        yield from loads
         yield from _unexplained(probe, loaded.share, name)
 
 

@@ -30,6 +30,7 @@ _WORDS = {
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
+    "payload_change": "its last link carries {mass:.2g} kg more than in the fitted logs",
     "position_offset": "the zero of the position may be off",
     "position_order": "the position may be that of another joint",
     "position_sign": "the position may have the opposite sign",
@@ -39,6 +40,7 @@ _WORDS = {
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
     "unsigned_torque": "the torque may be a size without its sign",
+    "unmounted_part": "{mass:.2g} kg of the URDF's last link seem not to have been mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
     "lack a load",
 }
