@@ -26,7 +26,7 @@ _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
 _FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
 _HELD = 0.1  # [samples] ... or a torque that is held from row to row
 _SURE = 3.0  # standard errors from which a delay is reported
-_LATE = 0.03  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
+_LATE = 0.04  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
 _HELPS = 0.15  # share of what is unexplained that it must take away
 _FEW = 100  # rows from which a joint counts for the delay
 _MOVING = 0.1  # share of the instants in which it must move
@@ -38,8 +38,10 @@ _WINDOWS = 8  # stretches they are in, where the log has more of them
 _BLOCKS = 8  # parts of the log that are left out in turn
 _OVERSAMPLED = 8.0  # instants per period of the filter: products of motions are faster than they
 _UNFILTERED = 10.0  # [Hz] bandwidth that is taken for a motion without a filter
-_BAND, _WIDE = 1.5, 3.0  # of the job's cut-off: those of the comparison and of its motion
-_NYQUIST = 0.4  # of the rate that they are at most
+# Cut-off of the comparison over the job's, and over the rate at most: noise that is interpolated
+# between rows would be smoothed there.
+_BAND = 1.5, 0.15
+_WIDE = 3.0, 0.4  # the same of the motion that the regressor is made of
 _SETTLED = 1.5  # [periods of the filter] from an end the filter of a stretch has settled
 _HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 _EXACT = 1e-5  # share of a torque that is taken for noise in a log without any
@@ -125,7 +127,7 @@ def check_torque_delay(
     periodic in the position leave of the delayed torque, instants near slow ones apart. Its
     uncertainty is the jackknife's over the joints and over stretches of the log. It is a warning
     from three standard errors on, if the delay of the other stretches explains each stretch better:
-    one of more than 30 ms clearly so.
+    one of more than 40 ms clearly so.
 
     Args:
         model: The robot, with a fixed base.
@@ -138,10 +140,10 @@ def check_torque_delay(
         SettingsError: If a setting does not fit the log.
     """
     step = float(np.median(np.diff(log.t)))
-    most = _NYQUIST * min(1 / step, signals.rate or np.inf)
+    rate = min(1 / step, signals.rate or np.inf)
     band, wide = (
-        replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most))
-        for times in (_BAND, _WIDE)
+        replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
+        for times, most in (_BAND, _WIDE)
     )
     misfit = _misfit(model, smooth_motion(model, log, wide), band)
     if misfit is None:
@@ -235,9 +237,19 @@ def _window(
     slow = turns | (np.abs(v) < _SLOW)
     steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
     tau = low_pass(motion.tau[rows], 1 / step, signals)
-    late = np.array([[np.interp(at + delay, t, x) for x in tau.T] for delay in _GRID])
+    late = _interpolated(t, tau, [at + delay for delay in _GRID])
     drive = np.concatenate([own, coupled], axis=2)
-    return _Window(W[:, :, :size], drive, np.column_stack(steady), np.moveaxis(late, 1, 2))
+    return _Window(W[:, :, :size], drive, np.column_stack(steady), late)
+
+
+def _interpolated(t: Array, values: Array, times: Sequence[Array]) -> Array:
+    """Return values, shape (N, n), at each of several lists of times, shape (lists, M, n)."""
+    from scipy.interpolate import CubicSpline
+
+    if len(t) < 2:
+        return np.empty((len(times), 0, values.shape[1]))
+    spline = CubicSpline(t, values, axis=0)
+    return np.array([spline(at) for at in times])
 
 
 def _distance(at: Array, turns: Array) -> Array:
