@@ -110,7 +110,9 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
-    is_set = np.array([step[k] > _SET and _goes_on(log.q, k) for k in gaps], dtype=bool)
+    is_set = np.array(
+        [step[k] > _SET and _goes_on(log.q, k) for k in gaps.tolist()], dtype=np.bool_
+    )
     if is_set.any():
         k = int(gaps[is_set][0])
         jump = float(step[k]) - median

@@ -77,7 +77,7 @@ def check_payload_change(fitted: Sequence[Probe], kept: Probe, name: str) -> Ite
     mean = np.append(models[-1].mean, np.zeros(4))
     prior = np.column_stack([np.eye(shared + 4), mean / spread])
     X = np.vstack([*(part * np.append(spread, 1.0) for part in rows), prior])
-    R = np.linalg.qr(X, mode="r")
+    R = np.asarray(np.linalg.qr(X, mode="r"))
     left = R[-1, -1] ** 2
     gain = float(np.sum(R[shared:-1, -1] ** 2))
     expected = sum(model.expected for model in models)
