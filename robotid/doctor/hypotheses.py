@@ -120,7 +120,8 @@ def _signs(own: Array) -> Explanation:
 def _unsigned(probe: Probe, own: Array) -> Explanation:
     """Return the torques that are never negative as sizes of torques of either sign.
 
-    The signs are those of what physics makes of the signed torque, in turn, from the URDF's on.
+    The signs are those of what physics makes of the signed torque, in turn, from those of the
+    URDF's torque, of the velocity or of the acceleration on.
     """
     share, joints = own[:, 0].copy(), []
     loads = _link_loads(probe, None)
@@ -128,17 +129,22 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
         if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
             continue
         X = np.hstack([loads[:, j], probe.drive(j)])
-        sign = np.sign(loads[:, j].sum(axis=1))
-        for _ in range(_TURNS):
-            predicted = _nonnegative_prediction(X, sign * tau)
-            sign = np.where(predicted < 0, -1.0, 1.0)
-        R, T = _compressed(X, (sign * tau)[:, None])
-        size = float(np.sum((sign * tau - (sign * tau).mean()) ** 2))
-        found = _nonnegative_misfit(R, T[:, 0]) / size if size > 0 else 1.0
+        starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
+        found = min(_folded_misfit(X, tau, np.sign(start)) for start in starts)
         if found < _FOLDED * own[j].min():
             share[j] = found
             joints.append(j)
     return Explanation("unsigned_torque", share, tuple(joints))
+
+
+def _folded_misfit(X: Array, tau: Array, sign: Array) -> float:
+    """Return the unexplained share of a torque whose signs are found in turn from a first guess."""
+    for _ in range(_TURNS):
+        sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
+    signed = sign * tau
+    R, T = _compressed(X, signed[:, None])
+    size = float(np.sum((signed - signed.mean()) ** 2))
+    return _nonnegative_misfit(R, T[:, 0]) / size if size > 0 else 1.0
 
 
 def _order(share: Array) -> Explanation:
