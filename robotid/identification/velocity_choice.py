@@ -12,13 +12,13 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.identification.rows import row_mask
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.measured_velocity import coarse_velocities, is_timely, unlike_velocities
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.used_rows import row_mask
 from robotid.robot.model import RobotModel
 
 __all__ = ["prefers_measured"]
