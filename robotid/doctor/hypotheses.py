@@ -143,7 +143,8 @@ def _folded_misfit(X: Array, tau: Array, sign: Array) -> float:
         sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
     signed = sign * tau
     R, T = _compressed(X, signed[:, None])
-    size = float(np.sum((signed - signed.mean()) ** 2))
+    # of the torque as logged: a constant one turned with the speed would be all friction
+    size = float(np.sum((tau - tau.mean()) ** 2))
     return _nonnegative_misfit(R, T[:, 0]) / size if size > 0 else 1.0
 
 
