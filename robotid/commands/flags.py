@@ -41,6 +41,15 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--gain": ("torque.gains", {"metavar": "JOINT=N_M_PER_A", "action": "append"}),
     "--rate": ("signals.rate", {"metavar": "HZ", "type": float}),
     "--cutoff": ("signals.cutoff", {"metavar": "HZ"}),
+    "--velocity": ("signals.velocity", {"metavar": "HOW"}),
+    "--acceleration": ("signals.acceleration", {"metavar": "HOW"}),
+    "--order": ("signals.order", {"metavar": "N", "type": int}),
+    "--trim": ("signals.trim", {"metavar": "S", "type": float}),
+    "--min-velocity": ("signals.min_velocity", {"metavar": "RAD_PER_S", "type": float}),
+    "--friction-band": ("signals.friction_band", {"metavar": "RAD_PER_S", "type": float}),
+    "--max-gap": ("signals.max_gap", {"metavar": "S", "type": float}),
+    "--torque-delay": ("signals.torque_delay", {"metavar": "S", "type": float}),
+    "--velocity-delay": ("signals.velocity_delay", {"metavar": "S", "type": float}),
     "--friction": ("model.friction", {"metavar": "MODEL"}),
     "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
     "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
@@ -58,6 +67,13 @@ _READ: Mapping[str, Callable[[Any, str], Any]] = {
     "--cutoff": _cutoff,
 }
 _LOG = tuple(flag for flag in _FLAGS if flag != "--estimator")
+#: Flags that a tracked or replayed log has a use for.
+_ONLINE = tuple(
+    flag
+    for flag, (key, _) in _FLAGS.items()
+    if flag in ("--rate", "--cutoff", "--min-velocity")
+    or (flag in _LOG and not key.startswith("signals."))
+)
 _SOURCE = ("--topic", "--effort", "--stamp")
 
 
@@ -92,7 +108,7 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_robot_and_log(parser)
             _add_out(parser, "robotid-track")
             _add_json(parser, "track.json")
-            _add_settings(parser.add_argument_group("the log"), _LOG)
+            _add_settings(parser.add_argument_group("the log"), _ONLINE)
             _add_verbose(parser)
             _add_serve(parser, "show it in the browser while it runs, in true time")
         case "replay":
@@ -103,7 +119,7 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
             _add_serve(parser, "track the log again, in true time, and show it as it goes")
             group = parser.add_argument_group("the log, unless a RESULT says it")
-            _add_settings(group, _LOG)
+            _add_settings(group, _ONLINE)
         case "validate":
             add("result", metavar="RESULT.json")
             add("logs", nargs="+", metavar="LOG")
@@ -242,7 +258,7 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
 
 def _given(options: argparse.Namespace) -> list[str]:
     names = ["validate", *(flag[2:].replace("-", "_") for flag in _FLAGS)]
-    return [name for name in names if getattr(options, name, None)]
+    return [name for name in names if getattr(options, name, None) is not None]
 
 
 def _stated(options: argparse.Namespace, flags: Sequence[str]) -> dict[str, Any]:

@@ -5,17 +5,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from robotid._typing import Array
-from robotid.doctor.clock import runs_of
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
+from robotid.logs.measured_velocity import (
+    COARSE,
+    LATE,
+    quantum,
+    unlike_velocities,
+    velocity_lag,
+)
 from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import velocity_lag
 
 __all__ = ["check_channels"]
 
-_COARSE = 100  # a channel of fewer steps than this over its range says little
-_PLATEAU = 5  # rows in a row at the very limit of a channel that are no coincidence
-_CLIPPED = 0.01  # share of the rows at the limit from which a channel is clipped
 _SPIKE = 15.0  # a row this many times farther off its neighbours than usual is a spike
 _BEYOND = 1.5  # ... if it is also farther off than this many times what the channel ever is
 _RESTING = 3.0  # within so many times its noise a channel stays at a value
@@ -24,7 +26,6 @@ _LEAST_TORQUE = 0.01  # of the median joint's torque that is as good as none
 _ABSURD = 5.0  # a spike this many times what the channel ever is cannot be motion
 _HARM = 0.02  # share of a channel's energy in its spikes that ruins a least-squares fit
 _NOISY = 0.3  # noise over signal from which a torque tells little
-_LATE = 0.02  # [s] robotid does not use a measured velocity that is later than this
 _LAG = 0.002  # [s] a shorter lag is not reported
 _ALIKE = 0.8  # correlation of a velocity with the derivative of its position
 _SCALE = 1.1  # a velocity that is this many times d(q)/dt, or its inverse, is in another unit
@@ -39,19 +40,17 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         signals: Where velocities come from, and the delay of measured ones that is corrected.
 
     Yields:
-        "quantised" per kind of channel: a warning for torques of few steps, else a note; warnings
-        "clipped" per joint and limit, or "constant_torque" per joint; "spikes" per channel: an
-        error where they are absurd and strong enough to ruin a fit; notes "noise" per kind of
-        channel and "noisy_torque" where noise prevails; of measured velocities an error
-        "velocity_order" for each that is the derivative of another joint's position, at most one
-        "velocity_delay", with the scatter over the joints as its uncertainty, and
-        "velocity_scale" per joint: an error where they are used, else a note.
+        "quantised" per kind of channel: a warning for torques of few steps, else a note; "spikes"
+        per channel: an error where they are absurd and strong enough to ruin a fit; notes "noise"
+        per kind of channel and "noisy_torque" where noise prevails; of measured velocities an
+        error "velocity_order" for each that is the derivative of another joint's position,
+        "unlike_velocity" for each other one that is not that of its own: an error where they are
+        used, a warning where "auto" leaves them out, else a note; at most one "velocity_delay",
+        with the scatter over the joints as its uncertainty, and "velocity_scale" per joint: an
+        error where they are used, else a note.
     """
     for kind, values in _channels(log):
         yield from _quantisation(log, kind, values)
-    moving = np.append((np.diff(log.q, axis=0) != 0).any(axis=1), False)
-    for joint, x in zip(log.joints, log.tau.T, strict=True):
-        yield from _clipping(log, joint, x, moving)
     for kind, values in _channels(log):
         yield from _spikes(log, kind, values)
     for kind, values in _channels(log):
@@ -59,53 +58,33 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
     if log.v is not None:
         slope, v = _slopes(log, log.v)
         alike = _correlation(slope, v)  # (n, n): position j, velocity k
-        yield from _velocity_order(log, alike)
+        exchanged = list(_velocity_order(log, alike))
+        yield from exchanged
+        if not exchanged:
+            yield from _unlike_velocity(log, signals.velocity)
         yield from _velocity_delay(log, signals.velocity_delay)
         yield from _velocity_scale(log, slope, v, np.diag(alike), signals.velocity)
 
 
 def _quantisation(log: Log, kind: str, values: Array) -> Iterator[Finding]:
     """Yield the joints whose channel moves in steps: those of few steps, and the others."""
-    steps = np.array([_quantum(x) for x in values.T])
+    steps = np.array([quantum(x) for x in values.T])
     count = np.ptp(values, axis=0) / np.where(steps > 0, steps, 1.0)
     for few in (True, False):
-        chosen = np.flatnonzero((steps > 0) & ((count < _COARSE) == few))
+        chosen = np.flatnonzero((steps > 0) & ((count < COARSE) == few))
         if len(chosen) == 0:
             continue
         names = [log.joints[j] for j in chosen]
         evidence = {f"steps_{log.joints[j]}": count[j] for j in chosen}
         todo = "it is uninformative: scale or log it finer" if few else "log more digits"
+        if few and kind == "dq":
+            todo += "; velocity = 'auto' differentiates the position instead"
         message = (
             f"{kind} of {listed(names)} moves in steps of {steps[chosen].max():.3g}, "
             f"{count[chosen].min():.0f} of them over its range; {todo}"
         )
         severity = "warning" if few and kind == "tau" else "note"
         yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
-
-
-def _clipping(log: Log, joint: str, x: Array, moving: Array) -> Iterator[Finding]:
-    """Yield whether a torque stays at a limit, or at one value, in rows where the robot moves."""
-    if moving.any() and np.ptp(x) == 0:
-        value = float(x[0]) + 0.0  # no -0
-        message = (
-            f"the torque of {joint} is {value:.6g} in every row while the robot moves: the channel "
-            "is dead, and nothing of this joint's drive can be identified; log "
-            f"tau_{joint}, or leave the joint out"
-        )
-        yield log_finding(log.name, "constant_torque", "warning", message, joint, value=value)
-        return
-    for limit in (float(x.max()), float(x.min())):
-        at = (x == limit) & moving
-        share = float(at.mean())
-        plateau = max((stop - start for start, stop in runs_of(at)), default=0)
-        if share < _CLIPPED or plateau < _PLATEAU or _steps(x) < _COARSE:
-            continue
-        message = (
-            f"the torque of {joint} stays at its limit {limit:.6g} in {100 * share:.3g} % of the "
-            "rows while the robot moves: it is clipped, and those rows are wrong; record a gentler "
-            "motion or cut them out"
-        )
-        yield log_finding(log.name, "clipped", "warning", message, joint, limit=limit, share=share)
 
 
 def _spikes(log: Log, kind: str, values: Array) -> Iterator[Finding]:
@@ -163,6 +142,24 @@ def _velocity_order(log: Log, alike: Array) -> Iterator[Finding]:
         yield log_finding(log.name, "velocity_order", "error", message, joint, **evidence)
 
 
+def _unlike_velocity(log: Log, velocity: str) -> Iterator[Finding]:
+    """Yield measured velocities that are not those of their positions, however late."""
+    severity = {"measured": "error", "auto": "warning"}.get(velocity, "note")
+    todo = (
+        "velocity = 'auto' differentiates every position instead"
+        if velocity == "auto"
+        else "set [signals] velocity = 'differentiated' (--velocity differentiated)"
+    )
+    for joint, alike in unlike_velocities(log).items():
+        message = (
+            f"dq_{joint} is not d(q)/dt of q_{joint} (correlation {alike:.2f} at any lag up to "
+            f"0.3 s): the channel holds noise or another quantity; correct it, {todo}"
+        )
+        yield log_finding(
+            log.name, "unlike_velocity", severity, message, f"dq_{joint}", correlation=alike
+        )
+
+
 def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     """Yield how late the measured velocity is against the position, beyond what is stated [s]."""
     lag = velocity_lag(log) - stated
@@ -173,9 +170,9 @@ def _velocity_delay(log: Log, stated: float) -> Iterator[Finding]:
     error = max(scatter / np.sqrt(max(len(used), 1)), 0.02 * step)
     if abs(lag) < max(_LAG, 3 * error, 0.1 * step):
         return
-    is_late = abs(lag) >= _LATE
+    is_late = abs(lag) >= LATE
     what = (
-        "velocity = 'auto' differentiates the position instead"
+        "velocity = 'auto' takes it only if it predicts torque as well as the differentiated one"
         if is_late
         else "if the torque is as late, keep velocity = 'measured'; else differentiate"
     )
@@ -219,7 +216,10 @@ def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
     step = np.diff(log.t)[:, None]
     usual = (step < 5 * np.median(step))[:, 0]
     every = max(1, len(step) // 20000)
-    slope, v = np.diff(log.q, axis=0) / step, 0.5 * (velocity[1:] + velocity[:-1])
+    slope, v = (
+        np.diff(np.unwrap(log.q, axis=0), axis=0) / step,
+        0.5 * (velocity[1:] + velocity[:-1]),
+    )
     return slope[usual][::every], v[usual][::every]
 
 
@@ -227,25 +227,6 @@ def _channels(log: Log) -> Iterator[tuple[str, Array]]:
     for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
         if values is not None:
             yield kind, values
-
-
-def _quantum(x: Array) -> float:
-    """Return the step that all values are multiples of, 0 if there is none."""
-    levels = np.unique(x)
-    if len(levels) < 3 or len(levels) > 0.5 * len(x):
-        return 0.0
-    steps = np.diff(levels)
-    steps = steps[steps > 1e-9 * np.ptp(x)]
-    if len(steps) == 0:
-        return 0.0
-    quantum = float(np.quantile(steps, 0.1))
-    counts = np.diff(levels)[:1000] / quantum
-    return quantum if np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95 else 0.0
-
-
-def _steps(x: Array) -> float:
-    quantum = _quantum(x)
-    return float(np.ptp(x)) / quantum if quantum > 0 else float("inf")
 
 
 def _jumps(t: Array, x: Array, reach: float) -> tuple[Array, Array]:

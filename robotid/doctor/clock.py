@@ -1,20 +1,22 @@
 """What a log shows of its own clock and of its joints' motion, without a model of the robot."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
+from robotid.robot.parameters import ParameterLayout
 
 __all__ = ["check_clock", "check_rest", "runs_of"]
 
 _JITTER = 0.05  # spread of the steps over their median from which jitter is reported
 _GAP = 2.5  # a step longer than this many median steps is a gap
 _LONG = 0.05  # [s] ... if it is longer than this, too
+_SET = 1.0  # [s] a gap this long over which the position goes on as in one step is none
 _STALE = 0.05  # share of stale rows that is more than a blemish
-_STILL = 0.02  # [rad/s or m/s] slower than this a joint stands still
+_STILL = 0.02  # [rad/s, of a slider at rest m/s] slower than this a joint stands still
 _REST = 1.0  # [s] a rest this long at an end is reported
 _STATIC = 1e-3  # [rad or m] a joint that moves less than this does not move
 _HARDLY = 0.2  # [rad] a joint that moves less than this hardly does
@@ -29,8 +31,9 @@ def check_clock(log: Log) -> Iterator[Finding]:
         log: The log.
 
     Yields:
-        Notes "rate" and "jitter"; at most one "gap", a warning if one is long, and one
-        "stale_rows", of rows that repeat the one before in every channel.
+        Notes "rate" and "jitter"; at most one "gap", a warning if one is long, one warning
+        "clock_step" if the clock was set while it logged, and one "stale_rows", of rows that
+        repeat the one before in every channel.
     """
     step = np.diff(log.t)
     median = float(np.median(step))
@@ -39,19 +42,20 @@ def check_clock(log: Log) -> Iterator[Finding]:
     yield from _stale_rows(log, step)
 
 
-def check_rest(log: Log, motion: Trajectory, prismatic: Collection[str] = ()) -> Iterator[Finding]:
+def check_rest(log: Log, motion: Trajectory, layout: ParameterLayout) -> Iterator[Finding]:
     """Yield how long the robot rests at the ends of a log, and joints that do not move, or hardly.
 
     Args:
         log: The log.
         motion: Its smooth motion, positions without full turns.
-        prismatic: Names of the joints that slide.
+        layout: Which joints slide, and how far.
 
     Yields:
         At most one note "standstill"; a warning "static_joint" or a note "hardly_moves" per joint.
     """
-    speed = np.abs(motion.v)
-    yield from _standstill(log, motion.t[(speed > _STILL).any(axis=1)])
+    speed = np.abs(motion.v) / layout.drive_speeds[: len(log.joints)]
+    # a slider that twitches by a millimetre is at rest, too
+    yield from _standstill(log, motion.t[(np.abs(motion.v) > _STILL).any(axis=1)])
     for j, joint in enumerate(log.joints):
         reach = float(np.ptp(motion.q[:, j]))
         share = float(np.mean(speed[:, j] > _STILL))
@@ -61,7 +65,7 @@ def check_rest(log: Log, motion: Trajectory, prismatic: Collection[str] = ()) ->
                 f"{joint} stands still (range {reach:.2g}): its friction, its inertia and much of "
                 "what it carries cannot be identified from this log; move it, or lock it"
             )
-        elif reach < (_HARDLY_SLIDES if joint in prismatic else _HARDLY) or share < _MOVING:
+        elif reach < (_HARDLY_SLIDES if joint in layout.prismatic else _HARDLY) or share < _MOVING:
             code, severity = "hardly_moves", "note"
             message = (
                 f"{joint} hardly moves (range {reach:.2g}, moving {100 * share:.2g} % of the "
@@ -106,6 +110,21 @@ def _rate(log: Log, step: Array, median: float) -> Iterator[Finding]:
 
 def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
     gaps = np.flatnonzero(step > _GAP * median * (1 + 1e-6))
+    is_set = np.array(
+        [step[k] > _SET and _goes_on(log.q, k) for k in gaps.tolist()], dtype=np.bool_
+    )
+    if is_set.any():
+        k = int(gaps[is_set][0])
+        jump = float(step[k]) - median
+        message = (
+            f"the clock jumps by {jump:.6g} s at t = {log.t[k]:.10g} s while the position goes on "
+            "as in one step: the clock was set while it logged, and both sides are taken for "
+            f"stretches of their own; take {jump:.6g} s off the later time stamps, or log a "
+            "monotonic clock"
+        )
+        evidence = {"jump": jump, "at": float(log.t[k]), "steps": float(is_set.sum())}
+        yield log_finding(log.name, "clock_step", "warning", message, **evidence)
+        gaps = gaps[~is_set]
     if len(gaps) == 0:
         return
     at = int(gaps[np.argmax(step[gaps])])
@@ -117,6 +136,15 @@ def _gaps(log: Log, step: Array, median: float) -> Iterator[Finding]:
         "without interruption if you can"
     )
     yield log_finding(log.name, "gap", severity, message, gaps=len(gaps), longest=longest, at=start)
+
+
+def _goes_on(q: Array, k: int) -> bool:
+    """Return whether the position goes from row k to the next as far as in the steps around."""
+    if not 2 <= k < len(q) - 3:
+        return False
+    around = (q[k] - q[k - 2] + q[k + 3] - q[k + 1]) / 4
+    own, size = q[k + 1] - q[k], float(np.linalg.norm(around))
+    return size > 0 and float(np.linalg.norm(own - around)) < 0.5 * size
 
 
 def _stale_rows(log: Log, step: Array) -> Iterator[Finding]:

@@ -10,7 +10,9 @@ from typing import Any
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.motions import check_excitation, check_repeated_motion
+from robotid.doctor.mounted import check_payload_change
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
+from robotid.doctor.torque_channels import check_torque_channels
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
 from robotid.doctor.urdf_base import rounded_robot
@@ -25,9 +27,9 @@ __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "joint_axis", "joint_order", "locked_position", "position_offset",
-    "position_order", "position_sign", "spikes", "torque_order", "torque_sign", "velocity_order",
-    "velocity_scale",
+    "gravity", "gravity_compensated", "joint_axis", "joint_order", "locked_position",
+    "position_offset", "position_order", "position_sign", "spikes", "torque_order", "torque_sign",
+    "unlike_velocity", "unsigned_torque", "velocity_order", "velocity_scale",
 )  # fmt: skip
 
 
@@ -75,10 +77,12 @@ def diagnose(
     findings: list[Finding] = []
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]
-    for log, (motion, _) in zip(kept, motions[len(fitted) :], strict=True):
+    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+    for log, (motion, probe) in zip(kept, motions[len(fitted) :], strict=True):
         if motion is not None:
             findings += check_repeated_motion(first, motion, log.name)
-    probes = [probe for _, probe in motions[: len(fitted)] if probe is not None]
+        if probe is not None and probes:
+            findings += check_payload_change(probes, probe, log.name)
     if probes:
         names = ", ".join(log.name for log in fitted)
         moving = [probe.motion for probe in probes]
@@ -111,6 +115,8 @@ def _examine_log(
     name = log.name
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
     findings += [*check_clock(log), *check_channels(log, signals)]
+    sizes = list(check_torque_channels(log))
+    findings += sizes
     if model.free_flyer:
         message = "torques of a robot with a floating base are not judged"
         findings.append(log_finding(name, "floating_base", "note", message))
@@ -120,14 +126,16 @@ def _examine_log(
     except DataError as error:
         findings.append(Finding(error.code, "error", name, str(error)))
         return None, None
-    findings += check_rest(log, motion, model.layout.prismatic)
+    findings += check_rest(log, motion, model.layout)
     probe = take_probe(model, motion)
     if probe is None:
         message = "too little moves to judge torques by; record motion of every joint"
         findings.append(log_finding(name, "no_motion", "warning", message))
         return motion, None
+    if any(finding.severity == "error" for finding in sizes):
+        return motion, probe  # no physics fits torques without signs
     torques = list(check_torques(probe, name))
     findings += torques
     if not any(finding.severity == "error" for finding in torques):
-        findings += check_torque_delay(model, motion, signals, name)
+        findings += check_torque_delay(model, log, signals, name)
     return motion, probe

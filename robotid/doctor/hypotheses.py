@@ -14,13 +14,16 @@ import numpy as np
 from robotid._typing import Array
 from robotid.doctor.sample import Probe
 
-__all__ = ["Explanation", "explanations", "unexplained"]
+__all__ = ["Explanation", "compensated", "explanations", "own_share", "unexplained"]
 
 _FLOOR = 1e-3  # an unexplained share below this is as good as none
 _POOR = 0.08  # a share above this lets other readings of the positions be tried
 _CLEARLY = 2.0  # gain in misfit, a factor 7, over what needs no other position
 _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero position may be off
 _EARTH = 9.81  # [m/s^2]
+_RINGING = 0.05  # of its top, that the filter makes a torque of one sign pass 0
+_TURNS = 8  # of signs and fit
+_FOLDED = 0.3  # share of what is unexplained that must be left to take a torque for a size
 _CONSTANT = 1e-9  # of its size: a torque that varies less does not, but for rounding
 
 
@@ -29,8 +32,8 @@ class Explanation:
     """What would have to be otherwise, and how well the torques are explained then.
 
     Attributes:
-        kind: "stated", "payload", "torque_sign", "torque_order", "gravity", "joint_order",
-            "joint_axis", "position_order", "position_sign" or "position_offset".
+        kind: "stated", "payload", "torque_sign", "unsigned_torque", "torque_order", "gravity",
+            "joint_order", "joint_axis", "position_order", "position_sign" or "position_offset".
         share: Unexplained share of each torque's variance, shape (n,).
         joints: Indices of the joints concerned.
         values: "torque_order": which joint each torque column belongs to; "gravity": the vector
@@ -46,6 +49,23 @@ class Explanation:
     def misfit(self) -> float:
         """The sum of the logarithms of the unexplained shares: lower is better."""
         return float(np.sum(np.log(self.share + _FLOOR)))
+
+
+def compensated(probe: Probe) -> tuple[Probe, Array]:
+    """Return a motion with the URDF's gravity added to its torques, and what stays unexplained.
+
+    Args:
+        probe: The motion.
+
+    Returns:
+        The motion, and what no physics explains as shares of the variance of the torques as logged,
+        shape (n,).
+    """
+    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial]
+    whole = replace(probe, tau=probe.tau + np.tensordot(probe.gravity, probe.G, axes=1) @ pi)
+    size, logged = _variation(whole), _variation(probe)
+    share = own_share(whole) * np.divide(size, logged, out=np.zeros_like(size), where=logged > 0)
+    return whole, np.minimum(share, 1.0)
 
 
 def unexplained(probe: Probe, gravity: Array | None = None) -> Array:
@@ -83,8 +103,8 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
     share = unexplained(probe)
     own = np.diagonal(share).T  # (n, 2)
     stated = Explanation("stated", own[:, 0])
-    others = [_signs(own), _order(share), _gravity(probe)]
-    loaded = Explanation("payload", np.minimum(_own_share(probe, any_load=True), stated.share))
+    others = [_signs(own), _unsigned(probe, own), _order(share), _gravity(probe)]
+    loaded = Explanation("payload", np.minimum(own_share(probe, any_load=True), stated.share))
     if stated.share.max() > _POOR:
         # more readings are tried, and with fewer rows: one of them must be clearly better
         bound = min(e.misfit for e in [stated, *others]) - _CLEARLY
@@ -95,6 +115,37 @@ def explanations(probe: Probe) -> tuple[Explanation, Explanation, list[Explanati
 def _signs(own: Array) -> Explanation:
     turned = np.flatnonzero(own[:, 1] < own[:, 0])
     return Explanation("torque_sign", own.min(axis=1), tuple(turned.tolist()))
+
+
+def _unsigned(probe: Probe, own: Array) -> Explanation:
+    """Return the torques that are never negative as sizes of torques of either sign.
+
+    The signs are those of what physics makes of the signed torque, in turn, from those of the
+    URDF's torque, of the velocity or of the acceleration on.
+    """
+    share, joints = own[:, 0].copy(), []
+    loads = _link_loads(probe, None)
+    for j, tau in enumerate(probe.tau.T):
+        if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
+            continue
+        X = np.hstack([loads[:, j], probe.drive(j)])
+        starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
+        found = min(_folded_misfit(X, tau, np.sign(start)) for start in starts)
+        if found < _FOLDED * own[j].min():
+            share[j] = found
+            joints.append(j)
+    return Explanation("unsigned_torque", share, tuple(joints))
+
+
+def _folded_misfit(X: Array, tau: Array, sign: Array) -> float:
+    """Return the unexplained share of a torque whose signs are found in turn from a first guess."""
+    for _ in range(_TURNS):
+        sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
+    signed = sign * tau
+    R, T = _compressed(X, signed[:, None])
+    # of the torque as logged: a constant one turned with the speed would be all friction
+    size = float(np.sum((tau - tau.mean()) ** 2))
+    return _nonnegative_misfit(R, T[:, 0]) / size if size > 0 else 1.0
 
 
 def _order(share: Array) -> Explanation:
@@ -115,7 +166,7 @@ def _gravity(probe: Probe) -> Explanation:
     n = len(probe.model.joints)
 
     def explained(g: Array) -> Explanation:
-        share = _own_share(probe, g)
+        share = own_share(probe, g)
         return Explanation("gravity", share, tuple(range(n)), tuple(g.tolist()))
 
     axes = [sign * size * axis for axis in np.eye(3) for sign in (1, -1)]
@@ -150,19 +201,19 @@ def _positions(probe: Probe) -> Iterator[Explanation]:
         yield Explanation("joint_order", share[np.arange(n), order, 0], pair)
     turning = [j for j in range(n) if probe.model.joints[j] not in probe.model.layout.prismatic]
     for j in turning:
-        share = _own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
+        share = own_share(small.with_motion(_moved(small, j, -1.0, 0.0)))
         yield Explanation("position_sign", share, (j,))
     for j in range(n):
         turned = small.with_motion(_moved(small, j, -1.0, 0.0))
         sign = np.where(np.arange(n) == j, -1.0, 1.0)
-        yield Explanation("joint_axis", _own_share(replace(turned, tau=sign * small.tau)), (j,))
+        yield Explanation("joint_axis", own_share(replace(turned, tau=sign * small.tau)), (j,))
     offsets = [_offset(small, j, offset) for j in turning for offset in _OFFSETS]
     if offsets:
         yield _refined(small, min(offsets, key=lambda e: e.misfit))
 
 
 def _offset(probe: Probe, j: int, offset: float) -> Explanation:
-    share = _own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
+    share = own_share(probe.with_motion(_moved(probe, j, 1.0, -offset)))
     return Explanation("position_offset", share, (j,), (offset,))
 
 
@@ -187,10 +238,13 @@ def _moved(probe: Probe, j: int, sign: float, offset: float) -> tuple[Array, Arr
     return q, v, a
 
 
-def _own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
+def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False) -> Array:
     """Return the share that each joint's own physics leaves of its torque, shape (n,).
 
-    With any load, the last link may also have any mass more, and any centre of it.
+    Args:
+        probe: The motion.
+        gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+        any_load: Whether the last link may also have any mass more, and any centre of it.
     """
     loads = _link_loads(probe, gravity)
     if any_load:
@@ -226,6 +280,16 @@ def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:
     used = size > 1e-9 * size.max(initial=1e-300)
     R = np.asarray(np.linalg.qr(np.hstack([X[:, used] / size[used], tau]), mode="r"))
     return R[:, : used.sum()], R[:, used.sum() :]
+
+
+def _nonnegative_prediction(X: Array, tau: Array) -> Array:
+    """Return what columns with factors >= 0 make of a torque, shape (N,)."""
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(X, axis=0)
+    columns = X / np.where(size > 0, size, 1.0)
+    predicted: Array = columns @ nnls(columns, tau)[0]
+    return predicted
 
 
 def _nonnegative_misfit(R: Array, tau: Array) -> float:

@@ -10,11 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.hypotheses import compensated
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
 
-__all__ = ["LoadModel", "check_loads", "load_model"]
+__all__ = ["NO_GRAVITY", "LoadModel", "check_loads", "load_model"]
 
+#: What is said of torques without gravity.
+NO_GRAVITY = (
+    "the torques hold no gravity: with the URDF's gravity added they fit the URDF, as logged they "
+    "do not. If the controller compensates gravity before they are logged, log the whole torque of "
+    "the motors; if the robot moves in a horizontal plane or floats, state gravity = [0, 0, 0]"
+)
 _SPREAD = 0.3  # of a link's mass about the URDF's
 _PRECISION = 0.05  # of a torque, model errors included
 _INDEPENDENT = 20.0  # instants of a log that are independent of each other
@@ -90,12 +97,13 @@ class LoadModel:
         return np.concatenate([rows.reshape(T, n * (c + 1), c + 1), prior], axis=1)
 
 
-def load_model(probe: Probe, share: Array) -> LoadModel:
+def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadModel:
     """Return the rows of a motion.
 
     Args:
         probe: The motion.
         share: Share of each torque's variance that no physics explains, shape (n,).
+        level: Standard deviation of each torque as logged, shape (n,); the motion's if None.
 
     Returns:
         The load model; a torque that is constant or that physics does not explain is ignored.
@@ -108,7 +116,7 @@ def load_model(probe: Probe, share: Array) -> LoadModel:
     Y = probe.regressor().reshape(N, n, bodies, 10)
     links = np.einsum("knbi,bi->knb", Y, pi)
     X = np.concatenate([links, Y[:, :, -1, :4], probe.tau[:, :, None]], axis=2)
-    level = probe.tau.std(axis=0)
+    level = probe.tau.std(axis=0) if level is None else level
     told = (level > _CONSTANT * np.abs(probe.tau).max()) & (share < _EXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))
     for j in np.flatnonzero(told).tolist():
@@ -137,8 +145,8 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         name: What the log is called.
 
     Yields:
-        "current_for_torque" per joint, or once for all joints of one factor, or else
-        "urdf_mismatch", or else "payload".
+        Warnings "current_for_torque" per joint, or once for all joints of one factor, or else an
+        error "gravity_compensated", or else a warning "urdf_mismatch", or else "payload".
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
@@ -148,6 +156,9 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         other = np.flatnonzero(np.abs(np.log(scale)) > np.log(_OTHER_SCALE))
         if len(other) and _is_this_robot(model, *model.fit(scale)[:2]):
             yield from _scaled(probe, scale, _needed(model, scale, other), name)
+            return
+        if _holds_no_gravity(probe):
+            yield log_finding(name, "gravity_compensated", "error", NO_GRAVITY)
             return
         if len(other) or _error_of_links(theta) > _MISMATCH:
             yield _mismatch(probe, theta[:bodies], name)
@@ -159,6 +170,15 @@ def _is_this_robot(model: LoadModel, chi: float, theta: Array) -> bool:
     """Return whether torques fit about as well as by themselves, by links that weigh as stated."""
     is_good = chi - model.expected < _WORSE * model.independent
     return is_good and _error_of_links(theta) < _MISMATCH
+
+
+def _holds_no_gravity(probe: Probe) -> bool:
+    """Return whether the torques fit the URDF, to their size as logged, if its gravity is added."""
+    if not probe.gravity.any():
+        return False
+    whole, share = compensated(probe)
+    model = load_model(whole, share, probe.tau.std(axis=0))
+    return _is_this_robot(model, *model.fit(np.ones(len(share)))[:2])
 
 
 def _error_of_links(theta: Array) -> float:

@@ -15,7 +15,7 @@ from robotid.robot.model import RobotModel
 __all__ = ["Probe", "smooth_motion", "take_probe"]
 
 _MARGIN = 0.15  # [s] rows nearer to the end of a stretch are left out: the filter has not settled
-_STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
+_STILL = 0.02  # [rad/s] slower than this the sign of a friction torque is not known
 _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
 
 
@@ -75,7 +75,8 @@ class Probe:
             Columns a, v, sign v, 1, -1 and those of coupled drives, shape (N, 5 + k).
         """
         v, one = self.v[:, j], np.ones(len(self.v))
-        still = min(_STILL, _SLOW * float(np.abs(v).max())) or _STILL
+        least = _STILL * float(self.model.layout.drive_speeds[j])
+        still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
         return np.hstack([own, self.drives[:, j]])
 
@@ -122,7 +123,8 @@ def take_probe(model: RobotModel, motion: Trajectory, *, samples: int = 500) -> 
         motion: The smooth motion.
         samples: Number of instants, spread evenly over the rows at which something moves.
     """
-    rows = np.flatnonzero((np.abs(motion.v) > _STILL).any(axis=1) & _inner(motion))
+    still = _STILL * model.layout.drive_speeds[: len(model.joints)]
+    rows = np.flatnonzero((np.abs(motion.v) > still).any(axis=1) & _inner(motion))
     if len(rows) < 50:
         return None
     chosen = np.unique(np.linspace(0, len(rows) - 1, samples).astype(int))

@@ -1,17 +1,18 @@
-"""How late the torque is against the position, and whether moving it back would help.
+"""How late the torque is against the position, as far as the model's physics tells.
 
-The torque went through the filter, the regressor did not: on both sides of the fit it does here,
-or else what the filter takes from the torque alone looks like a delay.
+The regressor is made of a motion of thrice the bandwidth, and torque and regressor then go through
+the same filter: what a filter takes from one of them alone looks like a delay.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.sample import smooth_motion
 from robotid.findings import Finding, log_finding
-from robotid.logs.data import Trajectory
+from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.regressor.torque import joint_torque_regressor
@@ -22,20 +23,28 @@ __all__ = ["check_torque_delay"]
 _LONGEST = 0.1  # [s] delays are sought up to this
 _GRID = np.linspace(-_LONGEST, _LONGEST, 81)
 _NEAR = 0.01  # [s] about the delay, where the misfit is a parabola
-_FINEST = 0.001  # [s] an estimate is not better than this
+_FINEST = 0.001  # [s] by which friction that no curve describes imitates a delay
+_HELD = 0.1  # [samples] ... or a torque that is held from row to row
+_SURE = 3.0  # standard errors from which a delay is reported
+_LATE = 0.04  # [s] a longer delay that hardly shows is none: other errors of the model imitate it
+_HELPS = 0.15  # share of what is unexplained that it must take away
 _FEW = 100  # rows from which a joint counts for the delay
 _MOVING = 0.1  # share of the instants in which it must move
-_STILL = 0.02  # [rad/s or m/s] slower than this the sign of a friction torque is not known
+_SLOW = 0.05  # [rad/s] slower than this a drive may stick
+_STILL = 0.02  # [rad/s] about which the direction of friction changes
+_AWAY = 0.75  # [periods of the filter] so near a slow instant friction is not known
 _ROWS = 2000  # instants that are looked at
 _WINDOWS = 8  # stretches they are in, where the log has more of them
 _BLOCKS = 8  # parts of the log that are left out in turn
-_OVERSAMPLED = 8.0  # instants per period of the cut-off: products of motions are faster than they
+_OVERSAMPLED = 8.0  # instants per period of the filter: products of motions are faster than they
 _UNFILTERED = 10.0  # [Hz] bandwidth that is taken for a motion without a filter
-_SETTLED = 1.5  # [periods of the cut-off] from an end the filter of a stretch has settled
+# Cut-off of the comparison over the job's, and over the rate at most: noise that is interpolated
+# between rows would be smoothed there.
+_BAND = 1.5, 0.15
+_WIDE = 3.0, 0.4  # the same of the motion that the regressor is made of
+_SETTLED = 1.5  # [periods of the filter] from an end the filter of a stretch has settled
+_HARMONICS = 4  # of a torque that is periodic in the position, as of gears and magnets
 _EXACT = 1e-5  # share of a torque that is taken for noise in a log without any
-_LATE = 0.01  # [s] a shorter delay of the torque is within the errors of friction models
-_HELD = 0.75  # [samples] ... or comes from a torque that is held from row to row
-_HELPS = 0.15  # share of the unexplained torque that a delay must take away to be believed
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,20 +54,28 @@ class _Misfit:
     Attributes:
         squares: Sums of squares in each block of the log, as shares of the joint's torque, shape
             (n, blocks, delays).
+        rows: Number of instants of each joint, shape (n,).
     """
 
     squares: Array
+    rows: Array
 
     def delays_without(self, axis: int) -> list[float]:
         """Return the delays if one joint (axis 0) or block of the log (1) is left out in turn."""
-        left_out = range(self.squares.shape[axis])
-        return [_Misfit(np.delete(self.squares, k, axis=axis)).delay() for k in left_out]
+        kept = [
+            _Misfit(
+                np.delete(self.squares, k, axis=axis),
+                np.delete(self.rows, k) if axis == 0 else self.rows,
+            )
+            for k in range(self.squares.shape[axis])
+        ]
+        return [misfit.delay() for misfit in kept]
 
     def delay(self) -> float:
         """Return the delay that explains most [s], NaN if it is at an end of the grid."""
         share = self.squares.sum(axis=1) + _EXACT
         # relative to the best of each joint: one that is explained well says more
-        cost = (share / share.min(axis=1, keepdims=True)).mean(axis=0)
+        cost = self.rows @ (share / share.min(axis=1, keepdims=True)) / self.rows.sum()
         best = float(_GRID[np.argmin(cost)])
         if abs(best) + _NEAR > _LONGEST:
             return float("nan")
@@ -71,7 +88,7 @@ class _Misfit:
         variance = 0.0
         for delays in (self.delays_without(0), self.delays_without(1)):
             variance += (len(delays) - 1) * float(np.var(delays))
-        return max(float(np.sqrt(variance)), _FINEST)
+        return float(np.sqrt(variance))
 
     def gain(self) -> float:
         """Return the share of what is unexplained that the delay of the other blocks explains."""
@@ -86,74 +103,95 @@ class _Misfit:
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Contiguous rows of a motion, and the filtered columns that may explain their torques.
+    """Filtered torques of contiguous rows of a motion, and the columns that may explain them.
 
     Attributes:
-        rows: The N instants, as rows of the motion, shape (N,), int.
         inertial: Of each body, shape (N, n, p).
-        drive: Of each joint's inertia and frictions, and of coupled drives, shape (N, n, k).
-        steady: Whether a joint is far from a change of its direction, shape (N, n), bool.
+        drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
+        steady: Whether a joint is far from where its drive may stick, shape (N, n), bool.
+        late: Torques at each delay of the grid after the instants, shape (delays, N, n).
     """
 
-    rows: Array
     inertial: Array
     drive: Array
     steady: Array
+    late: Array
 
 
 def check_torque_delay(
-    model: RobotModel, motion: Trajectory, signals: SignalSettings, name: str
+    model: RobotModel, log: Log, signals: SignalSettings, name: str
 ) -> Iterator[Finding]:
     """Yield at most one "torque_delay", how late the torque is against the position.
 
-    The delay minimises what the regressor leaves of the delayed torque, rows near a change of
-    direction apart; its uncertainty is the jackknife's over the joints and over stretches of the
-    log. It is worth a warning if the delay of the other stretches explains each stretch better.
+    The delay minimises what physics, friction of any odd curve of the speed and a torque that is
+    periodic in the position leave of the delayed torque, instants near slow ones apart. Its
+    uncertainty is the jackknife's over the joints and over stretches of the log. It is a warning
+    from three standard errors on, if the delay of the other stretches explains each stretch better:
+    one of more than 40 ms clearly so.
 
     Args:
         model: The robot, with a fixed base.
-        motion: The smooth motion.
-        signals: How it was smoothed.
+        log: The log, of the model's joints in its order.
+        signals: How it becomes a trajectory.
         name: What the log is called.
+
+    Raises:
+        DataError: If the log is too short.
+        SettingsError: If a setting does not fit the log.
     """
-    misfit = _misfit(model, motion, signals)
+    step = float(np.median(np.diff(log.t)))
+    rate = min(1 / step, signals.rate or np.inf)
+    band, wide = (
+        replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
+        for times, most in (_BAND, _WIDE)
+    )
+    misfit = _misfit(model, smooth_motion(model, log, wide), band)
     if misfit is None:
         return
-    delay, error = misfit.delay(), misfit.error()
-    if not np.isfinite([delay, error]).all():
+    delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
+    if not np.isfinite([delay, error, gain]).all():
         return
-    gain = misfit.gain()
-    step = float(np.median(np.diff(motion.t)))
-    late = abs(delay) > max(_LATE, _HELD * step, 3 * error) and gain > _HELPS
-    meaning = (
-        f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
-        "logger's clock, or"
-        if late
-        else ". Friction that the model lacks can look like this; if the drive filters its torque,"
-    )
-    message = (
-        f"the torque is {1e3 * delay:.1f} +- {1e3 * error:.1f} ms late against the position"
-        f"{meaning} state [signals] torque_delay = {delay:.4f}"
-    )
+    error = float(np.hypot(error, max(_FINEST, _HELD * step)))
+    is_sure = abs(delay) > _SURE * error and gain > (_HELPS if abs(delay) > _LATE else 0.0)
+    late = f"{1e3 * abs(delay):.1f} +- {1e3 * error:.1f} ms {'late' if delay > 0 else 'early'}"
+    total = delay + signals.torque_delay
+    if not is_sure:
+        todo = "; that may be none: nothing needs doing"
+    elif gain > _HELPS:
+        todo = (
+            f"; moved back, {100 * gain:.0f} % of what no physics explains of it goes: correct the "
+            f"logger's clock, or set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
+        )
+    else:
+        todo = (
+            ". Friction that the model lacks can look like this; if the drive filters its torque, "
+            f"set torque_delay = {total:.4f} (--torque-delay {total:.4f})"
+        )
+    message = f"the torque is {late} against the position{todo}"
     evidence = {"delay": delay, "std_error": error, "gain": gain}
-    yield log_finding(name, "torque_delay", "warning" if late else "note", message, **evidence)
+    yield log_finding(name, "torque_delay", "warning" if is_sure else "note", message, **evidence)
 
 
 def _misfit(model: RobotModel, motion: Trajectory, signals: SignalSettings) -> _Misfit | None:
     """Return the misfit of the joints that move enough, None if they are less than half of all."""
     step = float(np.median(np.diff(motion.t)))
     every = max(1, int(1 / (step * _OVERSAMPLED * signals.cutoff))) if signals.cutoff else 1
-    rows = _stretches(motion, every)
-    windows = [_window(model, motion, part, step, every, signals) for part in rows]
+    windows = [
+        _window(model, motion, part, step, every, signals)
+        for part in _stretches(model, motion, every)
+    ]
     joints = range(len(model.joints))
-    found = [_squares(model, motion, windows, j) for j in joints] if windows else []
-    told = [squares for squares in found if squares is not None]
-    return _Misfit(np.array(told)) if len(told) >= max(2.0, len(joints) / 2) else None
+    found = [_squares(model, windows, j) for j in joints] if windows else []
+    told = [one for one in found if one is not None]
+    if len(told) < max(2.0, len(joints) / 2):
+        return None
+    squares, rows = zip(*told, strict=True)
+    return _Misfit(np.array(squares), np.array(rows, dtype=float))
 
 
-def _stretches(motion: Trajectory, every: int) -> list[Array]:
+def _stretches(model: RobotModel, motion: Trajectory, every: int) -> list[Array]:
     """Return contiguous rows, of one segment each, spread over the motion."""
-    moving = np.flatnonzero((np.abs(motion.v) > _STILL).any(axis=1))
+    moving = np.flatnonzero((np.abs(motion.v) > _STILL * _units(model)).any(axis=1))
     if len(moving) == 0:
         return []
     first, stop = int(moving[0]), int(moving[-1]) + 1
@@ -167,20 +205,27 @@ def _stretches(motion: Trajectory, every: int) -> list[Array]:
     return [part for rows, at in zip(chosen, cuts, strict=True) for part in np.split(rows, at)]
 
 
+def _units(model: RobotModel) -> Array:
+    """Return the speed of each joint that counts as 1 rad/s, shape (n,)."""
+    speeds: Array = model.layout.drive_speeds[: len(model.joints)]
+    return speeds
+
+
 def _window(
     model: RobotModel, motion: Trajectory, rows: Array, step: float, every: int,
     signals: SignalSettings,
 ) -> _Window:  # fmt: skip
     """Return the filtered columns at every so many of contiguous rows, but for their ends."""
-    t, v, coarse = motion.t[rows], motion.v[rows], rows[::every]
+    t, q, v, coarse = motion.t[rows], motion.q[rows], motion.v[rows] / _units(model), rows[::every]
     period = 1.0 / (signals.cutoff or _UNFILTERED)
     edge = max(_LONGEST, _SETTLED * period)
     inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
-    # friction of any odd curve of the speed, so that it is not taken for a delay; filtered before
-    # rows are left out, for it jumps
-    top = np.maximum(np.abs(motion.v).max(axis=0), _STILL)
+    # friction of any odd curve of the speed, and torques periodic in the position, so that they are
+    # not taken for a delay; filtered before rows are left out, for friction jumps
+    top = np.maximum(np.abs(motion.v).max(axis=0) / _units(model), _STILL)
     signs = [np.tanh(v / speed) for speed in (_STILL, 0.1 * top, 0.3 * top)]
-    own = np.stack([motion.a[rows], v, *signs, v * np.abs(v)], axis=2)
+    waves = [wave(k * q) for k in range(1, 1 + _HARMONICS) for wave in (np.cos, np.sin)]
+    own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
     W = joint_torque_regressor(model, *state).reshape(len(coarse), len(model.joints), -1)
@@ -188,13 +233,23 @@ def _window(
     size = model.layout.n_inertial
     coupled = W[:, :, size + len(model.joints) * len(model.layout.terms) :]
     at = motion.t[coarse[inner]]
-    turned = np.diff(np.sign(v), axis=0) != 0
-    away = [
-        _distance(at, (0.5 * (t[1:] + t[:-1]))[turned[:, j]]) > 0.5 * period
-        for j in range(v.shape[1])
-    ]
-    steady = np.column_stack(away) & (np.abs(motion.v[coarse[inner]]) > _STILL)
-    return _Window(coarse[inner], W[:, :, :size], np.concatenate([own, coupled], axis=2), steady)
+    turns = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
+    slow = turns | (np.abs(v) < _SLOW)
+    steady = [_distance(at, t[slow[:, j]]) > _AWAY * period for j in range(v.shape[1])]
+    tau = low_pass(motion.tau[rows], 1 / step, signals)
+    late = _interpolated(t, tau, [at + delay for delay in _GRID])
+    drive = np.concatenate([own, coupled], axis=2)
+    return _Window(W[:, :, :size], drive, np.column_stack(steady), late)
+
+
+def _interpolated(t: Array, values: Array, times: Sequence[Array]) -> Array:
+    """Return values, shape (N, n), at each of several lists of times, shape (lists, M, n)."""
+    from scipy.interpolate import CubicSpline
+
+    if len(t) < 2:
+        return np.empty((len(times), 0, values.shape[1]))
+    spline = CubicSpline(t, values, axis=0)
+    return np.array([spline(at) for at in times])
 
 
 def _distance(at: Array, turns: Array) -> Array:
@@ -205,23 +260,22 @@ def _distance(at: Array, turns: Array) -> Array:
     return distance
 
 
-def _squares(
-    model: RobotModel, motion: Trajectory, windows: Sequence[_Window], j: int
-) -> Array | None:
-    """Return what is unexplained of joint j's torque, shape (blocks, delays), None of few rows."""
+def _squares(model: RobotModel, windows: Sequence[_Window], j: int) -> tuple[Array, int] | None:
+    """Return what is unexplained of joint j's torque, shape (blocks, delays), and its instants.
+
+    None of a joint that moves in too few.
+    """
     steady = np.concatenate([window.steady[:, j] for window in windows])
     if steady.sum() < max(_FEW, _MOVING * len(steady)):
         return None
-    rows = np.concatenate([window.rows for window in windows])[steady]
     inertial, drive = (
         np.concatenate(parts)[steady]
         for parts in zip(*((w.inertial[:, j], w.drive[:, j]) for w in windows), strict=True)
     )
     carried = model.support()[j, : model.layout.n_inertial]
-    X = np.hstack([inertial[:, carried], drive, np.ones((len(rows), 1))])
-    t, tau = motion.t, motion.tau[:, j]
-    late = np.array([np.interp(t[rows] + delay, t, tau) for delay in _GRID])  # (delays, N)
-    late = late - late.mean(axis=1, keepdims=True)
+    X = np.hstack([inertial[:, carried], drive, np.ones((len(inertial), 1))])
+    late = np.concatenate([window.late[:, :, j] for window in windows], axis=1)[:, steady]
+    late = late - late.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", late, late)
     if size.min() <= 0:
         return None
@@ -229,4 +283,5 @@ def _squares(
     U, s, _ = np.linalg.svd(X / np.where(length > 0, length, 1.0), full_matrices=False)
     Q = U[:, s > 1e-5 * s[0]]
     rest = (late - (late @ Q) @ Q.T) ** 2 / size[:, None]
-    return np.array([block.sum(axis=1) for block in np.array_split(rest, _BLOCKS, axis=1)])
+    blocks = np.array_split(rest, _BLOCKS, axis=1)
+    return np.array([block.sum(axis=1) for block in blocks]), len(inertial)

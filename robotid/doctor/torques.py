@@ -7,7 +7,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.hypotheses import Explanation, explanations
-from robotid.doctor.loads import check_loads
+from robotid.doctor.loads import NO_GRAVITY, check_loads
+from robotid.doctor.mounted import check_unmounted_parts
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
 
@@ -65,13 +66,13 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         name: What the log is called.
 
     Yields:
-        Errors "torque_sign", "torque_order", "joint_order", "joint_axis", "position_order",
-        "position_sign", "position_offset" or "gravity", or else what ``check_loads`` yields;
-        and "unexplained_torque".
+        Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
+        "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated",
+        or else what ``check_unmounted_parts`` or ``check_loads`` yields; and "unexplained_torque".
     """
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
-    if best.kind != "torque_sign" and loaded.misfit < best.misfit:
+    if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
         best = stated  # a load explains it better
     make = _FINDINGS.get(best.kind)
     found = list(make(_Reading(probe, stated, best, name))) if make else []
@@ -79,7 +80,11 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
         # what a load on the last link would explain as well is no error for certain
         yield replace(finding, severity="warning") if _is_excused(best, loaded) else finding
     if not found:
-        yield from check_loads(probe, loaded.share, name)
+        loads = list(check_loads(probe, loaded.share, name))
+        if not {finding.code for finding in loads} - {"payload"}:
+            parts = list(check_unmounted_parts(probe, loaded.share, name))
+            loads = parts or loads
+        yield from loads
         yield from _unexplained(probe, loaded.share, name)
 
 
@@ -95,6 +100,20 @@ def _sign(reading: _Reading) -> Iterator[Finding]:
         )
         evidence = {"unexplained": before, "unexplained_if_negated": after}
         yield log_finding(reading.log, "torque_sign", "error", message, joint, **evidence)
+
+
+def _unsigned(reading: _Reading) -> Iterator[Finding]:
+    for j, joint in zip(reading.best.joints, reading.joints, strict=True):
+        before, after = reading.stated.share[j], reading.best.share[j]
+        if after > _EXPLAINED:
+            continue
+        message = (
+            f"the torque of {joint} is a size without its sign: as it is, {100 * before:.0f} % of "
+            f"its variance cannot be explained, with the signs of the motion {100 * after:.2g} %; "
+            f"log tau_{joint} with its sign"
+        )
+        evidence = {"unexplained": before, "unexplained_with_signs": after}
+        yield log_finding(reading.log, "unsigned_torque", "error", message, joint, **evidence)
 
 
 def _exchanged(reading: _Reading) -> Iterator[Finding]:
@@ -146,12 +165,8 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
     size = float(np.linalg.norm(believed))
     if not g.any():
         if size > 0 and reading.is_certain:
-            message = (
-                "the torques hold no gravity: without it they are explained best; they may be "
-                "those of a gravity-compensated channel: log the torque of the motor, or state "
-                "gravity = [0, 0, 0] for what is left"
-            )
-            yield log_finding(reading.log, "gravity", "error", message, gain=gain)
+            code = "gravity_compensated"
+            yield log_finding(reading.log, code, "error", NO_GRAVITY, gain=gain)
         return
     cosine = float(g @ believed) / (float(np.linalg.norm(g)) * size) if size > 0 else 0.0
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
@@ -171,6 +186,7 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
 
 _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
     "torque_sign": _sign,
+    "unsigned_torque": _unsigned,
     "torque_order": _exchanged,
     "joint_order": _exchanged,
     "position_order": _exchanged,
@@ -182,7 +198,7 @@ _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
 
 
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
-    if best.kind == "torque_sign":
+    if best.kind in ("torque_sign", "unsigned_torque"):
         excused = (
             loaded.share[j] < min(_EXCUSED, _MUCH_BETTER * (best.share[j] + _NOISE))
             for j in best.joints

@@ -16,11 +16,12 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.identification.velocity_choice import prefers_measured
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
 from robotid.logs.read import LogLayout
 from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import decide, unwrap, velocity_lag
+from robotid.logs.signals import decide, unwrap
 from robotid.logs.smoothing import SPLINE, Stretch, filter_reach, process_stretches, too_short
 from robotid.logs.table import Place, RowReader, Table, prefixes
 from robotid.logs.time_stamps import blocks_of, map_stamps, median_step
@@ -236,8 +237,10 @@ class SurveyedLog:
             SettingsError: If a setting does not fit the log.
         """
 
-        def lag() -> float:
-            return float(np.median([velocity_lag(_unwrap(self.model, x)) for x in self.windows]))
+        def is_trusted() -> bool:
+            return prefers_measured(
+                self.model, [_unwrap(self.model, log) for log in self.windows], self.asked
+            )
 
         v, a = self.windows[0].v, self.windows[0].a
         return decide(
@@ -246,7 +249,7 @@ class SurveyedLog:
             self.path or "log",
             has_velocity=v is not None,
             has_acceleration=a is not None,
-            lag=lag,
+            is_trusted=is_trusted,
         )
 
     @cached_property

@@ -51,11 +51,14 @@ _WORDS = {
     "in another unit, masses and inertias are wrong in the same proportion",
     "density": "its mass makes {density:.2g} kg/m^3 of the box around its geometry",
     "gravity": "the direction of gravity may be stated wrongly",
+    "gravity_compensated": "the torque may be logged without gravity",
+    "held_torque": "the torque is held for {rows:.0f} rows at a time, so it is late and stepped",
     "gyration": "its mass lies {gyration:.2g} m from its centre on average, its geometry ends at "
     "{farthest:.2g} m: no body can be so",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
+    "payload_change": "its last link carries {mass:.2g} kg more than in the fitted logs",
     "position_offset": "the zero of the position may be off",
     "position_order": "the position may be that of another joint",
     "position_sign": "the position may have the opposite sign",
@@ -67,6 +70,8 @@ _WORDS = {
     "torque_scale": "the torque may be in another scale than the other joints', by 1 + {fault:.2f}",
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
+    "unsigned_torque": "the torque may be a size without its sign",
+    "unmounted_part": "{mass:.2g} kg of the URDF's last link seem not to have been mounted",
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
     "lack a load",
 }

@@ -8,7 +8,7 @@ from robotid._typing import Array
 
 __all__ = ["acting_directions"]
 
-_REST = 1e-6  # [rad/s or m/s] slower than this is rest: the sign of rounding is no direction
+_REST = 1e-6  # [rad/s] slower than this is rest: the sign of rounding is no direction
 # A drive that sticks is slow for so many times as long as its slopes at the edge of the band say.
 _REVERSAL = 2.0  # a straight line through zero has 1, a cubic that rests there 3
 _RETURN = 4.0  # a parabola from zero to the far edge of the band has 2 to 4
@@ -25,8 +25,8 @@ def acting_directions(t: Array, w: Array, band: float, longest: float) -> Array:
 
     Args:
         t: Times, shape (N,) [s].
-        w: Smooth speeds, shape (N, c) [rad/s or m/s].
-        band: Speed from which the sign is sure [rad/s or m/s]; 0: everywhere.
+        w: Smooth speeds, shape (N, c) [rad/s]; those of sliders as of ``friction_speeds``.
+        band: Speed from which the sign is sure [rad/s]; 0: everywhere.
         longest: Longest time that a drive sticks; what is slow for longer keeps its signs [s].
 
     References:

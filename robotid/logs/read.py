@@ -336,8 +336,27 @@ class _Finder:
         hint = f"Did you mean {near}? " if nearest else ""
         sought = f"{kind}_{named}" if joint else kind
         stood = f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
+        stood += self._how_to_lock() if joint else ""
         raise DataError(
             f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
             f"Rename it, or pass columns={{{standard!r}: {near}}}{stood}",
             code="missing_column",
         )
+
+    def _how_to_lock(self) -> str:
+        """Return the flags that leave out the joints whose columns are missing, "" if all are."""
+        logged = [joint for joint in self.joints if self._is_logged(joint)]
+        absent = [joint for joint in self.joints if joint not in logged]
+        if not logged:
+            return ""
+        locks = " ".join(f"--lock {joint}=0" for joint in absent)
+        return f" where it stood, as with --joints {','.join(logged)} {locks}"
+
+    def _is_logged(self, joint: str) -> bool:
+        """Return whether the file has a position, and a torque or a current, of a joint."""
+
+        def has(kind: str) -> bool:
+            names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
+            return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
+
+        return has("q") and (has("tau") or has("current"))

@@ -46,8 +46,9 @@ class SignalSettings(Settings):
     )
     velocity: str = setting(
         "auto",
-        "measured, differentiated (from the position), or auto: measured if the log has it and it "
-        "lags the position by less than 20 ms",
+        "measured, differentiated (from the position), or auto: measured if the log has it, it "
+        "is fine and that of its position, and predicts torque in stretches that were not fitted "
+        "as well as differentiated",
         among=_MEASURED,
     )
     acceleration: str = setting(
@@ -62,13 +63,15 @@ class SignalSettings(Settings):
     min_velocity: float = setting(
         0.02,
         "joint speed below which its rows are left out while Coulomb friction is identified "
-        "[rad/s or m/s], and within which a drive may stick; 0 keeps all rows",
+        "[rad/s], and within which a drive may stick; of a joint that slides, that at which it "
+        "crosses its range (1 m if the URDF has none) in the time of a full turn; 0 keeps all rows",
         within=NOT_NEGATIVE,
     )
     friction_band: float = setting(
         0.0,
-        "speed from which Coulomb friction has its full size [rad/s or m/s]: it changes linearly "
-        "between that speed and its negative; 0: at once, as Coulomb has it",
+        "speed from which Coulomb friction has its full size [rad/s], of joints that slide as for "
+        "min_velocity: it changes linearly between that speed and its negative; 0: at once, as "
+        "Coulomb has it",
         within=NOT_NEGATIVE,
     )
     max_gap: float | None = setting(

@@ -14,12 +14,12 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log, Trajectory
+from robotid.logs.measured_velocity import is_trustworthy
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import Stretch, process_stretches, too_short
 
-__all__ = ["decide", "process", "resolve", "turns_note", "unwrap", "velocity_lag"]
+__all__ = ["decide", "process", "resolve", "turns_note", "unwrap"]
 
-_LATE = 0.02  # [s] a measured velocity that lags more than this is not used by "auto"
 _GAP_STEPS = 2.5  # a step longer than this many median steps may be a gap
 _GAP_CYCLES = 0.25  # ... if it is also longer than this share of the filter's period
 
@@ -45,7 +45,7 @@ def resolve(log: Log, settings: SignalSettings) -> SignalSettings:
         log.path or "log",
         has_velocity=log.v is not None,
         has_acceleration=log.a is not None,
-        lag=lambda: velocity_lag(log),
+        is_trusted=lambda: is_trustworthy(log, settings.velocity_delay),
     )
 
 
@@ -56,7 +56,7 @@ def decide(
     *,
     has_velocity: bool,
     has_acceleration: bool,
-    lag: Callable[[], float],
+    is_trusted: Callable[[], bool],
 ) -> SignalSettings:
     """Return the settings as of ``resolve``, decided from a few facts of the log.
 
@@ -66,7 +66,7 @@ def decide(
         where: What the log is called in errors.
         has_velocity: Whether it has measured velocities.
         has_acceleration: Whether it has measured accelerations.
-        lag: Returns how late the measured velocity is [s]; called if that matters.
+        is_trusted: Returns whether measured velocities are to be used; called if that matters.
 
     Raises:
         DataError: If measured velocity or acceleration is asked for and the log has none.
@@ -89,8 +89,7 @@ def decide(
             )
     velocity, acceleration = settings.velocity, settings.acceleration
     if velocity == "auto":
-        is_timely = has_velocity and lag() - settings.velocity_delay < _LATE
-        velocity = "measured" if is_timely else "differentiated"
+        velocity = "measured" if has_velocity and is_trusted() else "differentiated"
     if acceleration == "auto":
         is_used = has_acceleration and velocity == "measured"
         acceleration = "measured" if is_used else "differentiated"
@@ -125,38 +124,6 @@ def process(log: Log, settings: SignalSettings, speeds: Array | None = None) -> 
         raise too_short(log.path or "log", len(stretches), settings)
     numbers = np.unique(trajectory.segment, return_inverse=True)[1]
     return replace(trajectory, segment=numbers)
-
-
-def velocity_lag(log: Log) -> float:
-    """Return how late the measured velocity is against the derivative of the position [s].
-
-    The delay minimises the distance between the measured velocity and the delayed derivative,
-    summed over the joints; found on a uniform grid and refined by a parabola. It is positive if
-    the measured velocity is late, and 0 if the joints stand still.
-
-    Args:
-        log: A log with measured velocities.
-
-    Raises:
-        DataError: If the log has no velocities.
-    """
-    if log.v is None:
-        raise DataError(f"{log.path or 'log'} has no measured velocity")
-    step = float(np.median(np.diff(log.t)))
-    grid = np.arange(log.t[0], log.t[-1], step)
-    q = np.array([np.interp(grid, log.t, column) for column in log.q.T])  # (n, N)
-    v = np.array([np.interp(grid, log.t, column) for column in log.v.T])
-    slope = np.gradient(q, step, axis=1)
-    longest = min(int(0.3 / step) + 1, len(grid) // 4)
-    shifts = np.arange(-longest, longest + 1)
-    cost = np.array([_distance(slope, v, int(shift)) for shift in shifts])
-    best = int(np.argmin(cost))
-    if not v.any() or not 0 < best < len(shifts) - 1:
-        return 0.0
-    left, middle, right = cost[best - 1 : best + 2]
-    curvature = left - 2 * middle + right
-    fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
-    return float((shifts[best] + fraction) * step)
 
 
 def unwrap(log: Log, is_free: Array) -> Log:
@@ -194,10 +161,3 @@ def turns_note(joints: Sequence[str]) -> str:
         joints: Names of the joints.
     """
     return f"full turns taken out of the angle of {listed(joints)}"
-
-
-def _distance(slope: Array, v: Array, shift: int) -> float:
-    """Return the mean square of v - slope delayed by shift samples."""
-    n = v.shape[1]
-    late, early = slice(max(shift, 0), n + min(shift, 0)), slice(max(-shift, 0), n - max(shift, 0))
-    return float(np.mean((v[:, late] - slope[:, early]) ** 2))

@@ -59,8 +59,8 @@ def process_stretches(
         settings: The settings, resolved.
         first: Row number that the log's first row has in the stretches.
         own: Rows wanted, numbered as in the stretches; the log must have the row that follows.
-        speeds: Ratios of the speeds that Coulomb friction follows to those of the joints, shape
-            (c, n), as of ``friction_speeds``.
+        speeds: Ratios of the speeds that Coulomb friction follows [rad/s] to those of the joints,
+            shape (c, n), as of ``friction_speeds``.
 
     Returns:
         The trajectory, of no samples if no stretch is long enough; the segment numbers of its

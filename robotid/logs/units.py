@@ -14,6 +14,7 @@ __all__ = ["check_reach", "check_units"]
 
 _TIME_NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _DEGREES = 180 / np.pi  # degrees in a radian
+_EPOCHS = 6e8, 5e9  # [s] since 1970: dates from 1989 to 2128
 _SLOWEST = 0.1  # [s] a longer median step is taken for another unit
 _FARTHEST = 4 * np.pi  # [rad] joints beyond two turns are taken for degrees
 _STRETCH = 0.1  # [s] motion is compared over stretches this long: noise and jitter average out
@@ -39,7 +40,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     turns = np.array([name not in prismatic for name in log.joints])
     factor = _velocity_factor(log)  # (n,), NaN where a joint tells nothing
     if units.time is None:
-        _check_step(float(np.median(np.diff(log.t))), log.name)
+        _check_step(float(np.median(np.diff(log.t))), float(log.t[0]), log.name)
         _check_clock(log, factor)
     if units.angle is None:
         check_reach(log, units, prismatic)
@@ -52,15 +53,18 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
         )
 
 
-def _check_step(step: float, where: str) -> None:
-    """Refuse a median time step that is too long for seconds."""
-    if step <= _SLOWEST * (1 + 1e-6):
+def _check_step(step: float, start: float, where: str) -> None:
+    """Refuse a median time step that is too long for seconds, and dates that are in none."""
+    epoch = [unit for unit in _TIME_NAMES if _EPOCHS[0] < start / PER_SECOND[unit] < _EPOCHS[1]]
+    if not epoch and step <= _SLOWEST * (1 + 1e-6):
         return
-    unit = "ms" if step <= 1e2 else "us" if step <= 1e5 else "ns"
+    unit = epoch[0] if epoch else "ms" if step <= 1e2 else "us" if step <= 1e5 else "ns"
+    since = f", the first of them {start:.13g} since 1970" if epoch else ""
     raise DataError(
-        f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]} "
+        f"{where}: median step {step:.6g} looks like {_TIME_NAMES[unit]}{since} "
         f"({PER_SECOND[unit] / step:.4g} Hz); in seconds it would be {1 / step:.3g} Hz. "
-        f"{_how_to_state('time', unit, 's')}",
+        f"{_how_to_state('time', unit, 's')}. To convert it, multiply by "
+        f"{1 / PER_SECOND[unit]:g}",
         code="time_unit",
     )
 

@@ -193,7 +193,8 @@ class OnlineIdentifier:
             self._step(instant, now)
             return
         v = instant[2]
-        if (np.abs(v) >= self.settings.min_velocity).any():
+        speeds = self.model.layout.drive_speeds[: len(v)]
+        if (np.abs(v) >= self.settings.min_velocity * speeds).any():
             self._early.append(instant)
         if len(self._early) * self._dt >= self.settings.warmup:
             self._start()

@@ -76,11 +76,13 @@ def friction_speeds(layout: ParameterLayout) -> Array:
         layout: The standard parameters of a robot with n joints.
 
     Returns:
-        Their ratios to the speeds of the joints, w = ratios v, shape (c, n) [-]; c is the number of
-        drives, or 0 if no term of the layout follows a direction.
+        Their ratios to the speeds of the joints, w = ratios v, shape (c, n), so that w is in rad/s
+        whether a joint turns or slides (``drive_speeds``); c is the number of drives, or 0 if no
+        term of the layout follows a direction.
     """
     is_followed = any(TERMS[name].follows_direction for name in layout.terms)
-    return layout.drive_ratios if is_followed else layout.drive_ratios[:0]
+    ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
+    return ratios if is_followed else ratios[:0]
 
 
 def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
@@ -89,7 +91,7 @@ def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:
     Args:
         layout: The standard parameters.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
-        least: Speed from which the sign is sure [rad/s or m/s].
+        least: Speed from which the sign is sure [rad/s]; ``drive_speeds`` times that of sliders.
     """
     ratios = friction_speeds(layout)
     first = v.shape[1] - ratios.shape[1]

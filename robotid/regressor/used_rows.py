@@ -18,7 +18,7 @@ def row_mask(model: RobotModel, trajectory: Trajectory, min_velocity: float) -> 
     Args:
         model: The robot. Without Coulomb friction to identify every row is used.
         trajectory: N samples.
-        min_velocity: Bound on the speed of a joint or of a coupled drive [rad/s or m/s].
+        min_velocity: Bound on the speed of a joint or of a coupled drive, as of ``sure_rows``.
     """
     return sure_rows(model.layout, trajectory.v, min_velocity)
 

@@ -120,13 +120,15 @@ class RobotModel:
         reduced = _reduce(full, positions)
         G, shift = _velocity_map(reduced, moving, followers, free_flyer)
         child = {joint.name: joint.child for joint in tree.movable}
+        slides = [joint for joint in tree.movable if joint.type == "prismatic"]
         layout = ParameterLayout(
             bodies=((tree.root,) if free_flyer else ())
             + tuple(child[name] for name in list(reduced.names)[first:]),
             joints=moving,
             terms=tuple(terms),
             couplings=tuple(couplings),
-            prismatic=frozenset(j.name for j in tree.movable if j.type == "prismatic"),
+            prismatic=frozenset(joint.name for joint in slides),
+            strokes={j.name: j.upper - j.lower for j in slides if j.has_limits},
         )
         return cls(tree, reduced, layout, G, shift, free_flyer, MappingProxyType(positions), mimic)
 

@@ -1,7 +1,7 @@
 """Names and order of the standard parameters, pseudo-inertia, physical consistency."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -58,6 +58,7 @@ class ParameterLayout:
         terms: The drive terms that are identified, names in ``TERMS`` in its order.
         couplings: Drives that turn with several joints.
         prismatic: Names of the joints that slide.
+        strokes: Ranges of those whose range the URDF states, by name [m].
     """
 
     bodies: tuple[str, ...]
@@ -65,6 +66,7 @@ class ParameterLayout:
     terms: tuple[str, ...] = DRIVE_TERMS
     couplings: tuple[Coupling, ...] = ()
     prismatic: frozenset[str] = frozenset()
+    strokes: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         unknown = [term for term in self.terms if term not in TERMS]
@@ -112,6 +114,21 @@ class ParameterLayout:
                 row[self.joints.index(joint)] = ratio
         ratios.setflags(write=False)
         return ratios
+
+    @cached_property
+    def drive_speeds(self) -> Array:
+        """Speed of each of the d drives that counts as 1 rad/s, shape (d,) [rad/s or m/s].
+
+        A joint that slides crosses its stroke (1 m if the URDF states none) at it in the time of a
+        full turn at 1 rad/s. A coupling has the mean of its joints, weighted by their ratios.
+        """
+        joints = [
+            self.strokes.get(joint, 1.0) / (2 * np.pi) if joint in self.prismatic else 1.0
+            for joint in self.joints
+        ]
+        weight = np.abs(self.drive_ratios) + 1e-300  # also of a coupling that turns with no joint
+        speeds: Array = weight @ np.array(joints) / weight.sum(axis=1)
+        return speeds
 
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:

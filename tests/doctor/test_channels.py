@@ -8,6 +8,7 @@ import pytest
 
 from robotid.commands.job import LogEntry, read_job
 from robotid.doctor.channels import check_channels
+from robotid.doctor.torque_channels import check_torque_channels
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 
@@ -75,7 +76,7 @@ def test_joints_at_rest_in_a_real_recording_raise_no_alarm(recordings, monkeypat
 @pytest.mark.parametrize("value", [0.0, -0.0, 3.0])
 def test_a_torque_that_never_changes_is_dead_and_not_clipped(value):
     log = log_of_two(tau=np.full(N, value))
-    (found,) = found_of(log, "constant_torque", "clipped")
+    (found,) = check_torque_channels(log)
     assert (found.code, found.where) == ("constant_torque", "run.csv: b")
     assert f"the torque of b is {abs(value):g} in every row" in found.message
 

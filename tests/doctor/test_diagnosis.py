@@ -68,6 +68,7 @@ def test_an_exact_log_gives_no_more_than_notes(ur5, seed):
 BESIDES = {
     "two position columns swapped": {"position_order"},
     "static joint": {"unexplained_torque", "excitation"},
+    "torques held for 5 rows": {"torque_delay"},  # by two rows on average
     "five spikes of 1000 N m": {"unexplained_torque"},
 }
 
@@ -188,6 +189,8 @@ def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypa
     assert loaded.severity == "warning"
     assert loaded.evidence["mass"] == pytest.approx(2.805, abs=3 * loaded.evidence["std_error"])
     assert "ident_20200219_14harm.parquet" not in payload
+    (change,) = [f for f in findings if f.code == "payload_change"]
+    assert change.evidence["mass"] == pytest.approx(-2.805, abs=3 * change.evidence["std_error"])
     assert "repeated_motion" in loud(findings)  # the same motion with and without the load
     single = examine(whole(recordings, monkeypatch, "ur10e", "jointwise_2"))
     still = {f.where.split(": ")[1] for f in single if f.code in ("static_joint", "hardly_moves")}

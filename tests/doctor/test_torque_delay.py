@@ -8,7 +8,6 @@ from helpers.corruptions import clean_log, late, robot, table_of
 from helpers.synthetic import exact_log, truth
 
 from robotid.doctor import torque_delay
-from robotid.doctor.sample import smooth_motion
 from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel
 
@@ -18,11 +17,7 @@ CLEAN = [("ur5", 100, 8.0), ("ur5", 101, 8.0), ("ur5", 104, 6.0), ("panda", 100,
 
 
 def found(model, log, signals=SIGNALS):
-    return list(
-        torque_delay.check_torque_delay(
-            model, smooth_motion(model, log, signals), signals, "run.csv"
-        )
-    )
+    return list(torque_delay.check_torque_delay(model, log, signals, "run.csv"))
 
 
 def delayed(log, delay):
@@ -72,17 +67,41 @@ def test_joints_that_hardly_move_have_no_say(ur5):
     assert found(ur5, replace(log, q=q)) == []
 
 
-@pytest.mark.parametrize(("share", "severity"), [(0.05, "note"), (0.5, "warning")])
-def test_a_delay_is_believed_if_it_explains_enough(ur5, monkeypatch, share, severity):
-    # misfits 1 - share (1 - x^2), x = 0 at a delay of 40 ms: what they fall by is the share
-    parabola = ((torque_delay._GRID - 0.04) / 0.04) ** 2
+# gains in ms, s.e. 1 ms (its floor): misfits 1 - share (1 - x^2), x = 0 at the delay; what they
+# fall by is the share
+@pytest.mark.parametrize(
+    ("delay", "share", "severity"),
+    [(0.045, 0.05, "note"), (0.045, 0.5, "warning"), (0.005, 0.05, "warning"),
+     (0.0025, 0.5, "note"), (-0.005, 0.05, "warning")],
+)  # fmt: skip
+def test_a_delay_is_said_at_three_sigma_if_it_helps_elsewhere(
+    ur5, monkeypatch, delay, share, severity
+):
+    parabola = ((torque_delay._GRID - delay) / delay) ** 2
     squares = np.tile(1 - share * (1 - parabola), (6, 8, 1))
-    monkeypatch.setattr(torque_delay, "_misfit", lambda *_: torque_delay._Misfit(squares))
+    misfit = torque_delay._Misfit(squares, np.ones(6))
+    monkeypatch.setattr(torque_delay, "_misfit", lambda *_: misfit)
     (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0))
     assert finding.severity == severity
-    assert finding.evidence["delay"] == pytest.approx(0.04, abs=1e-9)
-    assert finding.evidence["std_error"] == 1e-3
-    assert finding.evidence["gain"] == pytest.approx(share, rel=1e-4)
+    assert finding.evidence["delay"] == pytest.approx(delay, abs=1e-9)
+    assert finding.evidence["std_error"] == pytest.approx(1e-3)
+    assert finding.evidence["gain"] == pytest.approx(share, rel=0.01)
+    told = f"set torque_delay = {delay:.4f} (--torque-delay {delay:.4f})" in finding.message
+    assert told == (severity == "warning")
+
+
+@pytest.mark.parametrize(("name", "seed"), [("ur5", 100), ("ur5", 102), ("panda", 104)])
+def test_a_torque_that_is_periodic_in_the_position_is_no_delay(name, seed):
+    model = robot(name)
+    log, rng = clean_log(model, seed), np.random.default_rng(seed)
+    tau = log.tau.copy()
+    for torque, q in zip(tau.T, log.q.T, strict=True):
+        phase, size = rng.uniform(0, 2 * np.pi, 4), rng.standard_normal(4)
+        waves = [np.cos(k * q + p) for k, p in zip((1, 2, 3, 4), phase, strict=True)]
+        ripple = size @ waves
+        torque += 0.3 * torque.std() * ripple / ripple.std()
+    for finding in found(model, replace(log, tau=tau)):
+        assert finding.severity == "note"
 
 
 def test_a_model_of_one_joint_is_not_judged():

@@ -110,6 +110,43 @@ def both(*changes):
     return change
 
 
+def held(prefix, length):
+    def change(table):
+        rows = np.arange(len(table["time"])) // length * length
+        return {name: x[rows] if name.startswith(prefix) else x for name, x in table.items()}
+
+    return change
+
+
+def unsigned(prefix):
+    return lambda table: {
+        name: np.abs(x) if name.startswith(prefix) else x for name, x in table.items()
+    }
+
+
+def noise(name):
+    def function(x, _t):
+        return x.std() * np.random.default_rng(0).standard_normal(len(x))
+
+    return column(name, function)
+
+
+def compensated(table):
+    """Take the gravity torque off that the URDF says, as a controller's channel does."""
+    import pinocchio as pin
+
+    model = robot("ur5")
+    q = np.column_stack([table[f"q_{joint}"] for joint in model.joints])
+    data = model.pin_model.createData()
+    loads = np.array([pin.computeGeneralizedGravity(model.pin_model, data, x) for x in q])
+    torques = {f"tau_{joint}": loads[:, j] for j, joint in enumerate(model.joints)}
+    return {name: x - torques.get(name, 0.0) for name, x in table.items()}
+
+
+def stepped(seconds):
+    return column("time", lambda x, t: x + np.where(t > 8.0, seconds, 0.0))
+
+
 def stale(table):
     held = np.arange(len(table["time"]))
     held[1::5] -= 1  # every fifth row repeats the one before
@@ -150,7 +187,12 @@ CASES = {
     "one velocity halved": Case(("velocity_scale",), scaled("dq_elbow", 0.5)),
     "velocity in rpm": Case(("velocity_scale",), scaled("dq_", 9.5493)),
     "dead velocity channel": Case(("velocity_scale",), scaled("dq_elbow", 0.0)),
+    "one velocity replaced by noise": Case(("unlike_velocity",), noise("dq_elbow_joint")),
     "milliseconds": Case(("time_unit",), scaled("time", 1000)),
+    "nanoseconds since 1970": Case(("time_unit",), column("time",
+        lambda x, _t: np.round((x + 1.7e9) * 1e9))),
+    "clock set by 1e6 s": Case(("clock_step",), stepped(1e6)),
+    "clock set by 2 s": Case(("clock_step",), stepped(2.0)),
     "NaN torque": Case(("not_finite",), column("tau_elbow_joint", set_rows(300, np.nan))),
     "NaN position": Case(("not_finite",), column("q_elbow_joint", set_rows(300, np.nan))),
     "duplicate stamp": Case(("duplicate_stamp",), rows(duplicated)),
@@ -162,6 +204,11 @@ CASES = {
         lambda x, _t: np.minimum(x, np.quantile(x, 0.9)))),
     "dead torque channel": Case(("constant_torque",), column("tau_wrist_2_joint",
         lambda x, _t: np.full_like(x, 3.0))),
+    "torques without their sign": Case(("unsigned_torque",), unsigned("tau_")),
+    "one torque without its sign": Case(("unsigned_torque",), unsigned(f"tau_{B}")),
+    "torques held for 5 rows": Case(("held_torque",), held("tau_", 5)),
+    "one torque held for 3 rows": Case(("held_torque",), held("tau_elbow", 3)),
+    "gravity-compensated torques": Case(("gravity_compensated",), compensated),
     "static joint": Case(("static_joint",), both(
         column("q_wrist_3_joint", frozen), scaled("dq_wrist_3", 0))),
     "stale rows": Case(("stale_rows",), stale),

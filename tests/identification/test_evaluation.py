@@ -4,7 +4,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import evaluate_logs, pool, predict, shares_rows
 from robotid.identification.survey import hold_log
-from robotid.logs.data import Log
+from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.used_rows import row_mask
 from robotid.robot.parameters import Coupling
@@ -63,6 +63,20 @@ def test_rows_of_slow_joints_and_slow_coupled_drives_are_left_out(ur5, rng):
     np.testing.assert_array_equal(both[:, :4], mask[:, :4])
     frictionless = RobotModel.from_urdf(ur5.tree.path, terms=("viscous",))
     assert row_mask(frictionless, trajectory, 0.1).all()
+
+
+def test_a_slow_slider_is_slow_by_its_own_stroke():
+    from helpers.corruptions import robot
+
+    tiago = robot("tiago")  # its torso lifts 0.35 m: 0.02 rad/s is 1.1 mm/s of it
+    v = np.zeros((4, len(tiago.joints)))
+    v[:, 0] = [0.0010, 0.0012, 0.019, 0.021]
+    v[:, 1] = [0.019, 0.021, 0.019, 0.021]
+    q, rows = np.zeros_like(v), np.arange(4)
+    motion = Trajectory(rows / 1.0, q, v, q, q, tiago.joints, None, rows * 0)
+    mask = row_mask(tiago, motion, 0.02)
+    assert mask[:, 0].tolist() == [False, True, True, True]
+    assert mask[:, 1].tolist() == [False, True, False, True]
 
 
 def test_rows_recorded_twice_are_found_whatever_the_clock_says(ur5, rng):

@@ -262,7 +262,8 @@ def test_suspected_time_tells_how_to_state_it():
     with refused(
         "run3.csv: median step 10 looks like milliseconds (100 Hz); in seconds it would be 0.1 Hz. "
         'State units time = "ms" (job file table [units], CLI --time-unit ms, Python '
-        'units=LogUnits(time="ms")), or likewise "s" if that is right'
+        'units=LogUnits(time="ms")), or likewise "s" if that is right. To convert it, multiply by '
+        "0.001"
     ):
         check_units(make_log(t=make_log().t * 1e3), LogUnits())
 

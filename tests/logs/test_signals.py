@@ -3,8 +3,9 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log
+from robotid.logs.measured_velocity import velocity_lag
 from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process, resolve, unwrap, velocity_lag
+from robotid.logs.signals import process, resolve, unwrap
 
 
 def sine_log(t, frequency=0.5, lag=0.0, **options):

@@ -83,3 +83,24 @@ def test_a_velocity_that_does_not_go_with_its_position_is_refused(changes, code,
     with pytest.raises(DataError, match=said) as caught:
         check_units(log(**changes), LogUnits())
     assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("step", "factor", "unit"),
+    # 1 kHz, 5 Hz and 20 kHz since 1970: the step alone would say seconds, us, us
+    [(1e-3, 1e3, "ms"), (0.2, 1e3, "ms"), (5e-5, 1e9, "ns"), (0.01, 1e6, "us"), (0.01, 1e9, "ns")],
+)
+def test_a_date_tells_the_unit_of_the_time(step, factor, unit):
+    t = np.round((1.7e9 + step * np.arange(200)) * factor)
+    t = t if (np.diff(t) > 0).all() else (1.7e9 + step * np.arange(200)) * factor
+    q = np.sin(np.arange(200) * 0.05)[:, None]
+    with pytest.raises(DataError) as caught:
+        check_units(Log(t, q, q, ("a",)), LogUnits())
+    assert caught.value.code == "time_unit"
+    assert f'units time = "{unit}"' in str(caught.value)
+    assert str(caught.value).endswith(f"multiply by {1 / factor:g}")
+
+
+def test_seconds_since_1970_are_seconds():
+    q = np.sin(np.arange(200) * 0.05)[:, None]
+    check_units(Log(1.7e9 + 0.01 * np.arange(200), q, q, ("a",)), LogUnits())

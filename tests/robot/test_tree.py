@@ -50,6 +50,13 @@ def test_limits_are_those_stated_and_a_continuous_joint_has_no_range(chain):
     assert [joint.turns_freely for joint in (turn, endless, point)] == [False, True, True]
 
 
+def test_limits_that_no_joint_has_are_none(chain):
+    wide = read_tree(chain(("revolute", LIMIT.format(-10000, 10000)))).movable[0]
+    wound = read_tree(chain(("revolute", LIMIT.format(-12.6, 12.6)))).movable[0]
+    assert [joint.turns_freely for joint in (wide, wound)] == [True, False]
+    assert [joint.has_limits for joint in (wide, wound)] == [False, True]
+
+
 def test_what_mimic_leaves_out_is_one_and_zero(chain):
     tree = read_tree(chain(("revolute", ""), ("revolute", '<mimic joint="j1"/>')))
     assert tree.joints[1].mimic == ("j1", 1.0, 0.0)

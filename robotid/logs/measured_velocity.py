@@ -1,0 +1,171 @@
+"""What the measured velocities of a log are worth beside the derivative of its positions."""
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.logs.data import Log
+
+__all__ = [
+    "COARSE",
+    "LATE",
+    "coarse_velocities",
+    "is_timely",
+    "is_trustworthy",
+    "quantum",
+    "unlike_velocities",
+    "velocity_lag",
+]
+
+#: [s] A measured velocity that lags more than this is not used by "auto".
+LATE = 0.02
+#: A channel of fewer steps than this over its range is uninformative.
+COARSE = 100
+_LONGEST = 0.3  # [s] lags are sought up to this
+_GAP = 5  # a step longer than this many median steps is a gap
+_STRETCH = 0.1  # [s] motion is compared over stretches this long: noise averages out
+_UNLIKE = 0.5  # correlation below which a velocity is not that of its position
+_MOVED, _SPEED = 1e-3, 0.02  # [rad or m], [rad/s or m/s] less than this is standing still
+
+
+def is_trustworthy(log: Log, stated: float = 0.0) -> bool:
+    """Return whether the measured velocity of every joint is timely, fine and its position's own.
+
+    Args:
+        log: A log with measured velocities.
+        stated: How late they are said to be, which is corrected [s].
+    """
+    return is_timely(log, stated) and not coarse_velocities(log) and not unlike_velocities(log)
+
+
+def is_timely(log: Log, stated: float = 0.0) -> bool:
+    """Return whether the measured velocities lag their positions by less than 20 ms.
+
+    Args:
+        log: A log with measured velocities.
+        stated: How late they are said to be, which is corrected [s].
+    """
+    return velocity_lag(log) - stated < LATE
+
+
+def velocity_lag(log: Log) -> float:
+    """Return how late the measured velocity is against the derivative of the position [s].
+
+    The delay minimises the distance between the measured velocity and the delayed derivative,
+    summed over the joints; found on a uniform grid in stretches without gaps, and refined by a
+    parabola. It is positive if the measured velocity is late, and 0 if the joints stand still.
+
+    Args:
+        log: A log with measured velocities.
+
+    Raises:
+        DataError: If the log has no velocities.
+    """
+    v = _measured(log)
+    step = float(np.median(np.diff(log.t)))
+    q = np.unwrap(log.q, axis=0)
+    parts = np.split(np.arange(len(log.t)), np.flatnonzero(np.diff(log.t) > _GAP * step) + 1)
+    longest = min(int(_LONGEST / step) + 1, max(map(len, parts)) // 4)
+    shifts = np.arange(-longest, longest + 1)
+    total = np.zeros(len(shifts))
+    for part in (rows for rows in parts if len(rows) >= max(4 * longest, 2)):
+        t = log.t[part]
+        grid = np.arange(t[0], t[-1], step)
+        slope = np.gradient([np.interp(grid, t, x) for x in q[part].T], step, axis=1)
+        late = np.array([np.interp(grid, t, x) for x in v[part].T])  # (n, N)
+        total += [len(grid) * _distance(slope, late, int(shift)) for shift in shifts]
+    best = int(np.argmin(total))
+    if not v.any() or not 0 < best < len(shifts) - 1:
+        return 0.0
+    left, middle, right = total[best - 1 : best + 2]
+    curvature = left - 2 * middle + right
+    fraction = 0.5 * (left - right) / curvature if curvature > 0 else 0.0
+    return float((shifts[best] + fraction) * step)
+
+
+def coarse_velocities(log: Log) -> tuple[str, ...]:
+    """Return the joints whose measured velocity moves in few steps, as that of an encoder does.
+
+    Args:
+        log: A log with measured velocities.
+    """
+    return tuple(
+        joint
+        for joint, x in zip(log.joints, _measured(log).T, strict=True)
+        if 0 < np.ptp(x) < COARSE * quantum(x)
+    )
+
+
+def unlike_velocities(log: Log) -> dict[str, float]:
+    """Return the joints whose measured velocity is not that of their position, however late.
+
+    Args:
+        log: A log with measured velocities.
+
+    Returns:
+        The correlation of each with d(q)/dt at the lag where it is largest, by joint [-].
+    """
+    v, dt = _measured(log), np.diff(log.t)[:, None]
+    median = float(np.median(dt))
+    usual = dt < _GAP * median
+    length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
+    moved = _means(np.where(usual, np.diff(np.unwrap(log.q, axis=0), axis=0), 0.0), length)
+    swept = _means(np.where(usual, dt * (v[1:] + v[:-1]) / 2, 0.0), length)
+    reach = round(_LONGEST / median)
+    shifts = [k for k in range(-reach, reach + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]
+    found = {}
+    for j, joint in enumerate(log.joints):
+        speed = float(np.sqrt(np.mean(moved[:, j] ** 2))) / median
+        if np.ptp(log.q[:, j]) < _MOVED or speed < _SPEED or np.ptp(v[:, j]) == 0:
+            continue
+        alike = max(_alike(moved[:, j], swept[:, j], k) for k in [0, *shifts])
+        if alike < _UNLIKE:
+            found[joint] = alike
+    return found
+
+
+def quantum(x: Array) -> float:
+    """Return the step that all values are multiples of, 0 if there is none.
+
+    Args:
+        x: A channel, shape (N,).
+    """
+    levels = np.unique(x)
+    if len(levels) < 3 or len(levels) > 0.5 * len(x):
+        return 0.0
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-9 * np.ptp(x)]
+    if len(steps) == 0:
+        return 0.0
+    smallest = float(np.quantile(steps, 0.1))
+    counts = np.diff(levels)[:1000] / smallest
+    return smallest if np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95 else 0.0
+
+
+def _measured(log: Log) -> Array:
+    if log.v is None:
+        raise DataError(f"{log.path or 'log'} has no measured velocity")
+    return log.v
+
+
+def _means(steps: Array, length: int) -> Array:
+    """Return the means over each stretch of so many consecutive rows."""
+    total = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+    means: Array = (total[length:] - total[:-length]) / length
+    return means
+
+
+def _alike(moved: Array, swept: Array, shift: int) -> float:
+    """Return the correlation of one with the other so many rows later, whatever its sign."""
+    n = len(moved)
+    late, early = slice(max(shift, 0), n + min(shift, 0)), slice(max(-shift, 0), n - max(shift, 0))
+    a, b = moved[early], swept[late]  # not centred: a joint may turn at one speed
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return abs(float(a @ b)) / size if size > 0 else 0.0
+
+
+def _distance(slope: Array, v: Array, shift: int) -> float:
+    """Return the mean square of v - slope delayed by shift samples."""
+    n = v.shape[1]
+    late, early = slice(max(shift, 0), n + min(shift, 0)), slice(max(-shift, 0), n - max(shift, 0))
+    return float(np.mean((v[:, late] - slope[:, early]) ** 2))

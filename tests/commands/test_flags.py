@@ -1,0 +1,45 @@
+"""Flags state what the keys of a job file state."""
+
+import argparse
+
+import pytest
+
+from robotid.commands.flags import add_flags, job_from_flags
+from robotid.exceptions import SettingsError
+from robotid.logs.settings import SignalSettings
+
+
+def job(command, *words):
+    parser = argparse.ArgumentParser()
+    add_flags(parser, command)
+    return job_from_flags(parser.parse_args(["robot.urdf", "run.csv", *words]))
+
+
+def test_every_setting_of_the_signals_has_a_flag():
+    words = {
+        "rate": "200", "cutoff": "5", "order": "2", "velocity": "differentiated",
+        "acceleration": "measured", "trim": "0.5", "min_velocity": "0.1", "friction_band": "0.05",
+        "max_gap": "0.3", "torque_delay": "-0.005", "velocity_delay": "0.01",
+    }  # fmt: skip
+    flags = [x for name, word in words.items() for x in (f"--{name.replace('_', '-')}", word)]
+    stated = {name: type(getattr(SignalSettings(), name))(word) for name, word in words.items()
+              if name not in ("rate", "max_gap")}  # fmt: skip
+    assert set(words) == set(SignalSettings.paths())
+    for command in ("identify", "doctor"):
+        found = job(command, *flags).signals
+        assert found == SignalSettings(rate=200.0, max_gap=0.3, **stated)
+
+
+def test_a_flag_that_a_command_has_no_use_for_is_not_there(capsys):
+    with pytest.raises(SystemExit):
+        job("track", "--trim", "0.5")
+    assert "--trim" in capsys.readouterr().err
+    assert job("track", "--min-velocity", "0.1").signals.min_velocity == 0.1
+
+
+def test_a_flag_of_zero_is_a_flag_beside_a_job_file(tmp_path):
+    parser = argparse.ArgumentParser()
+    add_flags(parser, "identify")
+    options = parser.parse_args([str(tmp_path / "job.toml"), "--min-velocity", "0"])
+    with pytest.raises(SettingsError, match="leave out"):
+        job_from_flags(options)

@@ -1,0 +1,60 @@
+"""Parts of the URDF that were not mounted, loads that only the validation log has."""
+
+import numpy as np
+import pytest
+from helpers.corruptions import NOISE, clean_log, robot
+
+from robotid.doctor.diagnosis import diagnose
+from robotid.logs.settings import SignalSettings
+from robotid.robot.bodies import link_places
+from robotid.simulation.closed_loop import another_robot, simulate
+from robotid.simulation.motions import random_fourier
+
+CODES = {"unmounted_part", "payload_change", "payload"}
+
+
+def loud(model, fitted, kept=()):
+    found = diagnose(model, [fitted], list(kept), SignalSettings())
+    return [f for f in found if f.code in CODES and f.severity != "note"]
+
+
+def recorded(model, seed, without=0.0):
+    """Simulate an arm whose links are 10 to 30 % off, without some parameters of the last one."""
+    rng = np.random.default_rng(seed)
+    size, pi = model.layout.n_inertial, model.standard_parameters()
+    links = pi[:size].reshape(-1, 10)
+    links[-1] -= without
+    links *= 1 + rng.uniform(0.1, 0.3, (len(links), 1)) * rng.choice([-1, 1], (len(links), 1))
+    pi[size:] = [rng.uniform(*term.usual) for _, term in model.layout.drive_parameters]
+    motion = random_fourier(model, rng, period=5.0)
+    return simulate(model, pi, motion, rate=100.0, duration=10.0, rng=rng, noise=NOISE)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_hand_that_was_not_mounted_is_named(seed):
+    panda = robot("panda")
+    parts = [p for p in link_places(panda) if p.body == 6 and p.role != "moved"]
+    hand = np.sum([p.parameters for p in parts], axis=0)
+    (found,) = loud(panda, recorded(panda, seed, hand))
+    assert (found.code, found.where) == ("unmounted_part", "log: panda_link7")
+    assert found.evidence["mass"] == pytest.approx(0.76)
+    assert "without panda_hand, panda_leftfinger, panda_rightfinger" in found.message
+    assert loud(panda, recorded(panda, seed)) == []
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda", "tiago"])
+def test_a_load_in_the_validation_log_only_is_weighed(name):
+    model, size = robot(name), robot(name).layout.n_inertial
+    pi = another_robot(model, np.random.default_rng(0))
+    fitted, other = (clean_log(model, seed, pi=pi, duration=10.0) for seed in (0, 1))
+    assert loud(model, fitted, [other]) == []
+    loaded = pi.copy()
+    last = loaded[:size].reshape(-1, 10)[-1]
+    last += np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
+    kept = clean_log(model, 2, pi=loaded, duration=10.0)
+    (change,) = [f for f in loud(model, fitted, [kept]) if f.code == "payload_change"]
+    assert change.where == f"run.csv: {model.layout.bodies[-1]}"
+    assert change.evidence["mass"] == pytest.approx(1.0, abs=3 * change.evidence["std_error"])
+    assert change.evidence["std_error"] < 0.3
+    (change,) = [f for f in loud(model, kept, [fitted]) if f.code == "payload_change"]
+    assert change.evidence["mass"] == pytest.approx(-1.0, abs=3 * change.evidence["std_error"])

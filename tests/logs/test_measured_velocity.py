@@ -1,0 +1,59 @@
+"""What measured velocities are worth: how late, how coarse, whether of their positions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotid.logs.data import Log
+from robotid.logs.measured_velocity import (
+    coarse_velocities,
+    is_trustworthy,
+    unlike_velocities,
+    velocity_lag,
+)
+
+T = np.arange(0, 10, 0.01)
+
+
+def log_of_two(t=T):
+    q = np.column_stack([np.sin(2 * t), np.cos(3 * t)])
+    v = np.column_stack([2 * np.cos(2 * t), -3 * np.sin(3 * t)])
+    return Log(t, q, np.ones_like(q), ("a", "b"), v=v)
+
+
+def test_a_gap_or_a_clock_that_was_set_costs_neither_memory_nor_the_lag():
+    log = log_of_two()
+    late = replace(log, v=np.column_stack([np.interp(log.t - 0.03, log.t, x) for x in log.v.T]))
+    jumped = replace(late, t=late.t + np.where(late.t > 5, 1e9, 0.0))
+    assert velocity_lag(jumped) == pytest.approx(0.03, abs=2e-3)
+
+
+def test_full_turns_are_no_motion():
+    log = log_of_two()
+    far = np.column_stack([3 * T, np.cos(3 * T)])
+    turned = replace(log, q=(far + np.pi) % (2 * np.pi) - np.pi, v=np.gradient(far, T, axis=0))
+    assert abs(velocity_lag(turned)) < 1e-3
+    assert unlike_velocities(turned) == {}
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.1, 0.2])
+def test_a_late_velocity_is_its_positions_and_noise_is_not(lag):
+    log = log_of_two()
+    late = np.column_stack([np.interp(log.t - lag, log.t, x) for x in log.v.T])
+    assert unlike_velocities(replace(log, v=late)) == {}
+    late[:, 1] = np.random.default_rng(0).standard_normal(len(T))
+    (joint, alike), *others = unlike_velocities(replace(log, v=late)).items()
+    assert (joint, others) == ("b", [])
+    assert alike < 0.5
+    assert not is_trustworthy(replace(log, v=late))
+
+
+def test_a_velocity_of_few_steps_is_coarse():
+    log = log_of_two()
+    assert coarse_velocities(log) == ()
+    v = log.v.copy()
+    v[:, 0] = np.round(v[:, 0] / 0.05) * 0.05  # 80 of them
+    assert coarse_velocities(replace(log, v=v)) == ("a",)
+    assert not is_trustworthy(replace(log, v=v))
+    assert is_trustworthy(log)
