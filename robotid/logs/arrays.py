@@ -53,9 +53,13 @@ class Hdf5Format(WritableFormat):
         return _table_of_arrays(path.name, _datasets(path, is_matlab=False), source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
-        with _h5py("writing HDF5").File(path, "w") as file:
+        h5py = _h5py("writing HDF5")
+        # in memory first: on a full disk HDF5 itself ends the process
+        with h5py.File(path, "w", driver="core", backing_store=False) as file:
             for name, values in table.items():
                 file.create_dataset(name, data=values, compression="gzip", shuffle=True)
+            file.flush()
+            path.write_bytes(file.id.get_file_image())
 
 
 class MatFormat(WritableFormat):

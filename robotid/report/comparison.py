@@ -6,7 +6,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from robotid._files import write_text
+from robotid._files import check_file, write_text
 from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
@@ -80,7 +80,9 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
+        SettingsError: If the target is a folder.
     """
+    check_file(Path(target))
     content = compare_results(paths)
     write_text(_page(content), target)
     return content
