@@ -16,11 +16,18 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
+def replace(folder, *files, error=None):
+    with folder_beside(folder) as beside:
+        for name in files:
+            (beside / name).write_text("new")
+        if error is not None:
+            raise error
+
+
 def test_after_an_error_every_file_is_as_it_was(tmp_path):
     (tmp_path / "a").write_text("old")
-    with pytest.raises(ZeroDivisionError), folder_beside(tmp_path) as beside:
-        (beside / "a").write_text("new")
-        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError):
+        replace(tmp_path, "a", error=ZeroDivisionError())
     assert names(tmp_path) == ["a"]
     assert (tmp_path / "a").read_text() == "old"
 
@@ -29,18 +36,17 @@ def test_after_an_error_every_file_is_as_it_was(tmp_path):
 def test_a_replacement_that_fails_half_way_is_undone(tmp_path, monkeypatch, failing):
     for name in "ac":
         (tmp_path / name).write_text("old")
-    replace, calls = os.replace, []
+    move, calls = os.replace, []
 
     def fail_once(source, target):
         calls.append(source)
         if len(calls) == failing:
             raise KeyboardInterrupt
-        replace(source, target)
+        move(source, target)
 
     monkeypatch.setattr(os, "replace", fail_once)
-    with pytest.raises(KeyboardInterrupt), folder_beside(tmp_path) as beside:
-        for name in "abc":
-            (beside / name).write_text("new")
+    with pytest.raises(KeyboardInterrupt):
+        replace(tmp_path, *"abc")
     assert names(tmp_path) == ["a", "c"]
     assert [(tmp_path / name).read_text() for name in "ac"] == ["old", "old"]
 
@@ -48,9 +54,7 @@ def test_a_replacement_that_fails_half_way_is_undone(tmp_path, monkeypatch, fail
 def test_files_of_a_folder_replace_those_of_their_names(tmp_path):
     (tmp_path / "a").write_text("old")
     (tmp_path / "other").write_text("kept")
-    with folder_beside(tmp_path) as beside:
-        (beside / "a").write_text("new")
-        (beside / "b").write_text("new")
+    replace(tmp_path, "a", "b")
     assert names(tmp_path) == ["a", "b", "other"]
     assert (tmp_path / "a").read_text() == "new"
 
@@ -59,9 +63,8 @@ def test_a_folder_in_the_place_of_a_file_is_refused_and_nothing_is_mixed(tmp_pat
     (tmp_path / "a").write_text("old")
     (tmp_path / "b").mkdir()
     message = r"b' is a folder, wanted a file to write; remove it, or name another"
-    with pytest.raises(SettingsError, match=message), folder_beside(tmp_path) as beside:
-        (beside / "a").write_text("new")
-        (beside / "b").write_text("new")
+    with pytest.raises(SettingsError, match=message):
+        replace(tmp_path, "a", "b")
     assert (tmp_path / "a").read_text() == "old"
     assert names(tmp_path) == ["a", "b"]
     with pytest.raises(SettingsError, match=message):
@@ -75,7 +78,7 @@ def test_places_where_nothing_can_be_written_are_refused(tmp_path):
     with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
         check_folder(tmp_path / "file" / "below")
     check_folder(tmp_path / "not" / "yet", ["result.json"])
-    with pytest.raises(DataError, match="there is no folder '.*not' to write x in"):
+    with pytest.raises(DataError, match=r"there is no folder '.*not' to write x in"):
         write_text("", tmp_path / "not" / "x")
 
 
@@ -104,7 +107,7 @@ def test_a_pipe_gets_the_content_and_a_reader_that_leaves_is_named(tmp_path):
 
     reader = threading.Thread(target=leave)
     reader.start()
-    with pytest.raises(DataError, match="the reader of '.*pipe' left before its end"):
+    with pytest.raises(DataError, match=r"the reader of '.*pipe' left before its end"):
         write_text("page" * 2**20, pipe)
     reader.join()
 

@@ -18,10 +18,8 @@ from robotid.robot.model import RobotModel
 URDF = str(ROOT / "urdf" / "planar_2r.urdf")
 UR5 = str(example_urdf("ur5_robot.urdf"))
 OUTPUTS = [
-    "result.json",
-    "report.html",
-    "planar_2r.identified.urdf",
-    "planar_2r.identified.drive.json",
+    *("result.json", "report.html"),
+    *("planar_2r.identified.urdf", "planar_2r.identified.drive.json"),
 ]
 
 
