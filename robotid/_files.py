@@ -18,6 +18,7 @@ __all__ = [
     "check_folder",
     "file_sha256",
     "folder_beside",
+    "read_json",
     "write_json",
     "write_text",
     "written_whole",
@@ -184,6 +185,35 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
     write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
 
 
+def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
+    """Return the content of a JSON file: finite numbers, text that UTF-8 can hold, few levels.
+
+    Args:
+        path: The file.
+        what: What it is, for errors.
+
+    Raises:
+        DataError: If it is missing or holds something else.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(f"there is no {what} {str(source)!r}")
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+        json.dumps(content, allow_nan=False, ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{source.name} is not JSON: {str(error)[:200]}") from error
+    inside = [content]
+    for _ in range(_DEEPEST):
+        lists = [
+            x.values() if isinstance(x, dict) else x for x in inside if isinstance(x, dict | list)
+        ]
+        inside = [x for entries in lists for x in entries]
+    if inside:
+        raise DataError(f"{source.name} is nested deeper than {_DEEPEST} levels: it is no {what}")
+    return content
+
+
 def file_sha256(path: str | Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; of a folder, that of its files' hashes.
 
@@ -197,6 +227,9 @@ def file_sha256(path: str | Path) -> str:
         return hashlib.sha256(listing.encode()).hexdigest()
     about = source.stat()
     return _sha256(source.resolve(), about.st_size, about.st_mtime_ns, about.st_ino)
+
+
+_DEEPEST = 40  # levels of tables and lists
 
 
 @lru_cache(maxsize=1024)

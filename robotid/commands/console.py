@@ -282,7 +282,7 @@ def _print_comparison(content: dict[str, Any]) -> None:
     print(f"\nfitted recordings of each, error %{alike}")
     _print_columns(content["fitted"], labels)
     print("\nbase parameters; last columns: difference to A over the combined standard error")
-    width = max(len(entry["name"]) for entry in content["base_parameters"])
+    width = max((len(entry["name"]) for entry in content["base_parameters"]), default=0)
     heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
     print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
     for entry in content["base_parameters"]:
@@ -301,7 +301,7 @@ def _print_comparison(content: dict[str, Any]) -> None:
 def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
     from robotid.identification.summary import cell
 
-    width = max(len(entry["joint"]) for entry in per_joint)
+    width = max((len(entry["joint"]) for entry in per_joint), default=0)
     print(f"  {'joint':{width}}" + "".join(f"{label:>9}" for label in labels))
     for entry in per_joint:
         cells = "".join(cell(value, 9) for value in entry["relative_error_pct"])

@@ -123,3 +123,9 @@ class LogSource(Settings):
         "was recorded",
         among=("header", "log"),
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for joint, name in self.joints.items():
+            if not isinstance(name, str):
+                raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")
