@@ -3,7 +3,7 @@
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -289,7 +289,8 @@ def _mat_variables(path: Path) -> dict[str, _Entry]:
             if isinstance(value, dict):
                 visit(f"{prefix}{name}/", value)
             elif not name.startswith("__"):
-                entries[prefix + name] = _entry(np.asarray(value))
+                with suppress(ValueError):  # of cells of several shapes, which are no array
+                    entries[prefix + name] = _entry(np.asarray(value))
 
     visit("", variables)
     return entries

@@ -19,6 +19,7 @@ from robotid.logs.smoothing import Stretch, process_stretches, too_short
 
 __all__ = ["decide", "process", "resolve", "turns_note", "unwrap", "velocity_lag"]
 
+_HOLE = 100  # median steps: across a longer one no lag is sought
 _LATE = 0.02  # [s] a measured velocity that lags more than this is not used by "auto"
 _GAP_STEPS = 2.5  # a step longer than this many median steps may be a gap
 _GAP_CYCLES = 0.25  # ... if it is also longer than this share of the filter's period
@@ -132,7 +133,7 @@ def velocity_lag(log: Log) -> float:
 
     The delay minimises the distance between the measured velocity and the delayed derivative,
     summed over the joints; found on a uniform grid and refined by a parabola. It is positive if
-    the measured velocity is late, and 0 if the joints stand still.
+    the measured velocity is late, and 0 if the joints stand still or there are too few rows.
 
     Args:
         log: A log with measured velocities.
@@ -143,7 +144,12 @@ def velocity_lag(log: Log) -> float:
     if log.v is None:
         raise DataError(f"{log.path or 'log'} has no measured velocity")
     step = float(np.median(np.diff(log.t)))
-    grid = np.arange(log.t[0], log.t[-1], step)
+    # the longest stretch without a hole: the grid must not grow with a jump of the clock
+    edges = [0, *(np.flatnonzero(np.diff(log.t) > _HOLE * step) + 1), len(log.t)]
+    first, stop = max(pairwise(edges), key=lambda edge: edge[1] - edge[0])
+    grid = np.arange(log.t[first], log.t[stop - 1], step)
+    if len(grid) < 8:
+        return 0.0
     q = np.array([np.interp(grid, log.t, column) for column in log.q.T])  # (n, N)
     v = np.array([np.interp(grid, log.t, column) for column in log.v.T])
     slope = np.gradient(q, step, axis=1)
