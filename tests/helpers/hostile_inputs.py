@@ -1,9 +1,10 @@
 """Hostile inputs of every kind, and what is done with each: a traceback is a failure.
 
-``tests/test_hostile_inputs.py`` tries some of each kind, ``benchmarks/fuzz.py`` thousands.
+``tests/test_hostile_inputs.py`` tries some of each kind, ``benchmarks/bench_fuzz.py`` thousands.
 """
 
 import contextlib
+import copy
 import io
 import json
 import tempfile
@@ -18,11 +19,11 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import scipy.io
+from hypothesis import strategies as st
+
 from helpers.paths import URDF as URDF_FOLDER
 from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
 from helpers.synthetic import exact_log, truth
-from hypothesis import strategies as st
-
 from robotid.cli import main
 from robotid.commands.job import Job
 from robotid.identification.settings import ESTIMATORS
@@ -45,13 +46,16 @@ def obey(*words, out=None):
     """
     before = None if out is None else files_in(out)
     shown, error = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(error):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                code = main([str(word) for word in words])
-            except SystemExit as end:  # of argparse
-                code = end.code
+    with (
+        contextlib.redirect_stdout(shown),
+        contextlib.redirect_stderr(error),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as end:  # of argparse
+            code = end.code
     assert code in (0, 1, 2), f"exit code {code}"
     assert "Traceback" not in error.getvalue()
     assert len(error.getvalue()) < 20_000, "an error of pages"
@@ -123,8 +127,23 @@ def good_file(name):
         return path.read_bytes()
 
 
-SPECIAL = [b"\0", b"\xff", b"\n", b",", b'"', b"nan", b"1e308", b"\0\0\0\0", b"\xff\xff\xff\xff",
-           b"\xff\xff\xff\x7f", b"\x80", b"-", b"'", b"(", b"9" * 30]  # fmt: skip
+SPECIAL = [
+    b"\0",
+    b"\xff",
+    b"\n",
+    b",",
+    b'"',
+    b"nan",
+    b"1e308",
+    b"\0\0\0\0",
+    b"\xff\xff\xff\xff",
+    b"\xff\xff\xff\x7f",
+    b"\x80",
+    b"-",
+    b"'",
+    b"(",
+    b"9" * 30,
+]
 
 
 @st.composite
@@ -159,8 +178,29 @@ def write_bytes(content, path):
 
 # --- tables of hostile values --------------------------------------------------------------------
 
-NUMBERS = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-308, 1e-30, 1e30, 1e150, 1e300, 1e308, -1e308,
-           np.nan, np.inf, -np.inf, 1e6, 1.7e9, 1.7e18, 2**53, np.pi, 360.0]  # fmt: skip
+NUMBERS = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    1e-320,
+    1e-308,
+    1e-30,
+    1e30,
+    1e150,
+    1e300,
+    1e308,
+    -1e308,
+    np.nan,
+    np.inf,
+    -np.inf,
+    1e6,
+    1.7e9,
+    1.7e18,
+    2**53,
+    np.pi,
+    360.0,
+]
 numbers = st.sampled_from(NUMBERS) | st.floats()
 
 
@@ -195,14 +235,33 @@ def columns(draw, longest=40):
     return table
 
 
-names = st.sampled_from(["", " ", "t", "time", "q_", "_", "q_joint_1", "tau_joint_3", "nan", "x" * 300,
-                         "time,t", '"', "é", "\U0001f916", "a/b", "#x", "current_joint_1"])  # fmt: skip
+names = st.sampled_from(
+    [
+        "",
+        " ",
+        "t",
+        "time",
+        "q_",
+        "_",
+        "q_joint_1",
+        "tau_joint_3",
+        "nan",
+        "x" * 300,
+        "time,t",
+        '"',
+        "é",
+        "\U0001f916",
+        "a/b",
+        "#x",
+        "current_joint_1",
+    ]
+)
 
 
 def write_csv(table, path):
     rows = [
         ",".join(table),
-        *(",".join(map(repr, map(float, row))) for row in zip(*table.values())),
+        *(",".join(map(repr, map(float, row))) for row in zip(*table.values(), strict=True)),
     ]
     path.write_text("\n".join(rows), encoding="utf-8")
 
@@ -229,12 +288,24 @@ def write_parquet(table, path):
 
 #: What stands where an array of numbers should.
 ODD = [
-    np.array(["a", "b"]), np.array(b"\xff\xfe"), np.array([b"\xff", b"joint_1"]), np.array(1.0),
-    np.zeros((2, 3, 4)), np.zeros((0, 3)), np.zeros(0), np.array([1j, 2j]), np.array([True, False]),
-    np.zeros(3, dtype=[("a", "f8"), ("b", "U3")]), np.array([0, 2**63], dtype=np.uint64),
-    np.array(["2020-01-01"], dtype="datetime64[D]"), np.full((60, 5), 1e308), np.zeros((60, 1)),
-    np.array(["joint_1", "joint_2"]), np.array(["joint_1"] * 3), np.arange(60.0).reshape(1, 60),
-]  # fmt: skip
+    np.array(["a", "b"]),
+    np.array(b"\xff\xfe"),
+    np.array([b"\xff", b"joint_1"]),
+    np.array(1.0),
+    np.zeros((2, 3, 4)),
+    np.zeros((0, 3)),
+    np.zeros(0),
+    np.array([1j, 2j]),
+    np.array([True, False]),
+    np.zeros(3, dtype=[("a", "f8"), ("b", "U3")]),
+    np.array([0, 2**63], dtype=np.uint64),
+    np.array(["2020-01-01"], dtype="datetime64[D]"),
+    np.full((60, 5), 1e308),
+    np.zeros((60, 1)),
+    np.array(["joint_1", "joint_2"]),
+    np.array(["joint_1"] * 3),
+    np.arange(60.0).reshape(1, 60),
+]
 odd = st.sampled_from(ODD)
 keys = st.sampled_from(
     ["time", "t", "q", "tau", "joints", "joint_names", "dq", "a/time", "a/q", "#"]
@@ -335,16 +406,21 @@ urdf = "{URDF}"
 log = "fit.csv"
 """
 plain = st.one_of(
-    st.sampled_from(["", "x", "joint_1", "a\0b", "\U0001f916", "auto", "none", "x" * 3000, "$X", "../x"]),
+    st.sampled_from(
+        ["", "x", "joint_1", "a\0b", "\U0001f916", "auto", "none", "x" * 3000, "$X", "../x"]
+    ),
     st.sampled_from([0, 1, -1, 2, 3, 10**9, 10**40, 2**63, 0.5, 1e-320, 1e308, -1e308, 1e30, 1e6]),
     st.sampled_from([float("nan"), float("inf"), -float("inf"), True, False]),
-    st.integers(), st.floats(), st.text(max_size=8).filter(lambda text: text.isprintable()),
-)  # fmt: skip
+    st.integers(),
+    st.floats(),
+    st.text(max_size=8).filter(lambda text: text.isprintable()),
+)
 words = st.sampled_from([*JOINTS, "link_1", "link_2", "torque_scale", "name", "ratios", "x", ""])
 values = st.recursive(
-    plain, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(words, inner, max_size=3),
+    plain,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(words, inner, max_size=3),
     max_leaves=6,
-)  # fmt: skip
+)
 
 
 def _paths(table, prefix=()):
@@ -407,12 +483,56 @@ def run_job_file(text, folder):
     obey("identify", path, "--out", out, out=out)
 
 
-flags = st.sampled_from(["--rate", "--cutoff", "--friction", "--joints", "--lock", "--gain", "--ignore",
-                         "--estimator", "--time-unit", "--angle-unit", "--topic", "--effort", "--stamp",
-                         "--workers", "--serve", "--speed", "--json", "--resume"])  # fmt: skip
-arguments = st.sampled_from(["", "x", "0", "-1", "1", "nan", "inf", "1e308", "1e-308", "99999", "false",
-                             "joint_1=nan", "joint_1=1e308", "joint_1", "joint_1,joint_1", "=", ",", "1_0",
-                             "consistent", "wls", "ms", "deg", "٣", "a=b=c"])  # fmt: skip
+flags = st.sampled_from(
+    [
+        "--rate",
+        "--cutoff",
+        "--friction",
+        "--joints",
+        "--lock",
+        "--gain",
+        "--ignore",
+        "--estimator",
+        "--time-unit",
+        "--angle-unit",
+        "--topic",
+        "--effort",
+        "--stamp",
+        "--workers",
+        "--serve",
+        "--speed",
+        "--json",
+        "--resume",
+    ]
+)
+arguments = st.sampled_from(
+    [
+        "",
+        "x",
+        "0",
+        "-1",
+        "1",
+        "nan",
+        "inf",
+        "1e308",
+        "1e-308",
+        "99999",
+        "false",
+        "joint_1=nan",
+        "joint_1=1e308",
+        "joint_1",
+        "joint_1,joint_1",
+        "=",
+        ",",
+        "1_0",
+        "consistent",
+        "wls",
+        "ms",
+        "deg",
+        "٣",
+        "a=b=c",
+    ]
+)
 command_lines = st.tuples(
     st.sampled_from(["identify", "doctor", "track", "convert", "inspect", "compare", "validate"]),
     st.lists(st.tuples(flags, arguments), min_size=1, max_size=3),
@@ -423,8 +543,11 @@ def run_flags(example, folder):
     command, given = example
     path, out = folder / "fit.csv", folder / "out"
     write_log(good_log(200), path)
-    flat = [word for flag, argument in given for word in ((flag,) if flag in ("--json", "--resume")
-                                                          else (flag, argument))]  # fmt: skip
+    flat = [
+        word
+        for flag, argument in given
+        for word in ((flag,) if flag in ("--json", "--resume") else (flag, argument))
+    ]
     if command == "track" and "--serve" in flat:
         flat += ["--serve", "-5"]  # so that it ends
     own = {"convert": [path, folder / "out.csv"]}.get(command, [URDF, path])
@@ -478,7 +601,7 @@ def results(draw):
     for _ in range(draw(st.integers(1, 3))):
         path = draw(st.sampled_from(draw(st.sampled_from(result_places()))))
         new, action = (
-            draw(replacements),
+            copy.deepcopy(draw(replacements)),
             draw(st.sampled_from(["replace", "replace", "drop", "add"])),
         )
         try:
@@ -513,8 +636,15 @@ def run_result(text, folder):
     obey("validate", path, good / "fit.csv")
     obey("compare", path, good / "result.json", "--out", page, out=page)
     obey("compare", good / "result.json", path, "--json")
-    obey("replay", URDF, good / "fit.csv", path, "--html", folder / "replay.html",
-         out=folder / "replay.html")  # fmt: skip
+    obey(
+        "replay",
+        URDF,
+        good / "fit.csv",
+        path,
+        "--html",
+        folder / "replay.html",
+        out=folder / "replay.html",
+    )
     for made in (page, folder / "replay.html"):
         if made.exists():
             assert "<script>alert" not in made.read_text(encoding="utf-8"), "markup is not escaped"
@@ -522,15 +652,35 @@ def run_result(text, folder):
 
 # --- all of them ---------------------------------------------------------------------------------
 
-READERS = {".csv": write_csv, ".npz": write_npz, ".mat": write_mat, ".h5": write_hdf5,
-           ".parquet": write_parquet}  # fmt: skip
-FILES = ["log.csv", "log.parquet", "log.npz", "plain.npz", "log.mat", "plain.mat", "log.h5", "plain.h5",
-         "log.mcap", "log.bag", "log.db3"]  # fmt: skip
+READERS = {
+    ".csv": write_csv,
+    ".npz": write_npz,
+    ".mat": write_mat,
+    ".h5": write_hdf5,
+    ".parquet": write_parquet,
+}
+FILES = [
+    "log.csv",
+    "log.parquet",
+    "log.npz",
+    "plain.npz",
+    "log.mat",
+    "plain.mat",
+    "log.h5",
+    "plain.h5",
+    "log.mcap",
+    "log.bag",
+    "log.db3",
+]
 
 #: By name: a strategy of examples, and what is done with one in an empty folder.
 KINDS = {
     **{
-        f"bytes of {name}": (spoilt, (name,), partial(read_log_file, write_bytes, Path(name).suffix))
+        f"bytes of {name}": (
+            spoilt,
+            (name,),
+            partial(read_log_file, write_bytes, Path(name).suffix),
+        )
         for name in FILES
     },
     **{
@@ -541,11 +691,12 @@ KINDS = {
     "arrays in .npz": (lambda: arrays, (), partial(read_log_file, write_npz, ".npz")),
     "structure of .h5": (lambda: odd_hdf5, (), partial(read_log_file, write_odd_hdf5, ".h5")),
     "structure of .mat": (
-        lambda: st.dictionaries(keys, cells, max_size=4), (),
+        lambda: st.dictionaries(keys, cells, max_size=4),
+        (),
         partial(read_log_file, write_odd_mat, ".mat"),
     ),
     "values, identified": (columns, (60,), partial(identify_from, write_csv, ".csv")),
     "job file": (jobs, (), run_job_file),
     "flags": (lambda: command_lines, (), run_flags),
     "result.json": (results, (), run_result),
-}  # fmt: skip
+}

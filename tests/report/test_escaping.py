@@ -1,4 +1,4 @@
-"""Whatever a robot, a joint, a file or a verdict is called: it is text on every page, never markup."""
+"""Whatever a robot, a joint, a file or a verdict is called: on every page it is text, not markup."""
 
 import json
 from html import escape
