@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from helpers.hostile_inputs import KINDS
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-SLOW = ("values, identified", "job file", "flags", "result.json")
+SLOW = ("values, identified", "result.json")
 LONGEST = 60  # [s] for one input
 MEMORY = 8 * 2**30  # [bytes] of a process
 COUNTS = ["inputs", "tracebacks", "aborts", "half-written", "hangs"]

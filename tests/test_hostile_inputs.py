@@ -1,6 +1,7 @@
 """Whatever is in a file, a setting or a result: robotid says what is wrong, and never how it broke.
 
-Each kind of input is tried for a few seconds with a fixed seed; ``benchmarks/bench_fuzz.py`` tries more.
+Each kind of input is tried for a few seconds with a fixed seed; ``benchmarks/bench_fuzz.py`` tries
+thousands.
 """
 
 import tempfile

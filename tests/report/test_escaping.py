@@ -1,4 +1,4 @@
-"""Whatever a robot, a joint, a file or a verdict is called: on every page it is text, not markup."""
+"""Whatever a robot, a joint, a file or a verdict is called: on every page it is text."""
 
 import json
 from html import escape
