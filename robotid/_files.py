@@ -18,6 +18,7 @@ __all__ = [
     "check_folder",
     "file_sha256",
     "folder_beside",
+    "missing_file",
     "read_json",
     "write_json",
     "write_text",
@@ -185,6 +186,20 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
     write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
 
 
+def missing_file(path: Path, what: str) -> str:
+    """Return what is wrong with a path that is no file.
+
+    Args:
+        path: The path.
+        what: What it should be, as "log file".
+    """
+    if path.is_dir():
+        return f"{str(path)!r} is a folder, wanted a {what}"
+    if path.exists():
+        return f"{str(path)!r} is a pipe or a device, wanted a {what}; copy it to one"
+    return f"there is no {what} {str(path)!r}"
+
+
 def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
     """Return the content of a JSON file: finite numbers, text that UTF-8 can hold, few levels.
 
@@ -197,7 +212,7 @@ def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
     """
     source = Path(path)
     if not source.is_file():
-        raise DataError(f"there is no {what} {str(source)!r}")
+        raise DataError(missing_file(source, what))
     try:
         content = json.loads(source.read_text(encoding="utf-8"))
         json.dumps(content, allow_nan=False, ensure_ascii=False).encode()

@@ -1,6 +1,7 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -41,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
     """
     code = 0
+    if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with unheard_in_silence():
             code = _run(sys.argv[1:] if arguments is None else arguments)

@@ -7,6 +7,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robotid._files import missing_file
 from robotid._settings import Entries, Range, Settings, check_keys, setting
 from robotid.exceptions import SettingsError
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
@@ -209,7 +210,7 @@ def read_job(path: str | Path) -> Job:
     """
     source = Path(path)
     if not source.is_file():
-        raise SettingsError(f"there is no job file {str(source)!r}")
+        raise SettingsError(missing_file(source, "job file"))
     try:
         table = tomllib.loads(source.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:  # no UTF-8, numbers too long, tables too deep

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from robotid._files import written_whole
+from robotid._files import missing_file, written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
@@ -61,9 +61,7 @@ def _format_of(path: Path) -> Format:
             f"not {suffix!r}; convert it"
         )
     if not path.is_file():
-        if path.exists():
-            raise DataError(f"{str(path)!r} is a pipe or a device, wanted a file; copy it to one")
-        raise DataError(f"there is no log file {str(path)!r}")
+        raise DataError(missing_file(path, "log file"))
     return _FORMATS[suffix]
 
 

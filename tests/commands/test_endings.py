@@ -1,6 +1,7 @@
 """How a command ends that cannot go on: outputs in the way, readers that leave, full disks."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -99,3 +100,37 @@ def test_a_warning_that_nobody_reads_does_not_end_the_work(log, tmp_path):
     os.close(write)
     assert run.returncode == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(OUTPUTS)
+
+
+def test_names_that_the_standard_output_cannot_show_are_shown_otherwise(log, tmp_path):
+    here = tmp_path / "\u2713"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    words = ["convert", log, str(tmp_path / "\u2713.csv")]
+    run = robotid(*words, stdout=subprocess.PIPE, env=environment)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith(str(here).replace("\u2713", "\\u2713") + ".csv: 1000 samples")
+
+
+@pytest.mark.parametrize("command", ["doctor", "validate", "compare", "replay"])
+def test_pipes_and_folders_are_no_input(log, tmp_path, capsys, command):
+    os.mkfifo(tmp_path / "pipe.json")
+    os.mkfifo(tmp_path / "pipe.toml")
+    pipe = str(tmp_path / "pipe.json")
+    words = {
+        "doctor": [str(tmp_path / "pipe.toml")],
+        "validate": [pipe, log],
+        "compare": [pipe, pipe],
+        "replay": [URDF, log, pipe],
+    }
+    assert main([command, *words[command]]) in (1, 2)
+    assert "is a pipe or a device, wanted a" in capsys.readouterr().err
+
+
+def test_a_signal_ends_the_live_page(log, tmp_path):
+    words = [sys.executable, "-m", "robotid", "track", URDF, log, "--out", str(tmp_path)]
+    run = subprocess.Popen([*words, "--serve"], stderr=subprocess.PIPE, text=True)
+    assert run.stderr.readline().startswith("live: http://127.0.0.1:")
+    run.send_signal(signal.SIGTERM)
+    assert run.communicate(timeout=60)[1] == "robotid: interrupted\n"
+    assert run.returncode == 143
+    assert list(tmp_path.iterdir()) == []

@@ -134,8 +134,8 @@ def test_a_pipe_a_device_and_a_folder_are_no_log(tmp_path):
     (tmp_path / "run.h5").mkdir()
     (tmp_path / "null.csv").symlink_to("/dev/null")
     for name, message in [
-        ("run.csv", "run.csv' is a pipe or a device, wanted a file"),
-        ("null.csv", "null.csv' is a pipe or a device, wanted a file"),
+        ("run.csv", "run.csv' is a pipe or a device, wanted a log file"),
+        ("null.csv", "null.csv' is a pipe or a device, wanted a log file"),
         ("run.h5", "run.h5 is a folder without metadata.yaml"),
         ("none.csv", "there is no log file '.*none.csv'"),
     ]:
