@@ -80,8 +80,8 @@ def read_log_file(write, suffix, example, folder):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             write(example, path)
-    except (ValueError, TypeError, OverflowError, NotImplementedError, pyarrow.ArrowException):
-        return  # that library cannot write it: then nobody has such a file
+    except Exception:  # that library cannot write it: then nobody has such a file
+        return
     obey("doctor", URDF, path)
     obey("convert", path, folder / "out.csv", out=folder / "out.csv")
 
