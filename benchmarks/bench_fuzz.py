@@ -76,6 +76,8 @@ def tried(kind, count, number, verbose):
         if verbose:
             print("\n".join(f"{kind}: {line}" for line in run.stdout.splitlines()
                             if line.strip() != "inputs"), file=sys.stderr)  # fmt: skip
+        if run.returncode != 0 and not marks["inputs"]:
+            raise SystemExit(f"{kind}: no input could be made; see --verbose")
         if run.returncode != 0:
             found["aborts"] += 1
         elif not marks["inputs"]:

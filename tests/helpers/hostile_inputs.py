@@ -570,8 +570,8 @@ def run_flags(example, folder):
 def good_result():
     """Return a folder with a result, and the content of its result.json."""
     folder = Path(tempfile.mkdtemp(prefix="robotid-fuzz-"))
-    write_log(good_log(300), folder / "fit.csv")
-    obey("identify", URDF, folder / "fit.csv", "--out", folder)
+    write_log(good_log(2000), folder / "fit.csv")
+    assert 0 == obey("identify", URDF, folder / "fit.csv", "--out", folder)
     return folder, (folder / "result.json").read_text()
 
 
