@@ -571,7 +571,7 @@ def good_result():
     """Return a folder with a result, and the content of its result.json."""
     folder = Path(tempfile.mkdtemp(prefix="robotid-fuzz-"))
     write_log(good_log(2000), folder / "fit.csv")
-    assert 0 == obey("identify", URDF, folder / "fit.csv", "--out", folder)
+    assert obey("identify", URDF, folder / "fit.csv", "--out", folder) == 0
     return folder, (folder / "result.json").read_text()
 
 
