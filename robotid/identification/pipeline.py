@@ -1,21 +1,29 @@
 """identify(): from a model and logs to parameters and how far they can be trusted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.diagnosis import diagnose
+from robotid.doctor.motions import is_poorly_excited
+from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.estimators import WLS, Consistent, Estimate
 from robotid.estimators.determination import Determination, base_spread, determine
 from robotid.estimators.estimator import Weighing
-from robotid.exceptions import DataError, RankDeficientError
+from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
+from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
+from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
-from robotid.identification.prior import prior_spread
+from robotid.identification.misfit import settled
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -31,7 +39,16 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.survey import hold_log
-from robotid.identification.verdict import Doubt, Verdict, judge
+from robotid.identification.verdict import (
+    Doubt,
+    Verdict,
+    alarming,
+    check_ignored,
+    doubts_of,
+    judge,
+    refuted,
+)
+from robotid.identification.witness import Witness, call_witness
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
@@ -40,12 +57,18 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.prior import prior_spread
 
-__all__ = ["EstimatorSettings", "Identification", "conclude", "identify"]
+__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify"]
+
+#: What may have determined a standard parameter.
+SOURCES = ("data", "mixed", "prior", "bound")
 
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
-_FROM_PRIOR = 0.9  # ... and above this share, the prior's
+_FROM_PRIOR = 0.9  # ... and above this share, the prior's, if it stayed there
+_STAYED = 0.3  # spreads that such a parameter may have moved
+_AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +82,7 @@ class Identification:
         estimate: What the estimator returned: base parameters, or standard ones ("consistent").
         wls: Weighted least squares on the same factors, base parameters.
         prior: Standard parameters of the URDF, shape (p,).
+        urdf_with_drives: The same with the drive terms that then fit best, shape (p,).
         prior_std: How far they may plausibly be wrong, shape (p,).
         standard: Standard parameters, shape (p,).
         standard_covariance: Their covariance given the prior, shape (p, p).
@@ -69,6 +93,7 @@ class Identification:
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
         determination: Which base parameters the fitted rows determine.
+        findings: What the user should know of the robot, of the logs and of the fit.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
         doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
@@ -80,6 +105,7 @@ class Identification:
     estimate: Estimate
     wls: Estimate
     prior: Array
+    urdf_with_drives: Array
     prior_std: Array
     standard: Array
     standard_covariance: Array
@@ -90,6 +116,7 @@ class Identification:
     errors: StandardErrors
     factors: Factors
     determination: Determination
+    findings: tuple[Finding, ...] = ()
     alarms: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     report: str = ""
@@ -121,6 +148,11 @@ class Identification:
         return is_possible and self.mass_matrix.is_positive
 
     @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF may be written of it: it is possible, and no fault makes it wrong."""
+        return self.is_consistent and not self.alarms
+
+    @property
     def mass_matrix(self) -> MassMatrixCheck:
         """The mass matrix of the standard parameters over random poses; ``replace`` keeps it."""
         if not self._checked or self._checked[-1][0] is not self.standard:
@@ -128,28 +160,52 @@ class Identification:
         return self._checked[-1][1]
 
     @property
+    def at_bound(self) -> Array:
+        """Which drive terms are 0 only since they cannot be negative, shape (p,).
+
+        What they would be without that bound is hidden, so they have no standard error.
+        """
+        is_bounded = bool(self.estimate.details.get("constraints"))
+        is_zero = self.standard <= _AT_BOUND * self.prior_std
+        return np.asarray(self.model.layout.is_nonnegative() & is_zero & is_bounded)
+
+    @property
     def standard_error(self) -> Array:
-        """Standard errors of the standard parameters given the prior, shape (p,)."""
+        """Standard errors of the standard parameters, shape (p,), by the prior; inf at bounds."""
         # exact data leave a variance of rounding size, of either sign
-        errors: Array = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
-        return errors
+        errors = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
+        return np.where(self.at_bound, np.inf, errors)
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Where each standard parameter comes from: "data", "mixed" or "prior"."""
+        """What determined each standard parameter.
+
+        * "data": the motion, which shrinks its plausible spread below 30 %;
+        * "prior": nothing, so that the URDF's value stands, within 30 % of that spread;
+        * "bound": physics forbids the URDF's value or what the data ask for: a drive term at 0, a
+          body held by its extent;
+        * "mixed": data and URDF together, in sums with others; or a wish of the user.
+        """
         layout, unbounded = self.model.layout, self.errors.unbounded
         after = self.standard_error if unbounded is None else unbounded  # a bound is no source
         share = after / np.maximum(self.prior_std, _KNOWN)
+        moved = np.abs(self.standard - self.prior) > _STAYED * self.prior_std
+        active = self.estimate.details.get("active", ())
+        held = layout.owned_by([label.split(" ", 1)[1] for label in active if " " in label])
         masses = self.estimator.bounds.masses.items()
         known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
         kept = layout.owned_by(self.estimate.details.get("pinned", ()))
-        kept = kept | np.isin(layout.names, known) | (share > _FROM_PRIOR)
-        names = np.where(kept, "prior", np.where(share < _FROM_DATA, "data", "mixed"))
+        kept = kept | np.isin(layout.names, known) | ((share > _FROM_PRIOR) & ~moved)
+        held = self.at_bound | (held & moved & (share >= _FROM_DATA))
+        names = np.select([kept, held, share < _FROM_DATA], ["prior", "bound", "data"], "mixed")
         return tuple(names.tolist())
 
     @property
     def base_interval(self) -> Array:
-        """95 % interval of each base parameter, shape (b, 2); infinite where it is open."""
+        """95 % interval of each base parameter, shape (b, 2); infinite where it is open.
+
+        It is open where the data say nothing, and where the parameter is at its bound.
+        """
         half = self.errors.reach * self.base_error
         return np.column_stack([self.base - half, self.base + half])
 
@@ -182,18 +238,35 @@ class Identification:
         return tuple(e for e in self.validation if e.is_refitted)
 
     @property
+    def is_poorly_excited(self) -> bool:
+        """Whether the motion, not the noise, leaves parameters open that a richer one would not."""
+        return is_poorly_excited(self.wls, len(self.base))
+
+    @property
+    def predictions(self) -> dict[str, Metrics]:
+        """Metrics of each validation recording that shows a prediction, by its name."""
+        kept = (e for e in self.validation if not e.is_refitted)
+        return {e.recording.name: e.metrics["estimate"] for e in kept}
+
+    @cached_property
+    def witness(self) -> Witness:
+        """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
+        return call_witness(self)
+
+    @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        kept = [e for e in self.validation if not e.is_refitted]
         return judge(
             self.metrics(),
-            {e.recording.name: e.metrics["estimate"] for e in kept},
+            self.predictions,
             undetermined=self.determination.undetermined,
+            is_poorly_excited=self.is_poorly_excited,
             is_consistent=self.is_consistent,
             joints=self.model.joints,
             alarms=self.alarms,
             doubts=self.doubts,
             refitted=[e.recording.name for e in self.refitted],
+            witness=self.witness,
         )
 
 
@@ -204,8 +277,10 @@ def identify(
     validation: Sequence[Log] = (),
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
+    doctor: bool = True,
+    ignore: Sequence[str] = (),
 ) -> Identification:
-    """Identify a robot's parameters from motion logs.
+    """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
         model: The robot, from its URDF.
@@ -213,32 +288,77 @@ def identify(
         validation: Recordings kept apart to measure the prediction with.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
+        doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
+        ignore: Codes of errors and doubts that you know better.
 
     Raises:
         DataError: If a log does not fit the model or is too short.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
-        SettingsError: If a setting is out of range.
+        SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     if not logs:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (logs, validation))
-    return conclude(Recordings(model, structural_mapping(model), fitted, kept), choice)
+    found = diagnose(model, logs, validation, settings) if doctor else ()
+    recordings = Recordings(model, structural_mapping(model), fitted, kept)
+    return conclude(recordings, choice, found, ignore)
 
 
-def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identification:
-    """Identify a robot's parameters from recordings, in memory or not.
+def conclude(
+    recordings: Recordings,
+    choice: EstimatorSettings,
+    found: Sequence[Finding] = (),
+    ignore: Sequence[str] = (),
+) -> Identification:
+    """Identify a robot's parameters from recordings, in memory or not, and judge the result.
 
     Args:
         recordings: The recordings.
         choice: Which estimator.
+        found: What was found of them before, as by the doctor.
+        ignore: Codes of findings that the verdict does not count.
 
     Raises:
         DataError: If a row of a log cannot be used.
         RankDeficientError, NotConvergedError: As of ``identify``.
     """
+    model, is_robust = recordings.model, choice.is_robust
+    with _explained(found):
+        fit = _fitted(recordings, choice)
+    # what the motion excites the fit tells from all rows: finding "undetermined"
+    told = [f for f in found if f.severity != "note" and f.code != "excitation"]
+    told = refuted(settled(told, fit_findings(fit)), fit.predictions, fit.witness)
+    alarms = alarming(told, ignore, is_robust=is_robust)
+    heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
+    findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
+    counted = [finding for finding in findings if finding.code not in ignore]
+    names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
+    return replace(
+        fit,
+        findings=tuple(findings),
+        alarms=tuple(finding.message for finding in alarms),
+        doubts=doubts_of(counted, model.joints, names, is_robust=is_robust),
+    )
+
+
+@contextmanager
+def _explained(found: Sequence[Finding]) -> Iterator[None]:
+    """Add what the doctor found to the error of a fit that fails."""
+    try:
+        yield
+    except (DataError, NotConvergedError, RankDeficientError) as error:
+        for finding in found:
+            if finding.severity != "note":
+                error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
+        raise
+
+
+def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification:
+    """Identify a robot's parameters from recordings."""
     model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice)
     prior, spread = ground.before.pi, ground.before.spread
@@ -246,28 +366,34 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     candidates = {"estimate": standard, "wls": mapping.to_standard(wls.theta, prior, spread)}
+    sigma = ground.before.sigma
+    driven = urdf_with_drives(model, mapping, ground.factors, sigma, ground.before.spread)
     fitted, kept = evaluate_logs(
-        recordings.fitted, recordings.kept, candidates, prior, plan=recordings.plan
+        recordings.fitted, recordings.kept, candidates, prior, driven, plan=recordings.plan
     )
     is_base = estimate.names == mapping.base_names
-    return Identification(
+    base_error = estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0))
+    found = Identification(
         model=model,
         mapping=mapping,
         estimator=choice,
         estimate=estimate,
         wls=wls,
         prior=prior,
+        urdf_with_drives=driven,
         prior_std=spread if estimate.prior_std is None else estimate.prior_std,
         standard=standard,
         standard_covariance=covariance,
         base=mapping.to_base(standard),
-        base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
+        base_error=base_error,
         fitted=fitted,
         validation=kept,
         errors=errors,
         factors=ground.factors,
         determination=ground.determination,
     )
+    hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at their bounds
+    return replace(found, base_error=np.where(hidden, np.inf, base_error))
 
 
 @dataclass(frozen=True, eq=False)
