@@ -8,13 +8,7 @@ from typing import Any
 from robotid._files import check_folder, folder_beside, write_json
 from robotid.commands.job import Job
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
-<<<<<<< HEAD
-from robotid.doctor.diagnosis import alarming
-from robotid.doctor.urdf_inertials import impossible_inertials
-from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
-=======
-from robotid.exceptions import DataError, SettingsError
->>>>>>> main
+from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
 from robotid.identification.findings import locked_findings
@@ -56,37 +50,18 @@ def run_job(
         WorkerError: If a worker ends before its work.
     """
     model, target = job.model(), Path(folder)
-<<<<<<< HEAD
     name = f"{Path(model.tree.path).stem}.identified.urdf"
     sidecar = str(Path(name).with_suffix(".drive.json"))
     check_folder(target, ["result.json", "report.html", name, sidecar])
-    identification, findings, checkpoint = _identify(job, model, target, plan)
-    target.mkdir(parents=True, exist_ok=True)
-    with folder_beside(target) as partial:
-        outputs = {"report": "report.html"}
-        if identification.is_consistent:
-            write_urdf(model, identification.standard, partial / name, dynamics=job.dynamics)
-            outputs |= {"urdf": name, "sidecar": sidecar}
-        write_report(identification, partial / "report.html", findings=findings)
-        result = build_result(identification, job.to_dict(), findings, outputs)
-=======
-    if target.exists() and not target.is_dir():
-        raise SettingsError(
-            f"{str(target)!r} is a file, wanted a folder for the results; name another"
-        )
     identification, checkpoint = _identify(job, model, target, plan)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {"report": "report.html"}
-        name = f"{Path(model.tree.path).stem}.identified.urdf"
         if identification.has_urdf:
-            sidecar = write_urdf(
-                model, identification.standard, partial / name, dynamics=job.dynamics
-            )
-            outputs |= {"urdf": name, "sidecar": sidecar.name}
+            write_urdf(model, identification.standard, partial / name, dynamics=job.dynamics)
+            outputs |= {"urdf": name, "sidecar": sidecar}
         write_report(identification, partial / "report.html")
-        result = build_result(identification, job.to_dict(), outputs)
->>>>>>> main
+        result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
     if "urdf" not in outputs:
         _remove_stale(target / name, target / sidecar)

@@ -18,13 +18,9 @@ from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_s
 from robotid.export.urdf import load_identified
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
-<<<<<<< HEAD
-from robotid.identification.pipeline import Identification
-from robotid.identification.verdict import Doubt
-=======
 from robotid.identification.pipeline import SOURCES, Identification
+from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
->>>>>>> main
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
