@@ -23,6 +23,7 @@ PAGES = {
     "uncertainty": "trust.md",
     "end_to_end": "speed.md",
     "figaroh": "speed.md",
+    "fuzz": "limits.md",
     "regressor": "speed.md",
     "startup": "speed.md",
     "scaling": "speed.md",

@@ -5,57 +5,154 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 
-__all__ = ["file_sha256", "folder_beside", "write_json", "write_text", "written_whole"]
+__all__ = [
+    "check_file",
+    "check_folder",
+    "file_sha256",
+    "folder_beside",
+    "missing_file",
+    "read_json",
+    "write_json",
+    "write_text",
+    "written_whole",
+]
+
+
+def check_file(target: Path) -> None:
+    """Refuse a place where no file can be written, as before the work that makes its content.
+
+    Args:
+        target: The file.
+
+    Raises:
+        DataError: If its folder does not exist.
+        SettingsError: If it is a folder.
+    """
+    if not target.parent.is_dir():
+        raise DataError(f"there is no folder {str(target.parent)!r} to write {target.name} in")
+    if target.is_dir():
+        raise SettingsError(
+            f"{str(target)!r} is a folder, wanted a file to write; remove it, or name another"
+        )
+
+
+def check_folder(target: Path, names: Iterable[str] = ()) -> None:
+    """Refuse a place where no results can be written, as before the work that makes them.
+
+    Args:
+        target: The folder; it need not exist.
+        names: Names of the files to be written in it.
+
+    Raises:
+        SettingsError: If it, or a folder above it, is a file or not writable, or if one of its
+            files is a folder.
+    """
+    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
+    if not there.is_dir():
+        raise SettingsError(
+            f"{str(there)!r} is a file, wanted a folder for the results; name another"
+        )
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise SettingsError(f"the folder {str(there)!r} is not writable; name another")
+    if there == target:
+        for name in names:
+            check_file(target / name)
 
 
 @contextmanager
 def written_whole(target: str | Path) -> Iterator[Path]:
     """Give a hidden name beside a file; what is written there is then put in its place.
 
-    After an error the target is as it was, and nothing is left beside it.
+    After an error the target is as it was, and nothing is left beside it. A device, a pipe or
+    ``/dev/stdout`` is not replaced: it gets the content, when that is complete.
 
     Args:
         target: The file.
 
     Yields:
         Where to write.
+
+    Raises:
+        DataError: If its folder does not exist, or the reader of a pipe has left.
+        SettingsError: If it is a folder.
     """
     path = Path(target)
+    check_file(path)
+    if _is_stream(path):
+        with tempfile.TemporaryDirectory(prefix="robotid-") as folder:
+            yield Path(folder, path.name)
+            try:
+                with Path(folder, path.name).open("rb") as made, path.open("wb") as stream:
+                    shutil.copyfileobj(made, stream)
+            except BrokenPipeError as error:
+                raise DataError(f"the reader of {str(path)!r} left before its end") from error
+        return
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         yield beside
         os.replace(beside, path)
+    except OSError as error:  # most do not say which file
+        error.add_note(f"while writing {str(path)!r}")
+        raise
     finally:
         beside.unlink(missing_ok=True)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether what is written to a path goes on from there, so that it must not be replaced."""
+    is_special = path.exists() and not path.is_file()
+    shown = path.absolute().parts[1:2]  # /dev/stdout, /dev/fd/1, /proc/self/fd/1
+    return is_special or (path.is_symlink() and shown in (("dev",), ("proc",)))
 
 
 @contextmanager
 def folder_beside(target: Path) -> Iterator[Path]:
     """Give a hidden folder in a folder; the files made there are then put in place, by name.
 
-    After an error none of them is, and the hidden folder is gone.
+    After an error none of them is, those of the same names are as they were, and the hidden
+    folder is gone.
 
     Args:
         target: The folder; it must exist.
 
     Yields:
         Where to write.
+
+    Raises:
+        SettingsError: If a file to be replaced is a folder.
     """
-    beside = Path(tempfile.mkdtemp(prefix=".robotid-", dir=target))
-    try:
-        yield beside
-        for made in sorted(beside.iterdir()):
-            os.replace(made, target / made.name)
-    finally:
-        shutil.rmtree(beside)
+    with tempfile.TemporaryDirectory(prefix=".robotid-", dir=target) as hidden:
+        new, old = Path(hidden, "new"), Path(hidden, "old")
+        new.mkdir()
+        old.mkdir()
+        yield new
+        names = sorted(made.name for made in new.iterdir())
+        check_folder(target, names)
+        try:
+            for name in names:
+                if os.path.lexists(target / name):
+                    os.replace(target / name, old / name)
+                os.replace(new / name, target / name)
+        except BaseException:
+            _put_back(names, new, old, target)
+            raise
+
+
+def _put_back(names: Iterable[str], new: Path, old: Path, target: Path) -> None:
+    """Undo what was done of a replacement of files."""
+    for name in names:
+        if os.path.lexists(old / name):
+            os.replace(old / name, target / name)
+        elif not os.path.lexists(new / name):
+            (target / name).unlink()
 
 
 def write_text(text: str, target: str | Path) -> Path:
@@ -67,10 +164,9 @@ def write_text(text: str, target: str | Path) -> Path:
 
     Raises:
         DataError: If its folder does not exist.
+        SettingsError: If it is a folder.
     """
     path = Path(target)
-    if not path.parent.is_dir():
-        raise DataError(f"there is no folder {str(path.parent)!r} to write {path.name} in")
     with written_whole(path) as beside:
         beside.write_text(text, encoding="utf-8")
     return path
@@ -85,8 +181,52 @@ def write_json(content: Mapping[str, Any], target: str | Path) -> None:
 
     Raises:
         DataError: If its folder does not exist.
+        SettingsError: If it is a folder.
     """
     write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", target)
+
+
+def missing_file(path: Path, what: str) -> str:
+    """Return what is wrong with a path that is no file.
+
+    Args:
+        path: The path.
+        what: What it should be, as "log file".
+    """
+    if path.is_dir():
+        return f"{str(path)!r} is a folder, wanted a {what}"
+    if path.exists():
+        return f"{str(path)!r} is a pipe or a device, wanted a {what}; copy it to one"
+    return f"there is no {what} {str(path)!r}"
+
+
+def read_json(path: str | Path, what: str) -> Any:  # noqa: ANN401
+    """Return the content of a JSON file: finite numbers, text that UTF-8 can hold, few levels.
+
+    Args:
+        path: The file.
+        what: What it is, for errors.
+
+    Raises:
+        DataError: If it is missing or holds something else.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(missing_file(source, what))
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+        json.dumps(content, allow_nan=False, ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{source.name} is not JSON: {str(error)[:200]}") from error
+    inside = [content]
+    for _ in range(_DEEPEST):
+        lists = [
+            x.values() if isinstance(x, dict) else x for x in inside if isinstance(x, dict | list)
+        ]
+        inside = [x for entries in lists for x in entries]
+    if inside:
+        raise DataError(f"{source.name} is nested deeper than {_DEEPEST} levels: it is no {what}")
+    return content
 
 
 def file_sha256(path: str | Path) -> str:
@@ -102,6 +242,9 @@ def file_sha256(path: str | Path) -> str:
         return hashlib.sha256(listing.encode()).hexdigest()
     about = source.stat()
     return _sha256(source.resolve(), about.st_size, about.st_mtime_ns, about.st_ino)
+
+
+_DEEPEST = 40  # levels of tables and lists
 
 
 @lru_cache(maxsize=1024)

@@ -15,6 +15,7 @@ from robotid.findings import listed
 __all__ = [
     "NOT_NEGATIVE",
     "POSITIVE",
+    "Entries",
     "Key",
     "Range",
     "Settings",
@@ -30,6 +31,15 @@ class Range:
 
     words: str  # as an error names it
     holds: Callable[[Any], bool]
+
+
+@dataclass(frozen=True)
+class Entries:
+    """A list or a table of a job file whose entries are of one kind."""
+
+    outer: type  # list or dict
+    inner: tuple[type, ...]  # of each entry
+    count: int | None = None  # how many there are; any number if None
 
 
 POSITIVE = Range("a positive number", lambda x: x > 0)
@@ -128,7 +138,7 @@ class Settings:
             for name in tables:
                 inside = inside.get(name, {})
             if last in inside:
-                given[f.name] = _load(inside[last], key, f.type, last)
+                given[f.name] = _load(inside[last], key, f.type)
         return cls(**given)
 
     def to_dict(self) -> dict[str, Any]:
@@ -173,26 +183,60 @@ def check_keys(
         if key not in schema:
             near = difflib.get_close_matches(key, schema, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise SettingsError(f"{at} is not a known key{hint} Known: {sorted(schema)}")
+            raise SettingsError(
+                f"{_shown(at)[1:-1]} is not a known key{hint} Known: {sorted(schema)}"
+            )
         wanted = schema[key]
         if isinstance(wanted, dict):
             if not isinstance(value, Mapping):
-                raise SettingsError(f"{at} is {value!r}, wanted a table [{section}{key}]")
+                raise SettingsError(f"{at} is {_shown(value)}, wanted a table [{section}{key}]")
             check_keys(value, wanted, where, f"{section}{key}.")
         elif isinstance(wanted, list):
             _check_array(value, wanted[0], where, f"{section}{key}")
-        elif not isinstance(value, wanted) or (isinstance(value, bool) and bool not in wanted):
-            raise SettingsError(f"{at} is {value!r}, wanted {_type_name(wanted)}")
+        elif isinstance(wanted, Entries):
+            _check_entries(value, wanted, at)
+        else:
+            _check_type(value, wanted, at)
 
 
 def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str) -> None:
     if not isinstance(value, list) or not all(isinstance(item, Mapping) for item in value):
-        raise SettingsError(f"{where}: {name} is {value!r}, wanted tables written as [[{name}]]")
+        raise SettingsError(
+            f"{where}: {name} is {_shown(value)}, wanted tables written as [[{name}]]"
+        )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
         for required in ("log", "name", "ratios"):
             if required in schema and required not in item:
                 raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
+
+
+def _check_entries(value: object, wanted: Entries, at: str) -> None:
+    _check_type(value, (wanted.outer,), at)
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            _check_type(entry, wanted.inner, f"{at}.{name}")
+    elif isinstance(value, list):
+        if wanted.count is not None and len(value) != wanted.count:
+            raise SettingsError(f"{at} has {len(value)} entries, wanted {wanted.count}")
+        for k, entry in enumerate(value):
+            _check_type(entry, wanted.inner, f"{at}[{k}]")
+
+
+def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        raise SettingsError(f"{at} is {_shown(value)}, wanted {_type_name(kinds)}")
+    if isinstance(value, int | float) and not abs(value) <= _LARGEST:  # NaN, too
+        raise SettingsError(f"{at} is {_shown(value)}, wanted a number between -1e30 and 1e30")
+
+
+def _shown(value: object) -> str:
+    """Return a value as a message shows it, in one line."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of more than 4300 digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 80 else f"{text[:60]}...{text[-17:]}"
 
 
 def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
@@ -206,11 +250,11 @@ def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
     else:
         is_right, words = key.within.holds(value), [key.within.words]
     if not is_right:
-        shown = repr(value) if isinstance(value, str) else value
-        raise SettingsError(f"{name} is {shown}, wanted {' or '.join(words)}")
+        raise SettingsError(f"{name} is {_shown(value)}, wanted {' or '.join(words)}")
 
 
 _NUMBER = (int, float)
+_LARGEST = 10**30  # no setting is larger, and what is computed from it is still a number
 _WORDS = {str: "text", bool: "true or false", list: "a list", dict: "a table"}
 _ALSO = {bool: "false", str: "text", list: "a list"}
 
@@ -232,18 +276,20 @@ def _read_type(kind: Any) -> Any:  # noqa: ANN401
     if _is_table(kind):
         return kind.schema()
     origin, inner = get_origin(kind), get_args(kind)
-    if origin is tuple:
-        return [inner[0].schema()] if _is_table(inner[0]) else (list,)
     if origin is not None and issubclass(origin, Mapping):
-        return (dict,)
+        return (dict,) if inner[1] is Any else Entries(dict, _read_type(inner[1]))
     if origin is not None and issubclass(origin, Sequence):
-        return (list,)
+        if _is_table(inner[0]):
+            return [inner[0].schema()]
+        count = len(inner) if origin is tuple and inner[-1] is not ... else None
+        return Entries(list, _read_type(inner[0]), count)
     if inner:
-        return tuple(t for one in inner if one is not type(None) for t in _read_type(one))
+        kinds = [_read_type(one) for one in inner if one is not type(None)]
+        return kinds[0] if len(kinds) == 1 else tuple(t for one in kinds for t in one)
     return _NUMBER if kind is float else (kind,)
 
 
-def _load(value: Any, key: Key, kind: Any, name: str) -> Any:  # noqa: ANN401
+def _load(value: Any, key: Key, kind: Any) -> Any:  # noqa: ANN401
     if key.load is not None:
         return key.load(value)
     if _is_table(kind):
@@ -252,9 +298,6 @@ def _load(value: Any, key: Key, kind: Any, name: str) -> Any:  # noqa: ANN401
         inner = get_args(kind)[0]
         return tuple(inner.from_dict(item) if _is_table(inner) else item for item in value)
     if isinstance(value, Mapping) and get_args(kind) == (str, float):
-        for entry, number in value.items():
-            if isinstance(number, bool) or not isinstance(number, _NUMBER):
-                raise SettingsError(f"{name}.{entry} is {number!r}, wanted a number")
         return {entry: float(number) for entry, number in value.items()}
     return value
 

@@ -1,17 +1,23 @@
 """The command line: flags to arguments, results to text; nothing is computed here."""
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from robotid._files import check_file
 from robotid.commands.console import (
+    Terminated,
     print_content,
     print_error,
     print_files,
     shown_log,
     terminal_progress,
+    terminations_raised,
+    unheard_in_silence,
 )
 from robotid.commands.flags import add_flags, job_from_flags, refuse_log_flags, source_settings
 from robotid.exceptions import RobotIdError, SettingsError
@@ -33,13 +39,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         Exit code: 0 done, 1 the data or the model do not allow it or the doctor found an error
-        that is not ignored, 2 wrong usage, 130 Ctrl-C.
+        that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
     """
-    words = sys.argv[1:] if arguments is None else arguments
+    code = 0
+    if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        with unheard_in_silence():
+            code = _run(sys.argv[1:] if arguments is None else arguments)
+    except OSError as error:  # the standard output cannot be written to
+        print_error(error)
+        return 1
+    return code
+
+
+def _run(words: Sequence[str]) -> int:
+    """Run a command line, tell what stops it, and return its exit code."""
     options = _parser(words).parse_args(words)
     try:
-        with shown_log(is_verbose=getattr(options, "verbose", False)):
+        with terminations_raised(), shown_log(is_verbose=getattr(options, "verbose", False)):
             code: int | None = options.run(options)
+    except BrokenPipeError:
+        raise
     except SettingsError as error:
         print_error(error)
         return 2
@@ -48,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as error:
         print_error(error, "interrupted")
-        return 130
+        return 128 + error.number if isinstance(error, Terminated) else 130
     return code or 0
 
 
@@ -74,12 +95,13 @@ def _show(
     content: dict[str, Any], options: argparse.Namespace, command: str, files: Sequence[str] = ()
 ) -> None:
     """Print what a command found and which files it wrote, or its JSON alone."""
-    if options.json:
-        print(json.dumps(content, allow_nan=False))
-        return
-    print_content(command, content)
-    if files:
-        print_files(options.out, files)
+    with unheard_in_silence():
+        if options.json:
+            print(json.dumps(content, allow_nan=False))
+            return
+        print_content(command, content)
+        if files:
+            print_files(options.out, files)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -154,6 +176,7 @@ def _replay(options: argparse.Namespace) -> None:
         refuse_log_flags(options, "a RESULT says how its logs are read")
         job = stated_job(findings, options.source, options.logs[0])
     if options.html or options.serve is None:
+        check_file(Path(options.html or "replay.html"))
         page = replay_files(job, findings, ghost=options.ghost)
         target = page.write(options.html or "replay.html")
         print(f"written: {target}, {target.stat().st_size / 1e6:.1f} MB", file=sys.stderr)
@@ -175,6 +198,8 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
     settings = {"port": options.serve, "speed": options.speed}
     try:
         serve_track(job, folder, **settings, announce=announce, finished=finished)
+    except Terminated:
+        raise
     except KeyboardInterrupt:
         print("\nended", file=sys.stderr)
 

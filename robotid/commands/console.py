@@ -1,11 +1,15 @@
 """Results, errors and progress as text on a terminal."""
 
 import logging
+import os
 import re
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from robotid.findings import listed
@@ -15,7 +19,76 @@ if TYPE_CHECKING:
 
     from robotid._typing import ProgressCallback
 
-__all__ = ["print_content", "print_error", "print_files", "shown_log", "terminal_progress"]
+__all__ = [
+    "Terminated",
+    "print_content",
+    "print_error",
+    "print_files",
+    "shown_log",
+    "terminal_progress",
+    "terminations_raised",
+    "unheard_in_silence",
+]
+
+
+_ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was told to end, by SIGTERM or SIGHUP: what Ctrl-C undoes is undone.
+
+    Attributes:
+        number: The signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(signal.Signals(number).name)
+
+
+@contextmanager
+def terminations_raised() -> Iterator[None]:
+    """Raise ``Terminated`` at SIGTERM and SIGHUP while the context lasts; once, the next is late.
+
+    A signal that is ignored stays so, as SIGHUP under nohup. Only the main thread hears signals:
+    elsewhere nothing changes.
+    """
+    numbers = [number for number in _ENDS if signal.getsignal(number) is signal.SIG_DFL]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+
+    def end(number: int, _: FrameType | None) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        raise Terminated(number)
+
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+
+@contextmanager
+def unheard_in_silence() -> Iterator[None]:
+    """Say no more if nobody reads the standard output on, as before ``| head``: that is no error.
+
+    Raises:
+        OSError: If it cannot be written to for another reason, as a full disk.
+    """
+    try:
+        try:
+            yield
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except OSError as error:
+        # what is left is not tried again at the end of the process
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            raise
 
 
 def print_error(error: BaseException, words: str = "") -> None:
@@ -27,7 +100,8 @@ def print_error(error: BaseException, words: str = "") -> None:
     """
     notes = getattr(error, "__notes__", ())
     separator = "; " if words else "\n  "
-    print("robotid:", separator.join([words or str(error), *notes]), file=sys.stderr)
+    with suppress(BrokenPipeError):  # the exit code says it, too
+        print("robotid:", separator.join([words or str(error), *notes]), file=sys.stderr)
 
 
 @contextmanager
@@ -63,7 +137,8 @@ class _EachOnce(logging.Handler):
         words = re.sub(r"[0-9]+", "#", text)
         if words not in self._said:
             self._said.add(words)
-            print(f"robotid: {text}", file=sys.stderr)
+            with suppress(BrokenPipeError):  # nobody reads on, and the work is worth ending
+                print(f"robotid: {text}", file=sys.stderr)
 
 
 def print_content(command: str, content: dict[str, Any]) -> None:
@@ -210,7 +285,7 @@ def _print_comparison(content: dict[str, Any]) -> None:
     print(f"\nfitted recordings of each, error %{alike}")
     _print_columns(content["fitted"], labels)
     print("\nbase parameters; last columns: difference to A over the combined standard error")
-    width = max(len(entry["name"]) for entry in content["base_parameters"])
+    width = max((len(entry["name"]) for entry in content["base_parameters"]), default=0)
     heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
     print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
     for entry in content["base_parameters"]:
@@ -229,7 +304,7 @@ def _print_comparison(content: dict[str, Any]) -> None:
 def _print_columns(per_joint: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
     from robotid.identification.summary import cell
 
-    width = max(len(entry["joint"]) for entry in per_joint)
+    width = max((len(entry["joint"]) for entry in per_joint), default=0)
     print(f"  {'joint':{width}}" + "".join(f"{label:>9}" for label in labels))
     for entry in per_joint:
         cells = "".join(cell(value, 9) for value in entry["relative_error_pct"])

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from robotid._files import check_file
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.logs.data import repeated, suggestion
@@ -47,8 +48,10 @@ def convert(
     Raises:
         DataError: If the file cannot be read, has no time, or does not hold a joint.
         MissingDependencyError: If a package that reads or writes a format is not installed.
+        SettingsError: If the target is a folder.
     """
     file = Path(path)
+    check_file(Path(target))
     opened = open_table(file, source)
     found, by_joint = _standard_names(file.name, opened.names, source)
     for joint in joints or ():

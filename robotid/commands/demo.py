@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._files import check_folder
 from robotid._typing import Array
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
@@ -41,6 +42,7 @@ def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]
         RobotIdError: If a step fails.
     """
     target = Path(folder)
+    check_folder(target, ["identification.csv", "validation.csv", "result.json", "replay.html"])
     target.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))

@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robotid._files import folder_beside, write_json
+from robotid._files import check_folder, folder_beside, write_json
 from robotid.commands.job import Job
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
 from robotid.identification.findings import locked_findings
@@ -50,34 +50,30 @@ def run_job(
         WorkerError: If a worker ends before its work.
     """
     model, target = job.model(), Path(folder)
-    if target.exists() and not target.is_dir():
-        raise SettingsError(
-            f"{str(target)!r} is a file, wanted a folder for the results; name another"
-        )
+    name = f"{Path(model.tree.path).stem}.identified.urdf"
+    sidecar = str(Path(name).with_suffix(".drive.json"))
+    check_folder(target, ["result.json", "report.html", name, sidecar])
     identification, checkpoint = _identify(job, model, target, plan)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {"report": "report.html"}
-        name = f"{Path(model.tree.path).stem}.identified.urdf"
         if identification.has_urdf:
-            sidecar = write_urdf(
-                model, identification.standard, partial / name, dynamics=job.dynamics
-            )
-            outputs |= {"urdf": name, "sidecar": sidecar.name}
+            write_urdf(model, identification.standard, partial / name, dynamics=job.dynamics)
+            outputs |= {"urdf": name, "sidecar": sidecar}
         write_report(identification, partial / "report.html")
-        result = build_result(identification, job.to_dict(), outputs)
+        result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
     if "urdf" not in outputs:
-        _remove_urdf(target / name)
+        _remove_stale(target / name, target / sidecar)
     identification = replace(identification, report=str(target / outputs["report"]))
     if checkpoint is not None:
         checkpoint.remove()
     return identification, result
 
 
-def _remove_urdf(urdf: Path) -> None:
+def _remove_stale(*files: Path) -> None:
     """Remove the URDF and sidecar that an earlier run left, for they are not of this result."""
-    for stale in (urdf, urdf.with_suffix(".drive.json")):
+    for stale in files:
         if stale.exists():
             _log.warning("%s is of an earlier run and was removed: this one wrote none", stale)
             stale.unlink()

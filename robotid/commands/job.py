@@ -7,7 +7,8 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._settings import Range, Settings, check_keys, setting
+from robotid._files import missing_file
+from robotid._settings import Entries, Range, Settings, check_keys, setting
 from robotid.exceptions import SettingsError
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
 from robotid.logs.data import Log
@@ -26,6 +27,7 @@ _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
     for name, term in TERMS.items()
 }
+_LONGEST_PATH = 4096  # characters
 _FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": lambda path: str(path.resolve())}
 
 
@@ -47,10 +49,6 @@ def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
 
 
 def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]:
-    for table in tables:
-        for joint, ratio in table["ratios"].items():
-            if isinstance(ratio, bool) or not isinstance(ratio, int | float):
-                raise SettingsError(f"ratios.{joint} is {ratio!r}, wanted a number")
     return tuple(
         Coupling(table["name"], tuple((j, float(r)) for j, r in table["ratios"].items()))
         for table in tables
@@ -79,7 +77,7 @@ class Job(Settings):
         None, "joints to identify, in order; all movable ones if not stated"
     )
     locked: Mapping[str, float] = setting({}, "positions of joints held still [rad or m]")
-    gravity: tuple[float, ...] = setting(
+    gravity: tuple[float, float, float] = setting(
         (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
     )
     free_flyer: bool = setting(False, "whether the base floats; no log format has its motion yet")
@@ -107,7 +105,7 @@ class Job(Settings):
         (),
         "drives that turn with several joints, each with a name and its ratios by joint [-]",
         at="coupling",
-        reads=[{"name": (str,), "ratios": (dict,)}],
+        reads=[{"name": (str,), "ratios": Entries(dict, (int, float))}],
         load=_load_couplings,
         dump=_dump_couplings,
     )
@@ -139,7 +137,7 @@ class Job(Settings):
         None,
         "processes that work on the pieces; one per core for long logs if not stated",
         at="reduction.workers",
-        within=Range("at least 1", lambda x: x >= 1),
+        within=Range("1 to 1024", lambda x: 1 <= x <= 1024),
     )
 
     def __post_init__(self) -> None:
@@ -218,10 +216,10 @@ def read_job(path: str | Path) -> Job:
     """
     source = Path(path)
     if not source.is_file():
-        raise SettingsError(f"there is no job file {str(source)!r}")
+        raise SettingsError(missing_file(source, "job file"))
     try:
         table = tomllib.loads(source.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no UTF-8, numbers too long, tables too deep
         raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
     return job_from_settings(table, source.name, source.parent)
 
@@ -252,6 +250,12 @@ def job_from_settings(table: Mapping[str, Any], where: str, folder: Path) -> Job
 
 def _path(text: str, where: str, folder: Path) -> Path:
     """Return a path relative to a folder, with $VARIABLES of the environment filled in."""
+    is_unicode = not any("\ud800" <= character <= "\udfff" for character in text)
+    if "\0" in text or len(text) > _LONGEST_PATH or not is_unicode:
+        raise SettingsError(
+            f"{where}: {text[:80]!r} cannot name a file: wanted UTF-8 without NUL, at most "
+            f"{_LONGEST_PATH} characters"
+        )
     expanded = os.path.expandvars(text)
     if "$" in expanded:
         raise SettingsError(f"{where}: path {text!r} names an environment variable that is not set")

@@ -1,6 +1,5 @@
 """A replay from files: the log, what results predict of it, what a tracker saw, a ghost."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from robotid._files import read_json
 from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import read_result, stated_parameters
+from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.identification.evaluation import predict
 from robotid.identification.pipeline import Identification
 from robotid.identification.survey import hold_log
@@ -24,6 +25,15 @@ from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.viewer.unexplained import find_unexplained
 
 __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
+
+
+#: What is read of a track.json.
+_TRACK = {
+    "settings": TABLE,
+    "history": FILE,
+    "changes": [{"onset": NUMBER, "payload": {"mass": NUMBER, "std_error": NUMBER, "body": TEXT}}],
+    "base_parameters": [{"name": TEXT, "unit": TEXT}],
+}
 
 
 @dataclass(frozen=True)
@@ -168,15 +178,12 @@ def _ghost(job: Job, model: RobotModel, path: Path) -> tuple[Array, Array]:
 
 
 def _track(path: Path) -> Mapping[str, Any] | None:
-    """Return the content of a track.json; None if the file is another one, or none."""
-    if not path.is_file():
+    """Return the content of a track.json; None if the file is another one."""
+    content = read_json(path, "result")
+    if not (isinstance(content, dict) and {"history", "changes"} <= set(content)):
         return None
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        return None
-    is_track = isinstance(content, dict) and {"history", "changes"} <= set(content)
-    return content if is_track else None
+    check_shape(content, _TRACK, path.name)
+    return content
 
 
 def _torques(job: Job, model: RobotModel, log: Log, vectors: Mapping[str, Array]) -> Torques:

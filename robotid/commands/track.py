@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import file_sha256, write_json
+from robotid._files import check_folder, file_sha256, folder_beside, write_json
 from robotid.commands.job import Job
 from robotid.exceptions import MissingDependencyError, SettingsError
 from robotid.logs.data import Log
@@ -28,6 +28,7 @@ __all__ = ["run_track", "serve_track"]
 
 _SCHEMA = 1
 _RATE = 25.0  # [Hz] messages per second of the log
+_SLOWEST = 1e-3  # [-] speed of the log that is still worth waiting for
 
 
 def run_track(
@@ -45,7 +46,9 @@ def run_track(
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit.
     """
-    model = job.model()
+    model, history = job.model(), _history_name()
+    if folder is not None:
+        check_folder(Path(folder), [history, "track.json"])
     if len(job.identification) != 1:
         raise SettingsError(f"track takes one log, found {len(job.identification)}")
     log = job.read(job.identification[0], model)
@@ -58,13 +61,13 @@ def run_track(
         min_velocity=job.signals.min_velocity,
     )
     found = track(model, log, settings, observer=observer)
-    history = _history_name()
     content = _summary(found, job, log, history)
     if folder is not None:
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
-        write_columns(found.columns(), target / history)
-        write_json(content, target / "track.json")
+        with folder_beside(target) as partial:
+            write_columns(found.columns(), partial / history)
+            write_json(content, partial / "track.json")
     return content
 
 
@@ -152,10 +155,12 @@ def serve_track(
         KeyboardInterrupt: If the user ends it.
         ModelError: If the URDF cannot be used.
         OSError: If the port is taken.
-        SettingsError: If a setting does not fit.
+        SettingsError: If a setting does not fit, or port or speed are out of their ranges.
     """
-    if not speed >= 0:
-        raise SettingsError(f"speed is {speed}, wanted 0 or more")
+    if not (speed == 0 or speed >= _SLOWEST):
+        raise SettingsError(f"speed is {speed}, wanted 0, or {_SLOWEST} or more")
+    if not 0 <= port < 2**16:
+        raise SettingsError(f"port is {port}, wanted 1 to 65535, or 0 for any free one")
     model = job.model()
     log = job.read(job.identification[0], model)
     mapping = structural_mapping(model)

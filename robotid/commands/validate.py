@@ -127,7 +127,7 @@ def _doubts(
     missing: Sequence[str],
 ) -> list[Doubt]:
     """Return the doubts of the result, but for its own validation, and those of the new logs."""
-    own = [Doubt(**doubt) for doubt in stated.get("doubts", ())]
+    own = [Doubt(d["code"], d["joint"], d["message"]) for d in stated.get("doubts", ())]
     is_robust = job.estimator.is_robust
     doubts = [doubt for doubt in own if doubt.code != "repeated_motion"]
     doubts += doubts_of(found, model.joints, names, is_robust=is_robust)

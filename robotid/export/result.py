@@ -1,7 +1,6 @@
 """result.json: what an identification found, in the schema that other programs read."""
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import file_sha256
+from robotid._files import file_sha256, read_json
+from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import SOURCES, Identification
+from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -36,8 +38,39 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
+_STATUSES = ("good", "usable", "poor", "not evaluated")
 _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
-_WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
+_STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
+_METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}
+_PARAMETER = {"name": TEXT, "value": NUMBER, "unit": TEXT}
+_RECORDING = {
+    **dict.fromkeys(("start", "end", "rows_used"), NUMBER),
+    "signals": TABLE,
+}
+#: What is read of a result.json.
+_SHAPE = {
+    "robotid": TEXT,
+    "robot": TEXT,
+    "joints": [TEXT],
+    "versions?": {...: TEXT},
+    "settings": {"estimator": {"name": TEXT}},
+    "inputs": [{"role": TEXT, "path": TEXT, "sha256": (str, type(None))}],
+    "outputs": {"urdf?": FILE, "sidecar?": FILE},
+    "structure": {"base": NUMBER, "undetermined": [TEXT]},
+    "consistency": {"is_consistent": FLAG},
+    "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
+    "standard_parameters": [_PARAMETER],
+    "drive_parameters": [_PARAMETER],
+    "identification": _METRICS,
+    "validation": [{"log": TEXT, **_METRICS}],
+    "verdict": {
+        "status": _STATUS,
+        "reasons": [TEXT],
+        "per_joint?": {...: {"status": _STATUS, "reasons": [TEXT]}},
+        "alarms?": [TEXT],
+        "doubts?": [{field.name: TEXT for field in dataclasses.fields(Doubt)}],
+    },
+}
 
 
 def build_result(
@@ -200,24 +233,24 @@ def read_result(path: str | Path) -> dict[str, Any]:
         path: The file.
 
     Raises:
-        DataError: If it is missing, no JSON, or of another schema.
+        DataError: If it is missing, no JSON, or not of the schema of a result.
     """
-    source = Path(path)
-    if not source.is_file():
-        raise DataError(f"there is no result {str(source)!r}")
-    try:
-        result = json.loads(source.read_text(encoding="utf-8"))
-    except ValueError as error:  # no JSON, or no UTF-8
-        raise DataError(f"{source.name} is not JSON: {error}") from error
+    name, result = Path(path).name, read_json(path, "result")
     version = result.get("schema_version") if isinstance(result, dict) else None
     if version != SCHEMA_VERSION or "verdict" not in result:
         raise DataError(
-            f"{source.name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
+            f"{name} has schema_version {version!r}, wanted {SCHEMA_VERSION} of a result "
             "written by 'robotid identify'"
         )
-    missing = [key for key in _WANTED if key not in result]
-    if missing:
-        raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
+    check_shape(result, _SHAPE, name)
+    recordings = [entry for entry in result["inputs"] if entry["role"] != "urdf"]
+    check_shape(recordings, [_RECORDING], f"{name}.inputs")
+    kept = [entry for entry in recordings if entry["role"] == "validation"]
+    if len(kept) != len(result["validation"]):
+        raise DataError(
+            f"{name} has {len(kept)} recordings kept apart among its inputs and errors of "
+            f"{len(result['validation'])}: it is not whole; identify again"
+        )
     return dict(result)
 
 

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import folder_beside
+from robotid._files import folder_beside, read_json
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export import xml_splice
+from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
@@ -30,10 +31,18 @@ from robotid.versions import __version__
 __all__ = ["load_identified", "read_sidecar", "write_urdf"]
 
 _SCHEMA_VERSION = 1
-_ENTRIES = {
-    "urdf_sha256": str, "joints": list, "locked": dict, "gravity": list, "free_flyer": bool,
-    "mimic": str, "terms": list, "drives": dict, "couplings": list, "lumped": dict,
-}  # fmt: skip
+_SHAPE = {
+    "urdf_sha256": TEXT,
+    "joints": [TEXT],
+    "locked": {...: NUMBER},
+    "gravity": [NUMBER],
+    "free_flyer": FLAG,
+    "mimic": TEXT,
+    "terms": [TEXT],
+    "drives": {...: {...: NUMBER}},
+    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}}],
+    "lumped": TABLE,
+}
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over them
 
@@ -99,24 +108,16 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
         path: The ``.drive.json`` file.
 
     Raises:
-        DataError: If it is missing, no JSON, of another schema, or lacks an entry.
+        DataError: If it is missing, no JSON, or not of the schema of a sidecar.
     """
-    source = Path(path)
-    if not source.is_file():
-        raise DataError(f"there is no sidecar {str(source)!r}; it is written beside the URDF")
-    try:
-        content = json.loads(source.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DataError(f"{source.name} is not JSON: {error}") from error
+    source, content = Path(path), read_json(path, "sidecar")
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != _SCHEMA_VERSION:
         raise DataError(
             f"{source.name} has schema_version {version!r}, wanted {_SCHEMA_VERSION}: the sidecar "
             "that write_urdf puts beside a URDF"
         )
-    wrong = [key for key, kind in _ENTRIES.items() if not isinstance(content.get(key), kind)]
-    if wrong:
-        raise DataError(f"{source.name} lacks the entries {wrong}; write it again with write_urdf")
+    check_shape(content, _SHAPE, source.name)
     return dict(content)
 
 
@@ -142,11 +143,8 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
             f"{found[:12]}..., wanted {facts['urdf_sha256'][:12]}...; restore the file, or write "
             "both again"
         )
-    try:
-        couplings = [Coupling(c["name"], tuple(c["ratios"].items())) for c in facts["couplings"]]
-        drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
-    except (KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{Path(sidecar).name}: a coupling lacks {error}") from error
+    couplings = [Coupling(c["name"], tuple(c["ratios"].items())) for c in facts["couplings"]]
+    drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
     model = RobotModel.from_urdf(
         path,
         couplings=couplings,

@@ -28,6 +28,7 @@ __all__ = [
 ]
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
+_COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 
@@ -85,7 +86,7 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     pair = [value, value] if _is_number(value) else value
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
-    low, high = float(pair[0]), float(pair[1])
+    low, high = (math.inf if abs(x) > 1e300 else float(x) for x in pair)
     found = f"{what} is [{low:g}, {high:g}] kg"
     if not (math.isfinite(low) and math.isfinite(high)):
         raise SettingsError(f"{found}, wanted finite numbers; write a large one for no upper bound")
@@ -98,7 +99,7 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     """Return the two corners of a box."""
     try:
         corners = [[float(x) for x in corner] for corner in value]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         corners = []
     is_box = [len(corner) for corner in corners] == [3, 3]
     if not is_box or not all(math.isfinite(x) for corner in corners for x in corner):
@@ -208,7 +209,7 @@ class BoundedSettings(EstimatorSettings):
         64,
         "fits to redrawn data and prior that tell the standard errors where bounds bind; 0 leaves "
         "the bounds out of them",
-        within=Range("0, or 10 or more", lambda x: x == 0 or x >= 10),
+        within=Range("0, or 10 to 10000", lambda x: x == 0 or 10 <= x <= 10_000),
     )
     constraints: Mapping[str, Any] = setting(
         {}, "bounds beside physical consistency", reads=ConstraintSettings
@@ -231,7 +232,7 @@ class DescentSettings(RecursiveSettings):
     """Settings of estimators that step along a gradient, and end beside least squares."""
 
     average: bool = setting(True, "whether the iterates are averaged")
-    passes: int = setting(4, "largest number of passes over the logs", within=_FINITE)
+    passes: int = setting(4, "largest number of passes over the logs", within=_COUNT)
     seed: int = setting(0, "seed of the order of the samples; negative: that of time")
 
 
@@ -280,9 +281,11 @@ class LogCholeskySettings(ConsistentSettings):
         "log_cholesky", "the consistent fit without a cone, in log-Cholesky parameters"
     )
     starts: int = setting(
-        0, "random starts beside the one from the cone programme", within=_NOT_NEGATIVE
+        0,
+        "random starts beside the one from the cone programme",
+        within=Range("0 to 1000", lambda x: 0 <= x <= 1000),
     )
-    seed: int = setting(0, "seed of the random starts")
+    seed: int = setting(0, "seed of the random starts", within=_NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """NPZ, HDF5 and MATLAB files, arrays under paths, as tables of named columns."""
 
+import math
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -25,6 +25,7 @@ _CLOCKS = ("time", "t")
 _LISTS = ("joints", "joint_names")  # entries that name the columns of wide arrays
 _WIDE = {prefix[:-1] for kinds in prefixes().values() for prefix in kinds}  # q, position, ...
 _MAT73 = b"MATLAB 7.3"  # how a MAT file starts that is HDF5 inside
+_DENSEST = 1032  # bytes that deflate makes of one, at most
 _MAT_NAME = 63  # characters that MATLAB allows in a name
 
 
@@ -33,12 +34,16 @@ class NpzFormat(WritableFormat):
 
     def open(self, path: Path, source: LogSource) -> Table:
         arrays: dict[str, Array] = {}
-        broken = (OSError, EOFError, zlib.error, zipfile.BadZipFile)
-        with told(path, "NPZ", broken), zipfile.ZipFile(path), np.load(path) as file:
-            for name in file.files:
-                with suppress(ValueError):  # of pickled objects
-                    arrays[name] = np.asarray(file[name])
-        return _table_of_arrays(path.name, {n: _entry(a) for n, a in arrays.items()}, source)
+        with told(path, "NPZ"), zipfile.ZipFile(path) as file:
+            for member in file.namelist():
+                name = member.removesuffix(".npy")
+                with file.open(member) as stream:
+                    shape, dtype = _npy_header(stream)
+                    _require_room(path, name, shape)
+                if not dtype.hasobject:
+                    with file.open(member) as stream:
+                        arrays[name] = np.lib.format.read_array(stream)
+        return _table_of_arrays(path, {n: _entry(a) for n, a in arrays.items()}, source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         columns: dict[str, Any] = dict(table)
@@ -50,12 +55,16 @@ class Hdf5Format(WritableFormat):
     """HDF5 files, compressed when written; only the columns that are read are loaded."""
 
     def open(self, path: Path, source: LogSource) -> Table:
-        return _table_of_arrays(path.name, _datasets(path, is_matlab=False), source)
+        return _table_of_arrays(path, _datasets(path, is_matlab=False), source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
-        with _h5py("writing HDF5").File(path, "w") as file:
+        h5py = _h5py("writing HDF5")
+        # in memory first: on a full disk HDF5 itself ends the process
+        with h5py.File(path, "w", driver="core", backing_store=False) as file:
             for name, values in table.items():
                 file.create_dataset(name, data=values, compression="gzip", shuffle=True)
+            file.flush()
+            path.write_bytes(file.id.get_file_image())
 
 
 class MatFormat(WritableFormat):
@@ -65,7 +74,7 @@ class MatFormat(WritableFormat):
         with path.open("rb") as file:
             is_hdf5 = file.read(len(_MAT73)) == _MAT73
         entries = _datasets(path, is_matlab=True) if is_hdf5 else _mat_variables(path)
-        return _table_of_arrays(path.name, entries, source)
+        return _table_of_arrays(path, entries, source)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         from scipy.io import savemat
@@ -93,20 +102,23 @@ class _Entry:
 _Column: TypeAlias = tuple[str, int | None]
 
 
-def _table_of_arrays(where: str, entries: Mapping[str, _Entry], source: LogSource) -> Table:
+def _table_of_arrays(path: Path, entries: Mapping[str, _Entry], source: LogSource) -> Table:
     """Return the table in a file of arrays.
 
     A vector is a column of its own name. A matrix of N samples, along its longer side, is n
     columns ``q_<joint>`` in the order of an entry ``joints``, else ``q_0``, ``q_1``, ...
     """
+    where = path.name
     group = _group(where, list(entries), source.topic)
-    inside = {path[len(group) :]: path for path in entries if path.startswith(group)}
-    lists = [entries[inside[name]] for name in _LISTS if name in inside]
-    joints = next((_joint_names(entry) for entry in lists if not entry.is_number), [])
+    inside = {at[len(group) :]: at for at in entries if at.startswith(group)}
+    lists = [(name, entries[inside[name]]) for name in _LISTS if name in inside]
+    texts = [(name, entry) for name, entry in lists if not entry.is_number]
+    joints = _joint_names(where, *texts[0]) if texts else []
     columns: dict[str, _Column] = {}
-    for name, path in inside.items():
-        if entries[path].is_number:
-            columns |= _columns_of(where, name, path, entries[path].shape, joints)
+    for name, at in inside.items():
+        if entries[at].is_number:
+            _require_room(path, name, entries[at].shape)
+            columns |= _columns_of(where, name, at, entries[at].shape, joints)
     return Table(list(columns), partial(_read, where, entries, columns))
 
 
@@ -129,12 +141,33 @@ def _group(where: str, paths: Sequence[str], topic: str | None) -> str:
     return "" if chosen == "/" else chosen + "/"
 
 
-def _joint_names(entry: _Entry) -> list[str]:
+def _require_room(path: Path, name: str, shape: tuple[int, ...]) -> None:
+    """Refuse an array that is too large for its file, before it is allocated."""
+    size = path.stat().st_size
+    if math.prod(shape) > _DENSEST * size:
+        raise DataError(
+            f"{path.name}: {name} claims the shape {shape}, which no file of {size} bytes holds; "
+            "export it again"
+        )
+
+
+def _npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:  # noqa: ANN401
+    """Return shape and type of an array in NumPy's format."""
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0
+    if version != (1, 0):
+        read = np.lib.format.read_array_header_2_0  # of version 3, too, but for its encoding
+    shape, _, dtype = read(stream)
+    return shape, dtype
+
+
+def _joint_names(where: str, list_name: str, entry: _Entry) -> list[str]:
     """Return the names in an array of text."""
-    return [
-        (name.decode() if isinstance(name, bytes) else str(name)).strip()
-        for name in np.ravel(entry.load()).tolist()
-    ]
+    names = np.ravel(entry.load()).tolist()
+    try:
+        return [(n.decode() if isinstance(n, bytes) else str(n)).strip() for n in names]
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: a name in {list_name} is not UTF-8 text: {error}") from error
 
 
 def _columns_of(
@@ -203,7 +236,7 @@ def _h5py(purpose: str) -> ModuleType:
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Any]:
     h5py = _h5py("reading HDF5 and MATLAB v7.3")
-    with told(path, "HDF5", (OSError, RuntimeError)), h5py.File(path, "r") as file:
+    with told(path, "HDF5"), h5py.File(path, "r") as file:
         yield file
 
 
@@ -242,11 +275,12 @@ def _load_dataset(path: Path, name: str, *, is_matlab: bool) -> Any:  # noqa: AN
 
 def _mat_variables(path: Path) -> dict[str, _Entry]:
     """Return the variables of a MAT file before v7.3 by path, fields of structs among them."""
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
+    from scipy.io import loadmat, whosmat
 
-    broken = (MatReadError, ValueError, TypeError, OSError, EOFError, NotImplementedError)
-    with told(path, "MATLAB", broken):
+    with told(path, "MATLAB"):
+        for name, shape, kind in whosmat(path):
+            if kind != "sparse":
+                _require_room(path, name, shape)
         variables = loadmat(path, simplify_cells=True)
     entries: dict[str, _Entry] = {}
 
@@ -255,7 +289,8 @@ def _mat_variables(path: Path) -> dict[str, _Entry]:
             if isinstance(value, dict):
                 visit(f"{prefix}{name}/", value)
             elif not name.startswith("__"):
-                entries[prefix + name] = _entry(np.asarray(value))
+                with suppress(ValueError):  # of cells of several shapes, which are no array
+                    entries[prefix + name] = _entry(np.asarray(value))
 
     visit("", variables)
     return entries

@@ -113,7 +113,7 @@ class _CsvRows(RowReader):
             if line.isspace():
                 continue
             if line.count(separator) != count - 1:  # unless a separator stands in quotes
-                found = len(next(csv.reader([line], delimiter=separator)))
+                found = len(self._cells(line, number))
                 if found != count:
                     raise DataError(
                         f"{self.path.name}: line {number} has {found} cells, the header has "
@@ -121,16 +121,19 @@ class _CsvRows(RowReader):
                     )
             yield line
 
+    def _cells(self, line: str, number: int) -> list[str]:
+        return _split(self.path.name, line, self.separator, number)
+
     def _bad_cell(self, columns: list[int]) -> DataError:
         """Return the error that names the first cell that is not a number."""
         where = self.path.name
         with _open_csv(self.path) as file:
             file.readline()
             for row, line in enumerate(self._whole(file)):
-                cells = next(csv.reader([line], delimiter=self.separator))
+                cells = self._cells(line, row + 2)
                 for i in columns:
                     if not _is_number(cells[i]):
-                        found = repr(cells[i]) if cells[i].strip() else "empty"
+                        found = repr(cells[i][:80]) if cells[i].strip() else "empty"
                         hint = "; write decimals with a point" if "," in cells[i] else ""
                         return DataError(
                             f"{where}: {self.names[i]} is {found} at row {row}, wanted a "
@@ -160,11 +163,20 @@ def _csv_header(path: Path) -> tuple[list[str], str]:
     if not line.strip():
         raise DataError(f"{path.name} is empty; its first line must name the columns")
     separator = max(",;\t", key=line.count)  # the comma, if there is none
-    cells = next(csv.reader([line.strip("\r\n").lstrip("# ")], delimiter=separator))
+    cells = _split(path.name, line.strip("\r\n").lstrip("# "), separator, 1)
     names = [cell.strip() for cell in cells]
     if all(_is_number(name) for name in names):
         raise DataError(f"{path.name} has no header; its first line must name the columns")
     return names, separator
+
+
+def _split(where: str, line: str, separator: str, number: int) -> list[str]:
+    """Return the cells of a line; quotes may hold separators."""
+    try:
+        return next(csv.reader([line], delimiter=separator))
+    except (csv.Error, StopIteration) as error:
+        reason = str(error) or "no cells"
+        raise DataError(f"{where}: line {number} cannot be read ({reason}); correct it") from error
 
 
 def _is_number(text: str) -> bool:

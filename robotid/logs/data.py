@@ -19,6 +19,8 @@ from robotid.findings import listed
 
 __all__ = ["Log", "Trajectory"]
 
+_LARGEST = 1e30  # in any unit; what is computed from it is still a number
+
 
 @dataclass(frozen=True, eq=False)
 class Log:
@@ -248,7 +250,7 @@ def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
 def require_finite(
     values: Array, t: Array, names: Sequence[str], where: str, first: int = 0
 ) -> None:
-    """Refuse NaN and infinite values, naming the first.
+    """Refuse NaN, infinite values and those beyond 1e30, naming the first.
 
     Args:
         values: Shape (N, k).
@@ -258,15 +260,18 @@ def require_finite(
         first: Number in its file of the first row.
 
     Raises:
-        DataError: If a value is not finite.
+        DataError: If a value is not finite, or so large that its square may not be.
     """
-    if np.isfinite(values).all():
+    is_fine = np.abs(values) <= _LARGEST  # False for NaN, too
+    if is_fine.all():
         return
-    row, column = (int(i) for i in np.argwhere(~np.isfinite(values))[0])
-    found = "NaN" if np.isnan(values[row, column]) else str(values[row, column])
+    row, column = (int(i) for i in np.argwhere(~is_fine)[0])
+    value = values[row, column]
+    found = "NaN" if np.isnan(value) else f"{value:g}" if np.isfinite(value) else str(value)
+    what = ", beyond any robot's," if np.isfinite(value) else ""
     at = f" (t = {t[row]:.6g} s)" if np.isfinite(t[row]) else ""
     raise DataError(
-        f"{where}: {names[column]} is {found} at row {first + row}{at}; remove the row or "
+        f"{where}: {names[column]} is {found}{what} at row {first + row}{at}; remove the row or "
         "correct the recording",
         code="not_finite",
     )

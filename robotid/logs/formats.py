@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from robotid._files import written_whole
+from robotid._files import missing_file, written_whole
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
@@ -26,6 +26,7 @@ _FORMATS: dict[str, Format] = {
     ".db3": BagFormat(),
     ".bag": BagFormat(),
 }
+_LONGEST_NAME = 1000  # characters of a column
 
 
 def open_table(path: Path, source: LogSource) -> Table:
@@ -39,8 +40,20 @@ def open_table(path: Path, source: LogSource) -> Table:
         DataError: If the file is missing, of another suffix or broken, or its table is not found.
         MissingDependencyError: If a package that reads it is not installed.
     """
+    table = _format_of(path).open(path, source)
+    for name in table.names:
+        if len(name) > _LONGEST_NAME:
+            raise DataError(
+                f"{path.name}: a column has a name of {len(name)} characters, {name[:40]!r}...; "
+                f"wanted at most {_LONGEST_NAME}"
+            )
+    return table
+
+
+def _format_of(path: Path) -> Format:
+    """Return the format of a log, which is there."""
     if path.is_dir():
-        return BagFormat().open(path, source)
+        return BagFormat()
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         raise DataError(
@@ -48,8 +61,8 @@ def open_table(path: Path, source: LogSource) -> Table:
             f"not {suffix!r}; convert it"
         )
     if not path.is_file():
-        raise DataError(f"there is no log file {str(path)!r}")
-    return _FORMATS[suffix].open(path, source)
+        raise DataError(missing_file(path, "log file"))
+    return _FORMATS[suffix]
 
 
 def write_columns(table: Mapping[str, Array], path: Path) -> None:

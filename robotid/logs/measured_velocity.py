@@ -21,6 +21,7 @@ __all__ = [
 LATE = 0.02
 #: A channel of fewer steps than this over its range is uninformative.
 COARSE = 100
+_FEWEST = 8  # rows of a stretch in which a lag is sought
 _LONGEST = 0.3  # [s] lags are sought up to this
 _GAP = 5  # a step longer than this many median steps is a gap
 _STRETCH = 0.1  # [s] motion is compared over stretches this long: noise averages out
@@ -68,7 +69,7 @@ def velocity_lag(log: Log) -> float:
     longest = min(int(_LONGEST / step) + 1, max(map(len, parts)) // 4)
     shifts = np.arange(-longest, longest + 1)
     total = np.zeros(len(shifts))
-    for part in (rows for rows in parts if len(rows) >= max(4 * longest, 2)):
+    for part in (rows for rows in parts if len(rows) >= max(4 * longest, _FEWEST)):
         t = log.t[part]
         grid = np.arange(t[0], t[-1], step)
         slope = np.gradient([np.interp(grid, t, x) for x in q[part].T], step, axis=1)

@@ -98,7 +98,7 @@ def _open(path: Path, wanted: Sequence[str] = (), buffer: int = 0) -> Iterator[A
     """Open a Parquet file; columns that are wanted must hold numbers."""
     pa = load_pyarrow("reading Parquet")
     with (
-        told(path, "Parquet", (pa.ArrowInvalid, OSError)),
+        told(path, "Parquet"),
         pa.parquet.ParquetFile(path, buffer_size=buffer) as file,
     ):
         for name in wanted:

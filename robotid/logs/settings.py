@@ -11,6 +11,7 @@ __all__ = ["PER_SECOND", "LogSource", "LogUnits", "SignalSettings"]
 
 #: Divisors that turn a time unit into seconds.
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_HZ = Range("0.001 to 1e6", lambda x: 1e-3 <= x <= 1e6)
 _MEASURED = ("auto", "measured", "differentiated")
 _DELAY = Range("seconds between -1 and 1", lambda x: abs(x) <= 1)
 
@@ -29,12 +30,12 @@ class SignalSettings(Settings):
         None,
         "rate of the uniform grid [Hz]; if not stated, the log's median rate (and, without a "
         "filter, the rows as they are)",
-        within=POSITIVE,
+        within=_HZ,
     )
     cutoff: float | None = setting(
         8.0,
         "cut-off of the zero-phase Butterworth filter [Hz]; false (None in Python) for no filter",
-        within=POSITIVE,
+        within=_HZ,
         reads=(int, float, bool),
         load=_load_cutoff,
         dump=lambda value: False if value is None else value,
@@ -72,7 +73,7 @@ class SignalSettings(Settings):
         "speed from which Coulomb friction has its full size [rad/s], of joints that slide as for "
         "min_velocity: it changes linearly between that speed and its negative; 0: at once, as "
         "Coulomb has it",
-        within=NOT_NEGATIVE,
+        within=Range("0, or 1e-9 or more", lambda x: x == 0 or x >= 1e-9),
     )
     max_gap: float | None = setting(
         None,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.friction_direction import acting_directions
 from robotid.logs.settings import SignalSettings
@@ -20,6 +20,7 @@ __all__ = ["SPLINE", "Stretch", "filter_reach", "low_pass", "process_stretches",
 SPLINE = 64
 _FORGOTTEN = 42.0  # e-folds after which nothing is left of a filter's transient: 6e-19
 _LONGEST = 8.0  # periods of the filter: what is slow for longer is not taken to stick
+_FINEST = 1000  # points of the uniform grid per row of the log, at most
 _ALL = slice(None)
 
 
@@ -213,6 +214,11 @@ class _Grid:
         keep_every = max(1, round(native / settings.rate)) if settings.cutoff is not None else 1
         step = 1.0 / (settings.rate * keep_every)
         count = int(np.floor((stretch.end - stretch.start) / step * (1 + 1e-12))) + 1
+        if count > _FINEST * stretch.rows:
+            raise SettingsError(
+                f"{stretch.rows} rows over {stretch.end - stretch.start:.6g} s would become "
+                f"{count} at {1 / step:.6g} Hz; lower rate, or max_gap if the clock jumps"
+            )
         return cls(stretch.start, stretch.start + step * (count - 1), step, count, keep_every)
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robotid._typing import Array
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, RobotIdError
 from robotid.findings import listed
 from robotid.logs.settings import LogSource
 
@@ -161,18 +161,20 @@ def topic_note(path: Path, source: LogSource) -> tuple[str, ...]:
 
 
 @contextmanager
-def told(path: Path, kind: str, errors: tuple[type[Exception], ...]) -> Iterator[None]:
+def told(path: Path, kind: str) -> Iterator[None]:
     """Tell in our words what a reader says of a broken file.
 
     Args:
         path: The file.
         kind: Name of its format.
-        errors: What the reader raises.
 
     Raises:
-        DataError: In the place of those.
+        DataError: In the place of what it raises.
     """
     try:
         yield
-    except errors as error:
-        raise DataError(f"{path.name}: broken {kind} file ({error}); export it again") from error
+    except RobotIdError:
+        raise
+    except Exception as error:  # a parser of foreign bytes fails in many ways
+        reason = f"{type(error).__name__}: {error}"[:200]
+        raise DataError(f"{path.name}: broken {kind} file ({reason}); export it again") from error

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._files import folder_beside, write_json
+from robotid._files import check_folder, folder_beside, write_json
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.paper.equations import PlanarDynamics, torque
 from robotid.paper.errata import EnergyDrift, energy_drift, errata
@@ -65,6 +65,7 @@ def run_paper(
     chosen = settings or PaperSettings()
     report = progress or ignore_progress
     target = Path(folder)
+    check_folder(target, ["paper.html", "paper.json", "planar_2r.urdf", "replay.html"])
     target.mkdir(parents=True, exist_ok=True)
     studies = [
         study_model(name, chosen, progress=_counter(name, chosen.iterations, report))

@@ -6,7 +6,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from robotid._files import write_text
+from robotid._files import check_file, write_text
 from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
@@ -80,7 +80,9 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
 
     Raises:
         DataError: If the results cannot be compared, or the folder of the target is missing.
+        SettingsError: If the target is a folder.
     """
+    check_file(Path(target))
     content = compare_results(paths)
     write_text(_page(content), target)
     return content
@@ -199,7 +201,8 @@ def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | Non
     if one["std_error"] is None or other["std_error"] is None:
         return None
     combined = math.hypot(one["std_error"], other["std_error"])
-    return (other["value"] - one["value"]) / combined if combined > 0 else None
+    ratio = (other["value"] - one["value"]) / combined if combined > 0 else math.inf
+    return ratio if math.isfinite(ratio) else None
 
 
 def _chosen(result: Mapping[str, Any]) -> dict[str, Any]:
@@ -262,7 +265,7 @@ def _page(content: Mapping[str, Any]) -> str:
 
 def _verdicts(content: Mapping[str, Any]) -> str:
     return "".join(
-        f'<div class="verdict {result["verdict"]["status"]}"><p>{result["label"]}: '
+        f'<div class="verdict {escape(result["verdict"]["status"])}"><p>{result["label"]}: '
         f"<strong>{escape(result['verdict']['status'])}</strong> "
         f"({escape(result['estimator'])}) {code(result['path']).html}</p>"
         f"<ul>{''.join(f'<li>{escape(r)}</li>' for r in result['verdict']['reasons'])}</ul></div>\n"

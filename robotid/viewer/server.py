@@ -1,6 +1,7 @@
 """A live page: a server on this machine alone, which tells it what is sent."""
 
 import json
+import sys
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -36,11 +37,10 @@ class LivePage:
         self._news = threading.Condition()
         handler = type("Handler", (_Handler,), {"live": self})
         try:
-            self._server = ThreadingHTTPServer(("127.0.0.1", port), handler)
+            self._server = _Server(("127.0.0.1", port), handler)
         except OSError as error:
             message = f"port {port} of 127.0.0.1: {error.strerror}; name another one, or none"
             raise OSError(message) from error
-        self._server.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
@@ -93,6 +93,15 @@ class LivePage:
             return kept[len(kept) - new :], self._sent, self._over
 
 
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
+        """Say nothing of a page that was closed in the middle of a request or of an answer."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 class _Handler(BaseHTTPRequestHandler):
     live: LivePage
 
@@ -105,10 +114,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(self.live.page)
         elif self.path == "/events":
             self._start("text/event-stream", None)
-            try:
-                self._tell()
-            except (BrokenPipeError, ConnectionResetError):
-                return  # the page was closed
+            self._tell()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 

@@ -5,7 +5,6 @@ import json
 import logging
 import os
 import shutil
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,7 +73,8 @@ class Checkpoint:
 
     def finished(self) -> frozenset[int]:
         """Return the indices of the pieces whose reductions are kept."""
-        return frozenset(int(path.stem.split("-")[1]) for path in self.folder.glob("piece-*.npz"))
+        found = self.folder.glob(f"piece-{'[0-9]' * 6}.npz")
+        return frozenset(int(path.stem.split("-")[1]) for path in found)
 
     def load(self, index: int) -> Reduction:
         """Return a reduction that is kept, to the same bits.
@@ -89,7 +89,7 @@ class Checkpoint:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 content = dict(arrays)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except Exception as error:  # a broken archive fails in many ways
             raise DataError(
                 f"{path} cannot be read ({error}); delete it, its piece is reduced again",
                 "checkpoint",

@@ -191,26 +191,29 @@ def named(piece: Workload) -> Iterator[None]:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back until the context ends; workers started meanwhile never hear it.
+    """Hold Ctrl-C, SIGTERM and SIGHUP back until the context ends.
 
-    In the middle of the pool's own functions it would leave locks that nobody opens.
+    In the middle of the pool's own functions they would leave locks that nobody opens. Workers
+    started meanwhile never hear Ctrl-C.
     """
     heard: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
-    is_ours = threading.current_thread() is threading.main_thread() and before is not None
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in (signal.Signals[n] for n in names)}
+    is_ours = threading.current_thread() is threading.main_thread()
+    held = {number: handler for number, handler in before.items() if callable(handler) and is_ours}
     can_mask = hasattr(signal, "pthread_sigmask")
-    if is_ours:
-        signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    for number in held:
+        signal.signal(number, lambda number, _: heard.append(number))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_mask else None
     try:
         yield
     finally:
         if mask is not None:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        if is_ours:
-            signal.signal(signal.SIGINT, before)
+        for number, handler in held.items():
+            signal.signal(number, handler)
         if heard:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(heard[0])
 
 
 def _start_worker(parent: int) -> None:

@@ -1,6 +1,8 @@
 """`convert` writes what a robot recorded under standard names, or nothing."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -119,6 +121,29 @@ def test_the_command_refuses_by_name_and_leaves_what_was_there(tmp_path, bag, ca
     assert "run.mcap: logs are written as .csv, " in capsys.readouterr().err
     assert target.read_text() == "precious"
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "run.csv"}
+
+
+FULL_DISK = """
+import resource, sys
+from robotid.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+sys.exit(main(["convert", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "h5", "hdf5", "mat"])
+def test_on_a_full_disk_the_old_file_stays_and_no_part_of_the_new(tmp_path, suffix):
+    t, q = np.arange(20_000) / 100, np.random.default_rng(0).normal(size=20_000)
+    np.savez(tmp_path / "in.npz", time=t, q_a=q)
+    target = tmp_path / f"out.{suffix}"
+    target.write_text("precious")
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "in.npz"), str(target)]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 1
+    assert run.stderr.startswith("robotid: [Errno 27] ")
+    assert run.stderr.endswith(f"\n  while writing {str(target)!r}\n")
+    assert target.read_text() == "precious"
+    assert {path.name for path in tmp_path.iterdir()} == {"in.npz", target.name}
 
 
 def test_a_job_reads_a_bag_and_its_result_validates_on_it(tmp_path, ur5, rng, capsys):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -83,14 +84,31 @@ def test_a_cluster_gives_the_same_result_to_the_last_bit(job, expected, tmp_path
     assert (tmp_path / "result.json").read_text() == expected
 
 
-def cut_off(job, out, number, workers):
-    """Start the command line, send it a signal once three pieces are kept; code and stderr."""
+def children(pid):
+    """Return the processes that another one started, and they in turn."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it ended meanwhile
+            own, state, parent = re.fullmatch(
+                r"(\d+) \(.*\) (\w) (\d+) .*", stat.read_text().strip()
+            ).groups()
+            found += [int(own), *children(own)] if parent == str(pid) and state != "Z" else []
+    return found
+
+
+def cut_off(job, out, number, workers, ended=None):
+    """Start the command line, send it a signal once three pieces are kept; code and stderr.
+
+    The processes that it had started are added to ``ended``.
+    """
     mark = out.with_name("three pieces are kept")
     command = [sys.executable, HELD, mark, "3", "identify", job, "--out", out, "--workers", workers]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     while not mark.exists():
         assert run.poll() is None, run.stderr.read()
         time.sleep(0.01)
+    if ended is not None:
+        ended += children(run.pid)
     (os.killpg if number == signal.SIGINT else os.kill)(run.pid, number)
     _, error = run.communicate(timeout=60)
     return run.returncode, error
@@ -107,6 +125,23 @@ def test_a_killed_run_resumes_to_the_same_bits_and_does_only_what_is_missing(
     assert "reducing 24 pieces, 3 of them kept from before" in capsys.readouterr().err
     assert (out / "result.json").read_text() == expected
     assert not (out / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_to_end_is_heard_as_ctrl_c_is(job, expected, tmp_path, number, code):
+    out, workers = tmp_path / "out", []
+    found, error = cut_off(job, out, number, "2", workers)
+    assert found == code
+    assert error.count("\n") == 1
+    assert error.startswith("robotid: interrupted; finished pieces are kept in ")
+    assert [path.name for path in out.iterdir()] == [CHECKPOINT]
+    assert len(workers) >= 2
+    end = time.monotonic() + 10
+    while alive := [pid for pid in workers if Path(f"/proc/{pid}").exists()]:
+        assert time.monotonic() < end, alive
+        time.sleep(0.02)
+    assert main(["identify", job, "--out", str(out), "--resume"]) == 0
+    assert (out / "result.json").read_text() == expected
 
 
 def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, tmp_path):

@@ -166,7 +166,8 @@ def test_an_empty_folder_and_a_second_track_are_refused(tmp_path):
     with pytest.raises(Exception, match=r"there is no result\.json or track\.json in"):
         read_findings([tmp_path])
     for k in (1, 2):
-        (tmp_path / f"{k}.json").write_text('{"history": "", "changes": [], "settings": {}}')
+        content = {"history": "", "changes": [], "settings": {}, "base_parameters": []}
+        (tmp_path / f"{k}.json").write_text(json.dumps(content))
     with pytest.raises(Exception, match="2 tracks were given; a replay shows one"):
         read_findings([tmp_path / "1.json", tmp_path / "2.json"])
 

@@ -180,7 +180,7 @@ def test_consistency_tells_mass_and_eigenvalue_of_each_body(result, identified):
 
 
 def test_inputs_tell_files_hashes_windows_and_rows(result, identified):
-    urdf, *logs = result["inputs"]
+    urdf, *logs = map(dict, result["inputs"])
     path = identified.model.tree.path
     digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     assert urdf == {"role": "urdf", "path": str(path), "sha256": digest}
@@ -225,7 +225,7 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
     with pytest.raises(DataError, match=r"^result\.json has schema_version 2, wanted 1 of a"):
         read_result(path)
     path.write_text(json.dumps({k: v for k, v in result.items() if k != "inputs"}))
-    with pytest.raises(DataError, match=r"^result\.json has no \['inputs'\]; identify again"):
+    with pytest.raises(DataError, match=r"^result\.json has no entry 'inputs': it is not whole"):
         read_result(path)
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
     with pytest.raises(ModelError, match=r"^the result has no value of \['shoulder_pan_joint\.arm"):

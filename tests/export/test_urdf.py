@@ -418,13 +418,13 @@ def test_a_pair_that_does_not_belong_together_is_refused(source, tmp_path, rng):
 
 
 SIDECAR_FAULTS = {
-    "missing": (None, "there is no sidecar '.*; it is written beside the URDF"),
+    "missing": (None, "there is no sidecar '.*new.drive.json'"),
     "no JSON": ("{", "new.drive.json is not JSON: "),
     "a list": ("[]", "has schema_version None, wanted 1"),
     "other schema": ('{"schema_version": 2}', "has schema_version 2, wanted 1"),
     "entries": (
         '{"schema_version": 1, "joints": 3}',
-        r"lacks the entries \['urdf_sha256', 'joints'",
+        "new.drive.json has no entry 'urdf_sha256': it is not whole",
     ),
 }
 
@@ -447,7 +447,7 @@ def test_a_sidecar_with_a_missing_drive_is_refused(source, tmp_path, rng):
         load_identified(tmp_path / "new.urdf", sidecar)
     del content["couplings"][0]["ratios"]
     sidecar.write_text(json.dumps(content))
-    with pytest.raises(DataError, match=r"new.drive.json: a coupling lacks 'ratios'"):
+    with pytest.raises(DataError, match=r"couplings\[0\] has no entry 'ratios'"):
         load_identified(tmp_path / "new.urdf", sidecar)
 
 

@@ -122,7 +122,7 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
         ({"name": "kalman", "gate": True}, "gate is True, wanted 0.5 <= x < 1, or false"),
         ({"name": "prx", "step": "paper"}, "step is 'paper', wanted one of exact, printed"),
         ({"name": "prx", "metric": "D"}, "metric is 'D', wanted one of"),
-        ({"name": "prx", "passes": 0}, "passes is 0, wanted a positive, finite"),
+        ({"name": "prx", "passes": 0}, "passes is 0, wanted 1 to 10000"),
         ({"name": "gradient", "step_size": 2.0}, "step_size is 2.0, wanted 0 < x < 2"),
     ],
 )

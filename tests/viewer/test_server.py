@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import socket
+import struct
 import threading
 import time
 
@@ -64,6 +66,22 @@ def test_a_page_opened_late_and_one_opened_early_hear_the_same(live):
     listener.join(10)
     late = told(live.url)
     assert early == late == [{"t": k} for k in range(50)]
+
+
+@pytest.mark.parametrize("words", ["", "GET / HTTP/1.1\r\n", "GET /events HTTP/1.1\r\n"])
+def test_a_client_that_breaks_off_leaves_no_trace(live, capfd, words):
+    live.page = b"x" * 2**24  # more than any buffer on its way
+    host, _, port = live.url.removeprefix("http://").rstrip("/").partition(":")
+    for end in ("", "Host: localhost\r\n\r\n"):
+        with socket.create_connection((host, int(port))) as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            client.sendall((words + end).encode())
+            time.sleep(0.05)
+    live.send({"t": 0.0})
+    live.send({"t": 1.0})
+    assert ask(live.url, "/none")[1].status == 404
+    time.sleep(0.1)
+    assert capfd.readouterr().err == ""
 
 
 def test_only_the_newest_messages_are_kept(monkeypatch):
@@ -129,6 +147,9 @@ def test_a_tracker_tells_motion_torque_parameters_and_changes(panda, words, tmp_
 
 def test_a_wrong_speed_is_refused(words, tmp_path, capsys):
     assert main(["track", *words[1], "--out", str(tmp_path), "--serve", "--speed", "-1"]) == 2
-    assert "speed is -1.0, wanted 0 or more" in capsys.readouterr().err
+    assert "speed is -1.0, wanted 0, or 0.001 or more" in capsys.readouterr().err
+    assert main(["track", *words[1], "--out", str(tmp_path), "--serve", "--speed", "1e-300"]) == 2
+    assert main(["track", *words[1], "--out", str(tmp_path), "--serve", "99999"]) == 2
+    assert "port is 99999, wanted 1 to 65535" in capsys.readouterr().err
     with pytest.raises(SettingsError, match="speed is nan"):
         serve_track(None, None, speed=float("nan"), announce=print)

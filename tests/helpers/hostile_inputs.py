@@ -1,0 +1,714 @@
+"""Hostile inputs of every kind, and what is done with each: a traceback is a failure.
+
+``tests/test_hostile_inputs.py`` tries some of each kind, ``benchmarks/bench_fuzz.py`` thousands.
+"""
+
+import contextlib
+import copy
+import io
+import json
+import tempfile
+import tomllib
+import warnings
+import zipfile
+from functools import cache, partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import scipy.io
+from hypothesis import strategies as st
+
+from helpers.paths import URDF as URDF_FOLDER
+from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
+from helpers.synthetic import exact_log, truth
+from robotid.cli import main
+from robotid.commands.job import Job
+from robotid.identification.settings import ESTIMATORS
+from robotid.logs.read import write_log
+from robotid.robot.model import RobotModel
+
+__all__ = ["KINDS"]
+
+URDF = str(URDF_FOLDER / "planar_2r.urdf")
+JOINTS = ("joint_1", "joint_2")
+COLUMNS = ["time", *(f"{kind}_{joint}" for kind in ("q", "dq", "tau") for joint in JOINTS)]
+
+# --- what is done with an input ------------------------------------------------------------------
+
+
+def obey(*words, out=None):
+    """Run a command line: it ends in its own words, and what it leaves is whole or nothing.
+
+    ``out`` is the file, or the folder, that it writes to.
+    """
+    before = None if out is None else files_in(out)
+    shown, error = io.StringIO(), io.StringIO()
+    with (
+        contextlib.redirect_stdout(shown),
+        contextlib.redirect_stderr(error),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as end:  # of argparse
+            code = end.code
+    assert code in (0, 1, 2), f"exit code {code}"
+    assert "Traceback" not in error.getvalue()
+    assert len(error.getvalue()) < 20_000, "an error of pages"
+    if out is not None and code != 0:
+        assert files_in(out) == before, f"half-written: {files_in(out)}"
+    if out is not None:
+        hidden = [name for name in files_in(Path(out).parent) if "/." in name]
+        assert not hidden, f"left behind: {hidden}"
+    return code
+
+
+def files_in(place):
+    place = Path(place)
+    found = place.rglob("*") if place.is_dir() else [place] if place.exists() else []
+    return sorted(str(path) for path in found if path.is_file())
+
+
+def read_log_file(write, suffix, example, folder):
+    """Examine and convert what ``write`` makes of an example."""
+    path = folder / f"in{suffix}"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write(example, path)
+    except Exception:  # that library cannot write it: then nobody has such a file
+        return
+    obey("doctor", URDF, path)
+    obey("convert", path, folder / "out.csv", out=folder / "out.csv")
+
+
+def identify_from(write, suffix, example, folder):
+    path, out = folder / f"in{suffix}", folder / "out"
+    write(example, path)
+    obey("identify", URDF, path, "--validate", path, "--out", out, out=out)
+
+
+# --- bytes that were spoilt ----------------------------------------------------------------------
+
+
+@cache
+def good_log(samples=60):
+    model = RobotModel.from_urdf(URDF)
+    rng = np.random.default_rng(0)
+    return exact_log(model, truth(model), rng, samples=samples, rate=50.0, noise=0.1)
+
+
+@cache
+def good_file(name):
+    """Return the bytes of a valid file of a kind."""
+    log = good_log()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        table = {"time": log.t, "q": log.q, "tau": log.tau, "joints": np.array(JOINTS)}
+        match name:
+            case "log.mcap":
+                write_mcap(path, messages_of(log))
+            case "log.bag":
+                write_bag1(path, messages_of(log))
+            case "log.db3":
+                write_bag2(path.with_suffix(""), {"/joint_states": messages_of(log)})
+                path = next(path.with_suffix("").glob("*.db3"))
+            case "plain.mat":
+                scipy.io.savemat(path, table)
+            case "plain.npz":
+                np.savez(path, **table)
+            case "plain.h5":
+                table["joints"] = [joint.encode() for joint in JOINTS]
+                write_hdf5(table, path)
+            case _:
+                write_log(log, path)
+        return path.read_bytes()
+
+
+SPECIAL = [
+    b"\0",
+    b"\xff",
+    b"\n",
+    b",",
+    b'"',
+    b"nan",
+    b"1e308",
+    b"\0\0\0\0",
+    b"\xff\xff\xff\xff",
+    b"\xff\xff\xff\x7f",
+    b"\x80",
+    b"-",
+    b"'",
+    b"(",
+    b"9" * 30,
+]
+
+
+@st.composite
+def spoilt(draw, name):
+    """Bytes of a valid file after a few edits."""
+    content = bytearray(good_file(name))
+    new = st.sampled_from(SPECIAL) | st.binary(min_size=1, max_size=8)
+    for _ in range(draw(st.integers(1, 4))):
+        at, length = draw(st.integers(0, len(content))), draw(st.integers(0, 64))
+        # headers and indices stand at the ends of a file
+        at = draw(st.sampled_from([at, at % 256, max(len(content) - at % 256, 0)]))
+        match draw(
+            st.sampled_from(["overwrite", "overwrite", "insert", "delete", "cut", "repeat"])
+        ):
+            case "overwrite":
+                part = draw(new)
+                content[at : at + len(part)] = part
+            case "insert":
+                content[at:at] = draw(new)
+            case "delete":
+                del content[at : at + length]
+            case "cut":
+                del content[at:]
+            case "repeat":
+                content[at:at] = content[at : at + length]
+    return bytes(content)
+
+
+def write_bytes(content, path):
+    path.write_bytes(content)
+
+
+# --- tables of hostile values --------------------------------------------------------------------
+
+NUMBERS = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    1e-320,
+    1e-308,
+    1e-30,
+    1e30,
+    1e150,
+    1e300,
+    1e308,
+    -1e308,
+    np.nan,
+    np.inf,
+    -np.inf,
+    1e6,
+    1.7e9,
+    1.7e18,
+    2**53,
+    np.pi,
+    360.0,
+]
+numbers = st.sampled_from(NUMBERS) | st.floats()
+
+
+@st.composite
+def columns(draw, rows=None, numbers=numbers):
+    """A table of columns, most of it good, some of it hostile."""
+    if rows is None:
+        rows = draw(st.sampled_from([0, 1, 2, 2, 3, 5, 6, 40]))
+    log = good_log(max(rows, 60))
+    good = np.column_stack([log.t, log.q, log.v, log.tau])[:rows]
+    table = {name: good[:, k].copy() for k, name in enumerate(COLUMNS)}
+    for _ in range(draw(st.integers(0, 4))):
+        name = draw(st.sampled_from(sorted(table)))
+        action = draw(st.sampled_from(["one", "all", "scale", "jump", "shift", "drop", "rename"]))
+        if action == "drop" and len(table) > 1:
+            del table[name]
+        elif action == "rename":
+            table[draw(names)] = table.pop(name)
+        elif rows:
+            _spoil(table[name], action, draw(st.integers(0, rows - 1)), draw(numbers))
+    return table
+
+
+def _spoil(values, action, row, number):
+    with np.errstate(all="ignore"):
+        match action:
+            case "one":
+                values[row] = number
+            case "all":
+                values[:] = number
+            case "scale":
+                values *= number
+            case "jump":
+                values[row:] += number
+            case "shift":
+                values += number
+
+
+#: Numbers that a reader lets through.
+MILD = [0.0, -1.0, 1e-300, 1e-30, 1e-9, 1e-3, 0.1, 0.5, 2.0, np.pi, 10.0, 1e3, 1e6, 1e9, 1e20, 1e29]
+names = st.sampled_from(
+    [
+        "",
+        " ",
+        "t",
+        "time",
+        "q_",
+        "_",
+        "q_joint_1",
+        "tau_joint_3",
+        "nan",
+        "x" * 300,
+        "time,t",
+        '"',
+        "é",
+        "\U0001f916",
+        "a/b",
+        "#x",
+        "current_joint_1",
+    ]
+)
+
+
+def write_csv(table, path):
+    rows = [
+        ",".join(table),
+        *(",".join(map(repr, map(float, row))) for row in zip(*table.values(), strict=True)),
+    ]
+    path.write_text("\n".join(rows), encoding="utf-8")
+
+
+def write_npz(table, path):
+    np.savez(path, **table)
+
+
+def write_mat(table, path):
+    scipy.io.savemat(path, table)
+
+
+def write_hdf5(table, path):
+    with h5py.File(path, "w") as file:
+        for name, values in table.items():
+            file.create_dataset(name, data=values)
+
+
+def write_parquet(table, path):
+    pyarrow.parquet.write_table(pyarrow.table(table), path)
+
+
+# --- containers that claim what they do not hold -------------------------------------------------
+
+#: What stands where an array of numbers should.
+ODD = [
+    np.array(["a", "b"]),
+    np.array(b"\xff\xfe"),
+    np.array([b"\xff", b"joint_1"]),
+    np.array(1.0),
+    np.zeros((2, 3, 4)),
+    np.zeros((0, 3)),
+    np.zeros(0),
+    np.array([1j, 2j]),
+    np.array([True, False]),
+    np.zeros(3, dtype=[("a", "f8"), ("b", "U3")]),
+    np.array([0, 2**63], dtype=np.uint64),
+    np.array(["2020-01-01"], dtype="datetime64[D]"),
+    np.full((60, 5), 1e308),
+    np.zeros((60, 1)),
+    np.array(["joint_1", "joint_2"]),
+    np.array(["joint_1"] * 3),
+    np.arange(60.0).reshape(1, 60),
+]
+odd = st.sampled_from(ODD)
+keys = st.sampled_from(
+    ["time", "t", "q", "tau", "joints", "joint_names", "dq", "a/time", "a/q", "#"]
+)
+shapes = st.lists(
+    st.sampled_from([0, 1, 2, 60, 10**6, 10**9, 10**12, 2**31 - 1, 2**40, -1]), max_size=4
+)
+arrays = st.dictionaries(keys, odd, max_size=6)
+
+
+@st.composite
+def headers(draw):
+    """Members of a zip whose NumPy headers claim anything."""
+    made = {}
+    for name in draw(st.lists(keys, min_size=1, max_size=4, unique=True)):
+        shape = tuple(draw(shapes))
+        kind = draw(
+            st.sampled_from(["<f8", "|O", "<U9", ">i2", "<M8[s]", "nonsense", "<f16", "|V0"])
+        )
+        text = draw(
+            st.sampled_from(
+                [
+                    repr({"descr": kind, "fortran_order": draw(st.booleans()), "shape": shape}),
+                    repr({"descr": kind, "shape": shape}),
+                    "{" * 200,
+                    "__import__('os')",
+                    "",
+                ]
+            )
+        )
+        version = draw(st.sampled_from([b"\1\0", b"\2\0", b"\3\0", b"\x09\0"]))
+        size = len(text).to_bytes(2 if version == b"\1\0" else 4, "little")
+        made[name] = b"\x93NUMPY" + version + size + text.encode() + draw(st.binary(max_size=64))
+    return made
+
+
+def write_members(members, path):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(f"{name}.npy", content)
+
+
+def write_odd_hdf5(content, path):
+    """Write arrays, sizes that are only claimed, text of all kinds, and links into nowhere."""
+    made, claimed, links = content
+    with h5py.File(path, "w") as file:
+        for name, values in made.items():
+            is_text = values.dtype.kind == "U"
+            kind = h5py.string_dtype() if is_text else None
+            file.create_dataset(name, data=values.astype(object) if is_text else values, dtype=kind)
+        for name, shape in claimed.items():
+            if name not in file:
+                file.create_dataset(
+                    name, shape=tuple(abs(x) for x in shape), dtype="f8", chunks=True
+                )
+        for name, link in links.items():
+            if name not in file:
+                file[name] = link if link is not None else file["/"]
+
+
+links = st.dictionaries(
+    st.sampled_from(["a", "b", "time", "q"]),
+    st.sampled_from(
+        [None, h5py.SoftLink("/none"), h5py.SoftLink("/a"), h5py.ExternalLink("no.h5", "/x")]
+    ),
+    max_size=3,
+)
+odd_hdf5 = st.tuples(arrays, st.dictionaries(keys, shapes, max_size=3), links)
+
+
+def cell_array(items):
+    """Return what SciPy writes as a cell array."""
+    made = np.empty(len(items), dtype=object)
+    for k, item in enumerate(items):
+        made[k] = item
+    return made
+
+
+cells = st.recursive(
+    odd,
+    lambda inner: (
+        st.lists(inner, max_size=3).map(cell_array) | st.dictionaries(keys, inner, max_size=3)
+    ),
+)
+
+
+def write_odd_mat(content, path):
+    scipy.io.savemat(
+        path, {name.replace("/", "_"): x for name, x in content.items() if name != "#"}
+    )
+
+
+# --- settings ------------------------------------------------------------------------------------
+
+JOB = f"""
+urdf = "{URDF}"
+[[identification]]
+log = "fit.csv"
+"""
+plain = st.one_of(
+    st.sampled_from(
+        ["", "x", "joint_1", "a\0b", "\U0001f916", "auto", "none", "x" * 3000, "$X", "../x"]
+    ),
+    st.sampled_from([0, 1, -1, 2, 3, 10**9, 10**40, 2**63, 0.5, 1e-320, 1e308, -1e308, 1e30, 1e6]),
+    st.sampled_from([float("nan"), float("inf"), -float("inf"), True, False]),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=8).filter(lambda text: text.isprintable()),
+)
+words = st.sampled_from([*JOINTS, "link_1", "link_2", "torque_scale", "name", "ratios", "x", ""])
+values = st.recursive(
+    plain,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(words, inner, max_size=3),
+    max_leaves=6,
+)
+
+
+def _paths(table, prefix=()):
+    """Yield the path of every key of a schema."""
+    for key, kind in table.items():
+        yield (*prefix, key)
+        inner = kind[0] if isinstance(kind, list) else kind
+        if isinstance(inner, dict):
+            yield from _paths(inner, (*prefix, key))
+
+
+PATHS = sorted(_paths(Job.schema()))
+
+
+@st.composite
+def jobs(draw):
+    """The text of a job file with some values of any type and size."""
+    table = tomllib.loads(JOB)
+    if draw(st.booleans()):
+        table["estimator"] = {"name": draw(st.sampled_from(sorted(ESTIMATORS)))}
+    for _ in range(draw(st.integers(1, 3))):
+        *above, last = draw(st.sampled_from(PATHS))
+        inside = table
+        for key in above:
+            inside = inside.setdefault(key, {}) if isinstance(inside, dict) else inside[0]
+            if not isinstance(inside, dict | list) or inside == []:
+                break
+        else:
+            if isinstance(inside, list):
+                inside = inside[0]
+            if isinstance(inside, dict):
+                inside[last] = draw(values)
+    text = "\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items())
+    if draw(st.integers(0, 9)) == 0:  # no TOML any more
+        at = draw(st.integers(0, len(text)))
+        text = (
+            text[:at] + draw(st.sampled_from(["[" * 3000, "=", '"', "\0", "1" * 5000])) + text[at:]
+        )
+    return text
+
+
+def toml(value):
+    """Return a value as TOML has it, in one line."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dict):
+        inside = ", ".join(f"{json.dumps(key)} = {toml(x)}" for key, x in value.items())
+        return f"{{ {inside} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml, value))}]"
+    if isinstance(value, str):
+        return json.dumps(value)
+    return repr(value)
+
+
+def run_job_file(text, folder):
+    write_log(good_log(200), folder / "fit.csv")
+    path, out = folder / "job.toml", folder / "out"
+    path.write_text(text, encoding="utf-8")
+    obey("identify", path, "--out", out, out=out)
+
+
+flags = st.sampled_from(
+    [
+        "--rate",
+        "--cutoff",
+        "--friction",
+        "--joints",
+        "--lock",
+        "--gain",
+        "--ignore",
+        "--estimator",
+        "--time-unit",
+        "--angle-unit",
+        "--topic",
+        "--effort",
+        "--stamp",
+        "--workers",
+        "--serve",
+        "--speed",
+        "--json",
+        "--resume",
+    ]
+)
+arguments = st.sampled_from(
+    [
+        "",
+        "x",
+        "0",
+        "-1",
+        "1",
+        "nan",
+        "inf",
+        "1e308",
+        "1e-308",
+        "99999",
+        "false",
+        "joint_1=nan",
+        "joint_1=1e308",
+        "joint_1",
+        "joint_1,joint_1",
+        "=",
+        ",",
+        "1_0",
+        "consistent",
+        "wls",
+        "ms",
+        "deg",
+        "٣",
+        "a=b=c",
+    ]
+)
+command_lines = st.tuples(
+    st.sampled_from(["identify", "doctor", "track", "convert", "inspect", "compare", "validate"]),
+    st.lists(st.tuples(flags, arguments), min_size=1, max_size=3),
+)
+
+
+def run_flags(example, folder):
+    command, given = example
+    path, out = folder / "fit.csv", folder / "out"
+    write_log(good_log(200), path)
+    flat = [
+        word
+        for flag, argument in given
+        for word in ((flag,) if flag in ("--json", "--resume") else (flag, argument))
+    ]
+    if command == "track" and "--serve" in flat:
+        flat += ["--serve", "-5"]  # so that it ends
+    own = {"convert": [path, folder / "out.csv"]}.get(command, [URDF, path])
+    written = ["--out", out] if command in ("identify", "track") else []
+    obey(command, *own, *written, *flat, out=out)
+
+
+# --- results -------------------------------------------------------------------------------------
+
+
+@cache
+def good_result():
+    """Return a folder with a result, and the content of its result.json."""
+    folder = Path(tempfile.mkdtemp(prefix="robotid-fuzz-"))
+    write_log(good_log(2000), folder / "fit.csv")
+    assert obey("identify", URDF, folder / "fit.csv", "--out", folder) == 0
+    return folder, (folder / "result.json").read_text()
+
+
+def places(value, path=()):
+    """Yield the path of every value inside a value."""
+    yield path
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
+    for key, inner in pairs:
+        yield from places(inner, (*path, key))
+
+
+@cache
+def result_places():
+    found = list(places(json.loads(good_result()[1])))
+    # those near the top and those deep inside are tried as often
+    return [[path for path in found if len(path) == depth] for depth in range(6)]
+
+
+MARKUP = '"><script>alert(1)</script>'
+replacements = values | st.sampled_from(
+    [None, [], {}, MARKUP, "\ud800", [MARKUP], {MARKUP: MARKUP}]
+)
+
+
+@st.composite
+def results(draw):
+    """The text of a result.json with values of any shape."""
+    content = json.loads(good_result()[1])
+    for _ in range(draw(st.integers(1, 3))):
+        path = draw(st.sampled_from(draw(st.sampled_from(result_places()))))
+        new, action = (
+            copy.deepcopy(draw(replacements)),
+            draw(st.sampled_from(["replace", "replace", "drop", "add"])),
+        )
+        try:
+            inside = content
+            for key in path[:-1]:
+                inside = inside[key]
+            if not path:
+                content = new
+            elif action == "drop":
+                del inside[path[-1]]
+            elif action == "add" and isinstance(inside, list):
+                inside.append(new)
+            else:
+                inside[path[-1]] = new
+        except (KeyError, IndexError, TypeError):  # an earlier edit took that place away
+            continue
+    text = json.dumps(content)
+    if draw(st.integers(0, 9)) == 0:
+        at = draw(st.integers(0, len(text)))
+        text = (
+            text[:at] + draw(st.sampled_from(["[" * 5000, "", "\0", "9" * 5000, "é"])) + text[at:]
+        )
+    return text
+
+
+def run_result(text, folder):
+    good, _ = good_result()
+    path, page = folder / "result.json", folder / "page.html"
+    path.write_text(text, encoding="utf-8")
+    for name in ("planar_2r.identified.urdf", "planar_2r.identified.drive.json"):
+        (folder / name).write_bytes((good / name).read_bytes())
+    obey("validate", path, good / "fit.csv")
+    obey("compare", path, good / "result.json", "--out", page, out=page)
+    obey("compare", good / "result.json", path, "--json")
+    obey(
+        "replay",
+        URDF,
+        good / "fit.csv",
+        path,
+        "--html",
+        folder / "replay.html",
+        out=folder / "replay.html",
+    )
+    for made in (page, folder / "replay.html"):
+        if made.exists():
+            assert "<script>alert" not in made.read_text(encoding="utf-8"), "markup is not escaped"
+
+
+# --- all of them ---------------------------------------------------------------------------------
+
+READERS = {
+    ".csv": write_csv,
+    ".npz": write_npz,
+    ".mat": write_mat,
+    ".h5": write_hdf5,
+    ".parquet": write_parquet,
+}
+FILES = [
+    "log.csv",
+    "log.parquet",
+    "log.npz",
+    "plain.npz",
+    "log.mat",
+    "plain.mat",
+    "log.h5",
+    "plain.h5",
+    "log.mcap",
+    "log.bag",
+    "log.db3",
+]
+
+#: By name: a strategy of examples, and what is done with one in an empty folder.
+KINDS = {
+    **{
+        f"bytes of {name}": (
+            spoilt,
+            (name,),
+            partial(read_log_file, write_bytes, Path(name).suffix),
+        )
+        for name in FILES
+    },
+    **{
+        f"values in {suffix}": (columns, (), partial(read_log_file, write, suffix))
+        for suffix, write in READERS.items()
+    },
+    "headers in .npz": (headers, (), partial(read_log_file, write_members, ".npz")),
+    "arrays in .npz": (lambda: arrays, (), partial(read_log_file, write_npz, ".npz")),
+    "structure of .h5": (lambda: odd_hdf5, (), partial(read_log_file, write_odd_hdf5, ".h5")),
+    "structure of .mat": (
+        lambda: st.dictionaries(keys, cells, max_size=4),
+        (),
+        partial(read_log_file, write_odd_mat, ".mat"),
+    ),
+    "values, identified": (
+        columns,
+        (300, st.sampled_from(MILD)),
+        partial(identify_from, write_csv, ".csv"),
+    ),
+    "job file": (jobs, (), run_job_file),
+    "flags": (lambda: command_lines, (), run_flags),
+    "result.json": (results, (), run_result),
+}

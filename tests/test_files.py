@@ -1,0 +1,131 @@
+"""Files are put in place whole or not at all, and nothing that is no file is replaced."""
+
+import os
+import stat
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from robotid._files import check_file, check_folder, folder_beside, write_text, written_whole
+from robotid.exceptions import DataError, SettingsError
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def replace(folder, *files, error=None):
+    with folder_beside(folder) as beside:
+        for name in files:
+            (beside / name).write_text("new")
+        if error is not None:
+            raise error
+
+
+def test_after_an_error_every_file_is_as_it_was(tmp_path):
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(ZeroDivisionError):
+        replace(tmp_path, "a", error=ZeroDivisionError())
+    assert names(tmp_path) == ["a"]
+    assert (tmp_path / "a").read_text() == "old"
+
+
+@pytest.mark.parametrize("failing", range(1, 6))
+def test_a_replacement_that_fails_half_way_is_undone(tmp_path, monkeypatch, failing):
+    for name in "ac":
+        (tmp_path / name).write_text("old")
+    move, calls = os.replace, []
+
+    def fail_once(source, target):
+        calls.append(source)
+        if len(calls) == failing:
+            raise KeyboardInterrupt
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", fail_once)
+    with pytest.raises(KeyboardInterrupt):
+        replace(tmp_path, *"abc")
+    assert names(tmp_path) == ["a", "c"]
+    assert [(tmp_path / name).read_text() for name in "ac"] == ["old", "old"]
+
+
+def test_files_of_a_folder_replace_those_of_their_names(tmp_path):
+    (tmp_path / "a").write_text("old")
+    (tmp_path / "other").write_text("kept")
+    replace(tmp_path, "a", "b")
+    assert names(tmp_path) == ["a", "b", "other"]
+    assert (tmp_path / "a").read_text() == "new"
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_and_nothing_is_mixed(tmp_path):
+    (tmp_path / "a").write_text("old")
+    (tmp_path / "b").mkdir()
+    message = r"b' is a folder, wanted a file to write; remove it, or name another"
+    with pytest.raises(SettingsError, match=message):
+        replace(tmp_path, "a", "b")
+    assert (tmp_path / "a").read_text() == "old"
+    assert names(tmp_path) == ["a", "b"]
+    with pytest.raises(SettingsError, match=message):
+        check_folder(tmp_path, ["a", "b"])
+    with pytest.raises(SettingsError, match=message):
+        check_file(tmp_path / "b")
+
+
+def test_places_where_nothing_can_be_written_are_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SettingsError, match="file' is a file, wanted a folder for the results"):
+        check_folder(tmp_path / "file" / "below")
+    check_folder(tmp_path / "not" / "yet", ["result.json"])
+    with pytest.raises(DataError, match=r"there is no folder '.*not' to write x in"):
+        write_text("", tmp_path / "not" / "x")
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root makes device nodes")
+def test_a_device_is_written_to_and_stays_a_device(tmp_path):
+    node = tmp_path / "null"
+    os.mknod(node, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    write_text("page", node)
+    assert stat.S_ISCHR(node.stat().st_mode)
+    assert names(tmp_path) == ["null"]
+
+
+def test_a_pipe_gets_the_content_and_a_reader_that_leaves_is_named(tmp_path):
+    pipe, heard = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: heard.append(pipe.read_text()))
+    reader.start()
+    write_text("page", pipe)
+    reader.join()
+    assert heard == ["page"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+    def leave():
+        with pipe.open() as stream:
+            stream.read(1)
+
+    reader = threading.Thread(target=leave)
+    reader.start()
+    with pytest.raises(DataError, match=r"the reader of '.*pipe' left before its end"):
+        write_text("page" * 2**20, pipe)
+    reader.join()
+
+
+@pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"])
+def test_the_standard_output_is_written_to_whatever_it_is(tmp_path, name):
+    code = f"from robotid._files import write_text; write_text('page', {name!r})"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "page"
+    with (tmp_path / "out").open("w") as file:
+        inode = os.fstat(file.fileno()).st_ino
+        subprocess.run([sys.executable, "-c", code], stdout=file, check=True)
+    assert (tmp_path / "out").read_text() == "page"
+    assert (tmp_path / "out").stat().st_ino == inode
+
+
+def test_an_error_names_the_file_and_leaves_nothing(tmp_path):
+    with pytest.raises(OSError, match="no space") as caught, written_whole(tmp_path / "x"):
+        raise OSError(28, "no space")
+    assert caught.value.__notes__ == [f"while writing {str(tmp_path / 'x')!r}"]
+    assert names(tmp_path) == []

@@ -1,0 +1,34 @@
+"""Whatever is in a file, a setting or a result: robotid says what is wrong, and never how it broke.
+
+Each kind of input is tried for a few seconds with a fixed seed; ``benchmarks/bench_fuzz.py`` tries
+thousands.
+"""
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from helpers.hostile_inputs import KINDS
+from hypothesis import HealthCheck, Phase, given, settings
+
+EXAMPLES = {"values, identified": 12, "job file": 25, "result.json": 25}  # others: 40
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_input_gives_a_traceback(kind):
+    make, arguments, run = KINDS[kind]
+
+    @settings(
+        max_examples=EXAMPLES.get(kind, 40),
+        derandomize=True,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(make(*arguments))
+    def try_one(example):
+        with tempfile.TemporaryDirectory() as folder:
+            run(example, Path(folder))
+
+    try_one()
