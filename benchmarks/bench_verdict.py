@@ -150,7 +150,7 @@ def ask(task):
               for m in e.metrics["estimate"].per_joint.values()]  # fmt: skip
     worst = max((error for error in errors if error is not None), default=np.nan)
     return Answer(
-        name, what, verdict.status, codes, verdict.reasons, held(result, recording.arm.pi), worst,
+        name, what, verdict.status, codes, verdict.reasons, held(result, recording.truth), worst,
         seconds,
     )  # fmt: skip
 
