@@ -14,6 +14,7 @@ _POOR = 50.0  # [%] a joint predicted worse than this is not usable
 _OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
 _WRONG = 2.0  # a fit that misses this many times what WLS misses ...
 _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
+_SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt below
 #: Warnings that make a result doubtful, in words that a verdict can hold. A word in braces is a
 #: figure of the evidence.
 _WORDS = {
@@ -38,6 +39,20 @@ _WORDS = {
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
     "lack a load",
+}
+_MISFITS = {
+    "backlash": "backlash or windup",
+    "coupling": "a drive that turns with another joint, too,",
+    "drift": "a drift with time",
+    "friction_shape": "friction of another shape than viscous and Coulomb",
+    "load_friction": "friction that grows with the load",
+    "position_periodic": "a torque that repeats with its position",
+    "spring": "a spring or counterbalance",
+}
+_WORDS |= {
+    code: f"{term} would explain {{share_pct:.0f}} % of the squared residual ({{error_pct:.1f}} % "
+    "of the torque): the model of its drive lacks it"
+    for code, term in _MISFITS.items()
 }
 #: Codes of the warnings that make a result doubtful.
 DOUBTFUL = (*_WORDS, "repeated_motion")
@@ -314,7 +329,9 @@ def _doubts(finding: Finding, joints: Sequence[str]) -> Iterator[Doubt]:
 
 
 def _is_harmless(finding: Finding) -> bool:
-    """Return whether constraints cost so little that the torque is predicted well all the same."""
+    """Return whether the torque is explained well in spite of a constraint or a missing term."""
+    if finding.code in _MISFITS:
+        return finding.evidence["error_pct"] < _SMALL
     if finding.code != "constraint_costs":
         return False
     error, wls = finding.evidence["error_pct"], finding.evidence["wls_error_pct"]

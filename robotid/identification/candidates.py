@@ -1,0 +1,184 @@
+"""Terms of a drive's torque that the model may lack: columns to test what a fit leaves against."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from robotid._typing import Array
+
+__all__ = ["CANDIDATES", "Candidate", "JointMotion", "couplings"]
+
+_HARMONICS = 4  # of a torque that is periodic in the position
+_STRIBECK = (0.05, 0.2)  # of the usual speed, over which friction falls from its value at rest
+_PRESLIDING = (0.03, 0.15)  # of the usual speed, over which friction changes its sign
+_WINDUP = (0.02, 0.1)  # of the usual way between two reversals, on which a torque is taken up
+_TURNED = 0.05  # of the usual rigid torque, over which the side of a gear changes
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """How a joint moves in N rows of the fitted recordings, and what loads it.
+
+    Attributes:
+        q: Positions, shape (N,) [rad or m].
+        v: Speeds, shape (N,) [rad/s or m/s].
+        a: Accelerations, shape (N,) [rad/s^2 or m/s^2].
+        direction: Which way friction acts: the sign of v, as the torque is filtered, shape (N,).
+        load: Torque of the rigid bodies by the estimate, shape (N,) [N m or N].
+        travelled: Way since v last changed its sign, shape (N,) [rad or m].
+        time: Time since the recording began, over the longest recording's, shape (N,).
+        others: The joints before and after it, by name.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    direction: Array
+    load: Array
+    travelled: Array
+    time: Array
+    others: dict[str, "JointMotion"] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that a drive's torque may have, linear in its parameters.
+
+    Attributes:
+        name: Its name.
+        code: Code of the finding that says it is missing.
+        columns: What its c parameters multiply in N rows, shape (N, c). Scales in it are those of
+            the motion given, so that all rows are to be asked for at once.
+        meaning: What it is, in words of a finding.
+        advice: What the user can do, with {joint} for the joint; empty if nothing.
+        units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
+            is the torque of the term, root mean square.
+        turns: Whether only a joint that turns has it.
+        coupled: The other joint of a coupling; empty for none.
+    """
+
+    name: str
+    code: str
+    columns: Callable[[JointMotion], Array]
+    meaning: str
+    advice: str = ""
+    units: tuple[str, str] | None = None
+    turns: bool = False
+    coupled: str = ""
+
+
+def _usual(x: Array) -> float:
+    """Return the root mean square of a signal, 1 if it is 0 throughout."""
+    return float(np.sqrt(np.mean(x**2))) or 1.0
+
+
+def _stribeck(m: JointMotion) -> Array:
+    v = np.abs(m.v)[:, None] / (np.array(_STRIBECK) * _usual(m.v))
+    falling: Array = m.direction[:, None] * np.exp(-v)
+    return falling
+
+
+def _presliding(m: JointMotion) -> Array:
+    setting_in: Array = np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m.v)))
+    return setting_in
+
+
+def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
+    angle = np.outer(m.q, np.arange(1, harmonics + 1))
+    return np.hstack([np.cos(angle), np.sin(angle)])
+
+
+def _windup(m: JointMotion) -> Array:
+    way = m.travelled[:, None] / (np.array(_WINDUP) * _usual(m.travelled))
+    taken_up = m.direction[:, None] * np.exp(-way)
+    return np.column_stack([taken_up, np.tanh(m.load / (_TURNED * _usual(m.load)))])
+
+
+def _drift(m: JointMotion) -> Array:
+    drifting: Array = m.time[:, None] * np.column_stack([m.direction, m.v, np.ones_like(m.v)])
+    return drifting
+
+
+def _coupled(m: JointMotion, other: JointMotion, ratio: float) -> Array:
+    """Return what a drive that turns with both joints, w = v + ratio v', adds to the first."""
+    w = m.v + ratio * other.v
+    return np.column_stack([other.a, other.v, np.tanh(w / (_STRIBECK[0] * _usual(w)))])
+
+
+_FRICTION = "friction that is not viscous and Coulomb"
+#: The candidates of each joint, those of couplings aside.
+CANDIDATES = (
+    Candidate(
+        "coulomb", "friction_shape", lambda m: m.direction[:, None], "Coulomb friction",
+        "Set friction = 'viscous+coulomb' in [model]",
+    ),
+    Candidate(
+        "stribeck", "friction_shape", _stribeck,
+        f"{_FRICTION} but rises towards standstill (Stribeck)",
+        "Raise min_velocity to leave the slow rows out",
+    ),
+    Candidate(
+        "presliding", "friction_shape", _presliding, f"{_FRICTION} but sets in with speed",
+        "Set friction_band, or raise min_velocity to leave the slow rows out",
+    ),
+    Candidate(
+        "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
+        f"{_FRICTION} but bends with speed, as |v|^(1/3) does",
+    ),
+    Candidate(
+        "cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
+        f"{_FRICTION} but bends with speed, as v^3 does",
+    ),
+    Candidate(
+        "load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
+        "friction that grows with the load",
+        units=("N m per N m of load", "N per N of load"),
+    ),
+    Candidate(
+        "periodic", "position_periodic", _periodic,
+        "a torque that repeats with the joint's position (cogging, an eccentric gear)",
+        turns=True,
+    ),
+    Candidate(
+        "linear spring", "spring", lambda m: m.q[:, None], "a spring on the joint",
+        units=("N m/rad", "N/m"),
+    ),
+    Candidate(
+        "counterbalance", "spring", lambda m: _periodic(m, 2),
+        "a spring or counterbalance that follows the joint's position", turns=True,
+    ),
+    Candidate(
+        "windup", "backlash", _windup,
+        "a torque that changes after each reversal, or with the side of the gear that is loaded "
+        "(backlash, windup),",
+        "Raise min_velocity to leave the reversals out",
+    ),
+    Candidate(
+        "drift", "drift", _drift,
+        "friction or an offset that drifts with time (a drive that warms up)",
+        "Warm the robot up before recording, or cut the log with start",
+    ),
+)  # fmt: skip
+
+
+def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
+    """Return candidates of a drive that turns with a joint and with the one before or after it.
+
+    Args:
+        motion: The joint's motion.
+    """
+    return tuple(
+        Candidate(
+            f"coupling {ratio:+g} {name}", "coupling",
+            partial(_coupled, other=other, ratio=ratio),
+            f"a drive that turns with {name}, too,",
+            "Add [[coupling]] to the job with ratios = "
+            f"{{{{ {{joint}} = 1.0, {name} = {ratio} }}}}, the size of the second from the data "
+            "sheet",
+            coupled=name,
+        )
+        for name, other in motion.others.items()
+        for ratio in (1.0, -1.0)
+    )  # fmt: skip

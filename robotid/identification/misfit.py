@@ -1,0 +1,451 @@
+"""What the drive model lacks: the residual of a fit against terms that drives may have.
+
+For each joint, columns Z of a candidate term join the regressor, and theta is refitted without one
+stretch of the logs after the other, base parameters and all:
+
+    r = W delta + Z theta + e,    theta = (Z^T M Z)^-1 Z^T M r,    M = 1 - W (W^T W + C^-1)^-1 W^T,
+
+so that what base parameters can explain does not count (Frisch, Waugh 1933); C is their covariance
+before the data. What a term explains of the stretches left out, it explains beyond chance.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import stdtr
+
+from robotid._typing import Array
+from robotid.findings import Finding
+from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
+from robotid.identification.evaluation import Evaluation
+from robotid.identification.rows import independent_share
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import friction_directions
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = ["Misfit", "find_misfits", "misfit_findings"]
+
+_ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
+_NUMBERS = 2**24  # of the regressor in them
+_PER_INDEPENDENT = 2.0  # rows for each that is independent behind the filter
+_STRETCHES = 16  # left out in turn
+_SHORTEST = 10  # independent rows in a stretch
+_FEWEST = 6  # stretches to judge by
+_TERMS = 3  # found of one joint, at most
+_CHANCE = 3e-4  # that a term is named which is not there, each time that one is tried
+_NOTHING = 1e-300
+_LEAST = 0.1  # share of the squared residual from which a term is named
+_MOST = 0.25  # ... and from which it is a warning
+_ONE_SIDED = 0.6  # share from which a coupling is named that the other joint does not show
+_SEEN = 0.005  # of the torque: a term smaller than this is not named
+_MATTERS = 0.02  # ... and than this is no warning
+_OUTLIER = 12.0  # usual residuals from which a row is left out
+_ALIKE = 0.02  # of the squared residual, within which two terms explain alike
+_RIDGE = 1e-4  # share of a column that the regressor must leave of it
+_CONFIRMED = 0.25  # of the share, that a validation must show of it for a warning
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """A term that the model of a joint's drive lacks.
+
+    Attributes:
+        joint: The joint.
+        term: The term.
+        share: Share of the joint's squared residual that it explains in stretches that were left
+            out of the fit, beyond the terms found before it [-].
+        chance: How likely that is without such a term [-].
+        confirmed: The same share of the validation recordings; None without one.
+        size: Its parameter, or the root mean square of its torque, as the term's units say.
+        std_error: Standard error of the size.
+        unit: Unit of the size.
+        error: Residual over torque, root mean square, without the term [-].
+    """
+
+    joint: str
+    term: Candidate
+    share: float
+    chance: float
+    confirmed: float | None
+    size: float
+    std_error: float
+    unit: str
+    error: float
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is a warning."""
+        explained = np.sqrt(self.share) * self.error
+        is_denied = self.confirmed is not None and self.confirmed < _CONFIRMED * self.share
+        return bool(self.share >= _MOST and explained >= _MATTERS and not is_denied)
+
+
+def misfit_findings(identification: "Identification") -> list[Finding]:
+    """Return a finding for each term that the model of a drive lacks.
+
+    Args:
+        identification: What was found.
+    """
+    return [_finding(misfit) for misfit in find_misfits(identification)]
+
+
+def find_misfits(identification: "Identification") -> tuple[Misfit, ...]:
+    """Return the terms that would explain a part of what the fit leaves, the largest first.
+
+    Args:
+        identification: What was found.
+    """
+    sample = _take_sample(identification)
+    if sample is None:
+        return ()
+    found = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
+    coupled = [(m.joint, m.term.coupled) for m in found]
+    # a drive that turns with two joints loads both
+    return tuple(
+        m for m in found
+        if not m.term.coupled or m.share > _ONE_SIDED or (m.term.coupled, m.joint) in coupled
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Rows of the recordings, each joint's over its usual residual, 0 where they are not used.
+
+    Attributes:
+        joints: Names of the n joints.
+        slides: Which of them slide, shape (n,), bool.
+        motions: How each joint moves in the N rows.
+        weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
+        error: Usual residual over usual torque, shape (n,) [-].
+        stretches: Which rows each of the K stretches has, those of the logs kept apart last.
+        fitted: How many of the stretches are of fitted logs.
+        rows: How many of the rows are.
+        W: Regressor of the base parameters over their spread before the data, shape (N, n, b).
+        r: Residual of the estimate, shape (N, n).
+        A: W^T W of each stretch, all joints together, shape (K, b, b).
+        B: W^T r likewise, shape (K, b).
+    """
+
+    joints: tuple[str, ...]
+    slides: Array
+    motions: tuple[JointMotion, ...]
+    weight: Array
+    error: Array
+    stretches: tuple[slice, ...]
+    fitted: int
+    rows: int
+    W: Array
+    r: Array
+    A: Array
+    B: Array
+
+
+def _take_sample(identification: "Identification") -> _Sample | None:
+    """Return rows spread over the recordings; None if there are too few to judge by."""
+    model, mapping = identification.model, identification.mapping
+    kept = [e for e in identification.validation if not e.is_refitted]
+    rows, independent = _spread_rows(model, identification.fitted, kept)
+    own = sum(map(len, rows[: len(identification.fitted)]))
+    stretches = _stretches(own, sum(map(len, rows)) - own, independent)
+    number = sum(part.stop <= own for part in stretches)
+    if model.free_flyer or number < _FEWEST:
+        return None
+    parts = list(zip([*identification.fitted, *kept], rows, strict=True))
+    motion = [_at(e.recording.trajectory, k) for e, k in parts]
+    Y = np.concatenate([_regressor(model, m) for m in motion])  # (N, n, p)
+    tau = np.concatenate([m.tau for m in motion])
+    r = tau - np.concatenate([e.torques["estimate"][k] for e, k in parts])
+    used = np.concatenate([e.recording.mask[k] for e, k in parts])
+    used = used & (np.abs(r) <= _OUTLIER * _usual_size(r[:own], used[:own]))
+    squares = [np.sum(x[:own] ** 2, axis=0, where=used[:own]) for x in (r, tau)]
+    scale = np.sqrt(squares[0] / np.maximum(used[:own].sum(axis=0), 1))
+    weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
+    size = model.layout.n_inertial
+    load = Y[:, :, :size] @ identification.standard[:size]
+    # over their spread before the data, C = U^T U, base parameters are of size 1
+    U = np.asarray(np.linalg.qr((mapping.K * identification.prior_std).T, mode="r"))
+    W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
+    r = weight * r
+    by_stretch = [(W[k].reshape(-1, len(mapping.K)), r[k].ravel()) for k in stretches]
+    return _Sample(
+        joints=model.joints,
+        slides=np.isin(model.joints, list(model.layout.prismatic)),
+        motions=_joint_motions([e.recording.trajectory for e, _ in parts], rows, load, model),
+        weight=weight,
+        error=np.sqrt(squares[0] / np.where(squares[1] > 0, squares[1], np.inf)),
+        stretches=stretches,
+        fitted=number,
+        rows=own,
+        W=W,
+        r=r,
+        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
+        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
+    )
+
+
+def _spread_rows(
+    model: RobotModel, fitted: Sequence[Evaluation], kept: Sequence[Evaluation]
+) -> tuple[list[Array], float]:
+    """Return which rows of each recording are read, and the share of them that is independent."""
+    most = min(_ROWS, _NUMBERS // (model.n_rows * len(model.layout.names)))
+    rows, shares = [], []
+    for evaluations in (fitted, kept):
+        least = -(-sum(len(e.recording.trajectory.t) for e in evaluations) // most)
+        for e in evaluations:
+            share = independent_share(e.recording.signals)
+            step = max(least, int(1.0 / (_PER_INDEPENDENT * share)), 1)
+            rows.append(np.arange(0, len(e.recording.trajectory.t), step))
+            shares.append(min(1.0, share * step))
+    return rows, min(shares)
+
+
+def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
+    """Return how the rows of fitted and kept recordings are cut into stretches."""
+    edges = [0]
+    for rows in (fitted, kept):
+        count = min(_STRETCHES, max(1, int(rows * independent / _SHORTEST))) if rows else 0
+        first = edges[-1]
+        edges += [first + rows * (i + 1) // count for i in range(count)]
+    return tuple(slice(*pair) for pair in pairwise(edges))
+
+
+def _at(motion: Trajectory, rows: Array) -> Trajectory:
+    """Return some rows of a motion."""
+    names = ["t", "q", "v", "a", "tau", "segment"]
+    names += [] if motion.direction is None else ["direction"]
+    parts: dict[str, Any] = {name: getattr(motion, name)[rows] for name in names}
+    return replace(motion, **parts)
+
+
+def _regressor(model: RobotModel, motion: Trajectory) -> Array:
+    """Return the regressor of the standard parameters, shape (N, n, p)."""
+    Y = joint_torque_regressor(model, motion.q, motion.v, motion.a, motion.direction)
+    return Y.reshape(len(motion.t), model.n_rows, -1)
+
+
+def _usual_size(r: Array, used: Array) -> Array:
+    """Return the median size of each joint's residual over the rows used, shape (n,)."""
+    columns = zip(r.T, used.T, strict=True)
+    return np.array([np.median(np.abs(x[k])) if k.any() else np.inf for x, k in columns])
+
+
+def _joint_motions(
+    motions: Sequence[Trajectory], rows: Sequence[Array], load: Array, model: RobotModel
+) -> tuple[JointMotion, ...]:
+    """Return how each joint moves in the rows, with its neighbours."""
+    longest = max(float(np.ptp(m.t)) for m in motions)
+
+    def joined(of: Callable[[Trajectory], Array]) -> Array:
+        return np.concatenate([of(m)[k] for m, k in zip(motions, rows, strict=True)])
+
+    def directions(m: Trajectory) -> Array:
+        n = len(model.joints)
+        own = friction_directions(model.layout, m.v, m.direction)[:, :n]
+        return own if own.shape[1] else np.sign(m.v)
+
+    q, v, a = (joined(attrgetter(name)) for name in "qva")
+    signs, way = joined(directions), joined(_travelled)
+    time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
+    alone = [
+        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time)
+        for j in range(len(model.joints))
+    ]
+    beside = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
+    return tuple(
+        replace(motion, others={model.joints[k]: alone[k] for k in near})
+        for motion, near in zip(alone, beside, strict=True)
+    )
+
+
+def _travelled(motion: Trajectory) -> Array:
+    """Return how far each joint went since it last turned round, shape (N, n) [rad or m]."""
+    begins = np.diff(motion.segment, prepend=motion.segment[0] - 1) != 0
+    turns = (np.diff(np.sign(motion.v), axis=0, prepend=0.0) != 0) | begins[:, None]
+    last = np.maximum.accumulate(np.where(turns, np.arange(len(turns))[:, None], 0), axis=0)
+    way: Array = np.abs(motion.q - np.take_along_axis(motion.q, last, axis=0))
+    return way
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What columns Z of a joint, beside the base parameters, leave of its residual.
+
+    Attributes:
+        S: [Z r]^T M [Z r] of the rows fitted, shape (..., c + 1, c + 1).
+        H: What [Z r] leaves of each stretch after the regressor's fit, shape (K, c + 1, c + 1).
+    """
+
+    S: Array
+    H: Array
+
+    def parameters(self, which: Sequence[int]) -> Array:
+        """Return the parameters of some columns, shape (..., k)."""
+        square = self.S[..., which, :][..., which]
+        theta: Array = np.linalg.solve(square, self.S[..., which, -1:])[..., 0]
+        return theta
+
+    def left(self, which: Sequence[int]) -> Array:
+        """Return the squared residual of each stretch with some columns fitted, shape (K,)."""
+        if not which:
+            alone: Array = self.H[:, -1, -1]
+            return alone
+        theta = np.broadcast_to(self.parameters(which), (len(self.H), len(which)))
+        x = np.hstack([-theta, np.ones((len(theta), 1))])
+        square = self.H[:, [*which, -1], :][:, :, [*which, -1]]
+        left: Array = np.einsum("ki,kij,kj->k", x, square, x)
+        return left
+
+
+def _trials(sample: _Sample, j: int, Z: Array) -> tuple[_Trial, _Trial]:
+    """Return trials of columns (N, c): fitted without the stretch that judges, and to all."""
+    X = np.column_stack([sample.weight[:, [j]] * Z, sample.r[:, j]])
+    W, A = sample.W[:, j], sample.A
+    D = np.array([X[k].T @ X[k] for k in sample.stretches])  # (K, c + 1, c + 1)
+    B = np.array([W[k].T @ X[k] for k in sample.stretches])  # (K, b, c + 1)
+    B[:, :, -1] = sample.B  # other joints know of the base parameters, too
+    is_fitted = np.arange(len(D)) < sample.fitted
+
+    def trial(used: Array) -> _Trial:
+        D_fit, B_fit, A_fit = (np.tensordot(used, x, axes=1) for x in (D, B, A))
+        T = np.linalg.solve(A_fit + np.eye(A.shape[-1]), B_fit)  # (..., b, c + 1)
+        S = D_fit - B_fit.swapaxes(-1, -2) @ T
+        c = np.arange(S.shape[-1] - 1)
+        still = D_fit[..., c, c] == 0  # a column of a joint that does not move
+        S[..., c, c] += np.where(still, 1.0, _RIDGE * D_fit[..., c, c])
+        every_T = np.broadcast_to(T, B.shape)
+        E = [X[k] - W[k] @ T_k for k, T_k in zip(sample.stretches, every_T, strict=True)]
+        return _Trial(S, np.array([E_k.T @ E_k for E_k in E]))
+
+    apart = is_fitted & ~np.eye(len(D), dtype=bool)  # (K, K): what judges row k is fitted to
+    return trial(apart.astype(float)), trial(is_fitted.astype(float))
+
+
+def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
+    """Yield the terms that a joint's drive lacks, one after the other."""
+    motion = sample.motions[j]
+    if not sample.weight[: sample.rows, j].any():
+        return
+    own = [c for c in (*CANDIDATES, *couplings(motion)) if not (c.turns and sample.slides[j])]
+    columns = [candidate.columns(motion) for candidate in own]
+    ends = np.cumsum([x.shape[1] for x in columns]).tolist()
+    place = {
+        candidate: list(range(end - x.shape[1], end))
+        for candidate, x, end in zip(own, columns, ends, strict=True)
+    }
+    apart, whole = _trials(sample, j, np.hstack(columns))
+    chosen: list[int] = []
+    total = before = apart.left([])
+    for _ in range(_TERMS):
+        left = {c: apart.left([*chosen, *place[c]]) for c in own}
+        best = _best(left, before, place, total, sample.fitted)
+        if best is None:
+            return
+        gain = (before - left[best])[: sample.fitted]
+        share = float(gain.sum() / total[: sample.fitted].sum())
+        size, std_error, unit = _size(sample, j, best, whole, chosen, place[best])
+        kept = [
+            whole.left(which)[sample.fitted :].sum()
+            for which in ([], chosen, [*chosen, *place[best]])
+        ]
+        if np.sqrt(share) * sample.error[j] >= _SEEN:
+            yield Misfit(
+                joint=sample.joints[j],
+                term=best,
+                share=share,
+                chance=_chance(before, left[best], sample.fitted),
+                confirmed=float((kept[1] - kept[2]) / kept[0]) if kept[0] > 0 else None,
+                size=size,
+                std_error=std_error,
+                unit=unit,
+                error=float(sample.error[j]),
+            )
+        chosen += place[best]
+        before, own = left[best], [c for c in own if c.code != best.code]
+
+
+def _best(
+    left: Mapping[Candidate, Array],
+    before: Array,
+    place: Mapping[Candidate, Sequence[int]],
+    total: Array,
+    fitted: int,
+) -> Candidate | None:
+    """Return the simplest of the terms that explain as much as the best does; None without one."""
+    least = _LEAST * total[:fitted].sum()
+    sure = {
+        candidate: float((before - after).sum())
+        for candidate, after in left.items()
+        if (before - after)[:fitted].sum() > least and _chance(before, after, fitted) < _CHANCE
+    }
+    alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE * total.sum()]
+    return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
+
+
+def _chance(before: Array, after: Array, fitted: int) -> float:
+    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
+
+    By Student's test of the shares, each between -1 and 1, of the fitted logs' stretches or of all,
+    whichever is surer.
+    """
+    gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
+    chances = [
+        stdtr(len(x) - 1, -x.mean() / max(np.std(x, ddof=1) / np.sqrt(len(x)), _NOTHING))
+        for x in (gain, gain[:fitted])
+    ]
+    return float(min(chances))
+
+
+def _size(
+    sample: _Sample, j: int, term: Candidate, whole: _Trial, before: list[int], new: list[int]
+) -> tuple[float, float, str]:
+    """Return the size of a term beside those found before, its standard error and unit.
+
+    The error is that of scores which scatter from stretch to stretch, as noise of any colour does.
+    """
+    which, own = [*before, *new], slice(len(before), None)
+    theta, S = whole.parameters(which), whole.S[which][:, which]
+    H = whole.H[: sample.fitted, which]
+    scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
+    inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
+    covariance = few * (inverse @ (scores.T @ scores) @ inverse)[own, own]
+    theta, S = theta[own], S[own, own]
+    if term.units is not None:
+        error = float(np.sqrt(covariance[0, 0]))
+        return float(theta[0]), error, term.units[int(sample.slides[j])]
+    # root mean square of the torque that base parameters cannot explain: size^2 = theta^T S theta
+    S = S / np.sum(sample.weight[: sample.rows, j] ** 2)
+    size, slope = float(np.sqrt(theta @ S @ theta)), S @ theta
+    error = float(np.sqrt(slope @ covariance @ slope)) / size
+    return size, error, ("N m rms", "N rms")[int(sample.slides[j])]
+
+
+def _finding(misfit: Misfit) -> Finding:
+    term, kept = misfit.term, misfit.confirmed
+    confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
+    done = term.advice.format(joint=misfit.joint)
+    message = (
+        f"{misfit.joint}: {term.meaning} would explain {100 * misfit.share:.0f} % of the squared "
+        f"residual{confirmed}, which is {100 * misfit.error:.1f} % of the torque; its size is "
+        f"{misfit.size:.3g} +- {misfit.std_error:.2g} {misfit.unit}. "
+        f"{done or 'The model has no such term yet'}: as it is, the friction intervals of this "
+        "joint are too narrow"
+    )
+    evidence = {
+        "share_pct": 100 * misfit.share,
+        "error_pct": 100 * misfit.error,
+        "size": misfit.size,
+        "std_error": misfit.std_error,
+        "chance": misfit.chance,
+    }
+    if kept is not None:
+        evidence["validation_share_pct"] = 100 * kept
+    severity = "warning" if misfit.matters else "note"
+    return Finding(term.code, severity, misfit.joint, message, evidence)

@@ -1,0 +1,122 @@
+"""Logs of drives that do more than the friction model says, and the finding that must say so."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotid.logs.data import Log
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.parameters import Coupling
+from robotid.simulation.closed_loop import another_robot
+from robotid.simulation.motions import random_fourier
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a drive adds to the torque, in sizes of the joint's usual torque."""
+
+    code: str
+    torque: object  # function of time, position, speed, rigid torque and usual torque
+
+
+def _stribeck(t, q, v, load, usual):
+    return 0.25 * usual * np.sign(v) * np.exp(-((v / 0.15) ** 2))
+
+
+def _saturating(t, q, v, load, usual):
+    return 0.4 * usual * np.sign(v) * np.cbrt(np.abs(v))
+
+
+def _load(t, q, v, load, usual):
+    return 0.1 * np.sign(v) * np.abs(load)
+
+
+def _periodic(t, q, v, load, usual):
+    return 0.15 * usual * (np.cos(3 * q + 0.4) + 0.7 * np.sin(4 * q))
+
+
+def _spring(t, q, v, load, usual):
+    return 0.3 * usual * (q - 0.2)
+
+
+def _counterbalance(t, q, v, load, usual):
+    """A spring between points 0.6 m and 0.15 m from the axis, 0.4 m long at rest."""
+    length = np.sqrt(0.6**2 + 0.15**2 + 2 * 0.6 * 0.15 * np.cos(q - 0.5))
+    lever = 0.6 * 0.15 * np.sin(q - 0.5) / length
+    pull = (length - 0.4) * lever
+    return usual * pull / np.std(pull) * 0.5
+
+
+def _windup(t, q, v, load, usual):
+    """Friction builds up over 0.03 rad after each reversal."""
+    turns = np.diff(np.sign(v), prepend=0) != 0
+    last = np.maximum.accumulate(np.where(turns, np.arange(len(v)), 0))
+    return -0.4 * usual * np.sign(v) * np.exp(-np.abs(q - q[last]) / 0.05)
+
+
+def _drift(t, q, v, load, usual):
+    return 0.3 * usual * np.sign(v) * (1 - t / t[-1])
+
+
+EFFECTS = {
+    "stribeck": Effect("friction_shape", _stribeck),
+    "saturating": Effect("friction_shape", _saturating),
+    "load": Effect("load_friction", _load),
+    "periodic": Effect("position_periodic", _periodic),
+    "spring": Effect("spring", _spring),
+    "counterbalance": Effect("spring", _counterbalance),
+    "windup": Effect("backlash", _windup),
+    "drift": Effect("drift", _drift),
+}
+
+
+def coloured(rng, shape, memory):
+    """Return noise of variance 1 that forgets after so many samples, shape (N, n); 0 is white."""
+    white = rng.standard_normal(shape)
+    if not memory:
+        return white
+    from scipy.signal import lfilter
+
+    keep = np.exp(-1.0 / memory)
+    return lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], white, axis=0)
+
+
+def log_with(
+    model, seed, effect=None, joint=1, *, duration=30.0, rate=100.0, noise=0.02, memory=0,
+    coupling=None, part=0, size=1.0,
+):  # fmt: skip
+    """Return a log of a robot like the model whose drives are viscous and Coulomb, but for one.
+
+    Args:
+        model: The robot.
+        seed: Of the robot; with ``part`` that of the motion and the noise.
+        effect: Name of what joint ``joint`` has beside; None for nothing.
+        joint: Which joint.
+        duration: Length [s].
+        rate: Rate [Hz].
+        noise: Of each torque, share of its usual size.
+        memory: Correlation time of that noise [samples].
+        coupling: Ratios of a drive that turns with several joints, or None.
+        part: Which of several logs.
+        size: Of the effect.
+    """
+    rng = np.random.default_rng([seed, part])
+    truth = model if coupling is None else model.from_urdf(
+        model.tree.path, joints=model.joints, couplings=[Coupling("motor", coupling)]
+    )  # fmt: skip
+    pi = another_robot(truth, np.random.default_rng(seed))
+    t = np.arange(round(duration * rate) + 1) / rate
+    q, v, a = random_fourier(model, rng, period=duration).evaluate(t)
+    Y = joint_torque_regressor(truth, q, v, a).reshape(len(t), len(model.joints), -1)
+    tau = Y @ pi
+    added = np.zeros_like(tau)
+    if effect is not None:
+        load = Y[:, joint, : truth.layout.n_inertial] @ pi[: truth.layout.n_inertial]
+        usual = np.sqrt(np.mean(tau[:, joint] ** 2))
+        added[:, joint] = size * EFFECTS[effect].torque(t, q[:, joint], v[:, joint], load, usual)
+    level = noise * np.sqrt(np.mean(tau**2, axis=0))
+    return Log(
+        t=t, q=q + 2e-5 * rng.standard_normal(q.shape), v=v + 2e-4 * rng.standard_normal(q.shape),
+        tau=tau + added + level * coloured(rng, tau.shape, memory), joints=model.joints,
+        path=f"run{part}.csv",
+    )  # fmt: skip
