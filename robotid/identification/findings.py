@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from robotid.findings import Finding
+from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import misfit_findings
 from robotid.identification.pipeline import Identification
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
@@ -46,6 +47,7 @@ def fit_findings(identification: Identification) -> list[Finding]:
     findings += consistency_findings(identification)
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
+    findings += discrepancy_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

@@ -18,6 +18,7 @@ _SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt bel
 #: Warnings that make a result doubtful, in words that a verdict can hold. A word in braces is a
 #: figure of the evidence.
 _WORDS = {
+    "angle_scale": "positions fit best times another factor",
     "bound_binds": "the data, or the masses that it leaves, speak against a stated bound",
     "clipped": "the torque is clipped at a limit",
     "constant_torque": "the torque never changes: the channel is dead",
@@ -26,6 +27,7 @@ _WORDS = {
     "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "
     "in another unit, masses and inertias are wrong in the same proportion",
     "gravity": "the direction of gravity may be stated wrongly",
+    "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
@@ -33,8 +35,11 @@ _WORDS = {
     "position_order": "the position may be that of another joint",
     "position_sign": "the position may have the opposite sign",
     "solvers_differ": "two solvers found different parameters",
+    "time_scale": "inertia and gravity contradict each other: the time stamps, or the size of "
+    "gravity, may be wrong",
     "torque_delay": "the torque is late against the position by {delay:.3f} s",
     "torque_order": "the torque may be that of another joint",
+    "torque_scale": "the torque is in another scale than those of the other joints",
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
     "urdf_mismatch": "the torques do not fit the URDF's masses: it may be of another robot, or "
@@ -57,7 +62,7 @@ _WORDS |= {
 #: Codes of the warnings that make a result doubtful.
 DOUBTFUL = (*_WORDS, "repeated_motion")
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
-_OF_THE_FIT = ("estimator", "standard_parameters")  # places that are no recording
+_OF_THE_FIT = ("estimator", "standard_parameters", "all joints")  # places that are no recording
 
 
 @dataclass(frozen=True)
