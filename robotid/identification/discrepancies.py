@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.misfit import Sample, Trial, chance, take_sample, trials
 from robotid.logs.data import Trajectory
 from robotid.regressor.torque import joint_torque_regressor
@@ -156,7 +156,7 @@ def _found(sample: Sample, own: Sequence[_Alteration]) -> Iterator[Finding]:
         size, error = (x[-len(which) :] for x in _sizes(whole, chosen, sample.fitted))
         if np.linalg.norm(size) < max(best.least, _SURE * float(np.linalg.norm(error))):
             return
-        yield _finding(best, size, error, share)
+        yield _finding(best, size, error, share, [one for one in alike if one is not best])
 
 
 def _sizes(whole: Trial, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
@@ -168,16 +168,21 @@ def _sizes(whole: Trial, which: Sequence[int], fitted: int) -> tuple[Array, Arra
     return x, np.sqrt(few * np.diag(inverse @ (scores.T @ scores) @ inverse))
 
 
-def _finding(alteration: _Alteration, size: Array, error: Array, share: float) -> Finding:
+def _finding(
+    found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
+) -> Finding:
+    others = [f"{one.code} of {one.where}" for one in alike if one.where]
+    also = f"; {listed(others)} would explain as much" if others else ""
     message = (
-        f"{alteration.words(size, error)}. This explains {100 * share:.0f} % of the squared "
-        "residual, which no other masses or friction do"
+        f"{found.words(size, error)}. This explains {100 * share:.0f} % of the squared residual, "
+        f"which other masses and friction do not{also}"
     )
-    length = float(np.linalg.norm(size))
-    evidence = {"size": float(size[0]) if len(size) == 1 else length,
-                "std_error": float(np.linalg.norm(error)), "share_pct": 100 * share}  # fmt: skip
-    where = alteration.where or "all joints"
-    return Finding(alteration.code, "warning", where, message, evidence)
+    evidence = {
+        "size": float(size[0] if len(size) == 1 else np.linalg.norm(size)),
+        "std_error": float(np.linalg.norm(error)),
+        "share_pct": 100 * share,
+    }
+    return Finding(found.code, "warning", found.where or "all joints", message, evidence)
 
 
 def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
@@ -196,8 +201,8 @@ def _scale(what: str) -> Callable[[Array, Array], str]:
 
 def _gain(joint: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{joint}: its torque is {1 + x[0]:.3f} +- {error[0]:.2g} times what the torques of the "
-        f"other joints imply: check its gain, and gear ratio (--gain {joint}=...)"
+        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times what those of the "
+        f"other joints imply: check its gain and gear ratio (--gain {joint}=...)"
     )
 
 
