@@ -17,6 +17,7 @@ from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
 from robotid.findings import Finding
 from robotid.identification.findings import fit_findings, locked_findings, log_findings
+from robotid.identification.misfit import settled
 from robotid.identification.pipeline import Identification, conclude
 from robotid.identification.recordings import Recordings
 from robotid.identification.verdict import doubts_of
@@ -118,13 +119,13 @@ def _identify(
     findings += log_findings([log.head for log in (*fitted, *kept)])
     findings += impossible_inertials(model)
     # what the motion excites the fit tells from all rows: finding "undetermined"
-    findings += [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
-    findings += fit_findings(identification)
-    told = [finding for finding in findings if finding.code not in job.ignore]
+    told = [f for f in diagnosis if f.severity != "note" and f.code != "excitation"]
+    findings += settled(told, fit_findings(identification))
+    counted = [finding for finding in findings if finding.code not in job.ignore]
     names = [
         Path(e.recording.log.path).name for e in identification.validation if not e.is_refitted
     ]
-    doubts = doubts_of(told, model.joints, names, is_robust=is_robust)
+    doubts = doubts_of(counted, model.joints, names, is_robust=is_robust)
     messages = tuple(finding.message for finding in alarms)
     return replace(identification, alarms=messages, doubts=doubts), findings, checkpoint
 

@@ -201,7 +201,8 @@ def _unexplained(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         joint = probe.model.joints[j]
         message = (
             f"{100 * share[j]:.0f} % of the variance of {joint}'s torque fits neither gravity, "
-            "inertia nor friction: the channel may hold another quantity, little but noise, or a "
-            "drive that is coupled to others; what depends on it is not to be trusted"
+            "inertia nor friction: the channel may hold another quantity, little but noise, a "
+            "spring, a gear that is not round, or a drive that is coupled to others; what depends "
+            "on it is not to be trusted"
         )
         yield log_finding(name, "unexplained_torque", "warning", message, joint, share=share[j])

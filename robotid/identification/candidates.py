@@ -152,7 +152,7 @@ CANDIDATES = (
     Candidate(
         "windup", "backlash", _windup,
         "a torque that changes after each reversal, or with the side of the gear that is loaded "
-        "(backlash, windup),",
+        "(backlash, windup)",
         "Raise min_velocity to leave the reversals out",
     ),
     Candidate(
@@ -173,7 +173,7 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
         Candidate(
             f"coupling {ratio:+g} {name}", "coupling",
             partial(_coupled, other=other, ratio=ratio),
-            f"a drive that turns with {name}, too,",
+            f"a drive that turns with {name}, too",
             "Add [[coupling]] to the job with ratios = "
             f"{{{{ {{joint}} = 1.0, {name} = {ratio} }}}}, the size of the second from the data "
             "sheet",

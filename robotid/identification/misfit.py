@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from robotid._typing import Array
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.rows import independent_share
@@ -38,6 +38,7 @@ __all__ = [
     "chance",
     "find_misfits",
     "misfit_findings",
+    "settled",
     "take_sample",
     "trials",
 ]
@@ -56,6 +57,9 @@ _MOST = 0.25  # ... and from which it is a warning
 _ONE_SIDED = 0.6  # share from which a coupling is named that the other joint does not show
 _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
+_MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
+_OF_POSITION = ("position_periodic", "spring")
+_OF_MASSES = ("current_for_torque", "urdf_mismatch")
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
@@ -122,6 +126,38 @@ def find_misfits(identification: "Identification") -> tuple[Misfit, ...]:
         m for m in found
         if not m.term.coupled or m.share > _ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
+
+
+def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
+    """Return what was found before the fit and of the fit, without guesses that a term explains.
+
+    The doctor knows no springs: a joint whose torque follows its position weighs wrong for him, or
+    its torque fits nothing. The term that explains it is a warning then, however little is left.
+
+    Args:
+        found: What was found before the fit.
+        of_fit: What was found of the fit.
+    """
+    kept, terms = list(found), []
+    for term in of_fit:
+        guesses = [f for f in kept if _explains(term, f)]
+        kept = [f for f in kept if f not in guesses]
+        if guesses:
+            codes = listed(dict.fromkeys(f.code for f in guesses))
+            message = f"{term.message}. It explains {codes}, and may have gone into masses in part"
+            evidence = {**term.evidence, "replaces": float(len(guesses))}
+            term = replace(term, severity="warning", message=message, evidence=evidence)
+        terms.append(term)
+    return kept + terms
+
+
+def _explains(term: Finding, guess: Finding) -> bool:
+    """Return whether a term that the fit found explains what was found before the fit."""
+    if term.evidence.get("share_pct", 0.0) < _MAIN:
+        return False
+    if guess.code == "unexplained_torque":
+        return guess.where.rpartition(": ")[2] == term.where
+    return guess.code in _OF_MASSES and term.code in _OF_POSITION
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,13 +440,14 @@ def _best(
     fitted: int,
 ) -> Candidate | None:
     """Return the simplest of the terms that explain as much as the best does; None without one."""
-    least = _LEAST * total[:fitted].sum()
+    whole = float(total[:fitted].sum())
+    gains = {c: float((before - after)[:fitted].sum()) / whole for c, after in left.items()}
     sure = {
-        candidate: float((before - after).sum())
-        for candidate, after in left.items()
-        if (before - after)[:fitted].sum() > least and chance(before, after, fitted) < _CHANCE
+        candidate: gain
+        for candidate, gain in gains.items()
+        if gain > _LEAST and chance(before, left[candidate], fitted) < _CHANCE
     }
-    alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE * total.sum()]
+    alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
 
 
@@ -457,10 +494,10 @@ def _finding(misfit: Misfit) -> Finding:
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
     done = term.advice.format(joint=misfit.joint)
     message = (
-        f"{misfit.joint}: {term.meaning} would explain {100 * misfit.share:.0f} % of the squared "
-        f"residual{confirmed}, which is {100 * misfit.error:.1f} % of the torque; its size is "
-        f"{misfit.size:.3g} +- {misfit.std_error:.2g} {misfit.unit}. "
-        f"{done or 'The model has no such term yet'}: as it is, the friction intervals of this "
+        f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
+        f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"
+        f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
+        f"{done or 'The model has no such term yet'}; as it is, the friction intervals of this "
         "joint are too narrow"
     )
     evidence = {

@@ -336,7 +336,7 @@ def _doubts(finding: Finding, joints: Sequence[str]) -> Iterator[Doubt]:
 def _is_harmless(finding: Finding) -> bool:
     """Return whether the torque is explained well in spite of a constraint or a missing term."""
     if finding.code in _MISFITS:
-        return finding.evidence["error_pct"] < _SMALL
+        return finding.evidence["error_pct"] < _SMALL and "replaces" not in finding.evidence
     if finding.code != "constraint_costs":
         return False
     error, wls = finding.evidence["error_pct"], finding.evidence["wls_error_pct"]

@@ -75,7 +75,8 @@ def drive_figures(found: Identification) -> str:
         curves = (
             "<h3>Friction against speed</h3>\n<p>Torque that inertia, gravity and armature leave, "
             f"on {escape(_shown(found).recording.name)}, and the friction and offset identified. "
-            "Dots that bend away from the blue ones ask for another friction model.</p>\n"
+            "Dots that bend away from the blue ones ask for another friction model; what is beyond "
+            "chance is among the warnings and notes.</p>\n"
             f'<div class="plots">\n{_friction_figures(found)}</div>\n'
         )
     return f'{curves}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
