@@ -560,7 +560,7 @@ CASES = {
     ),
     "currents for torques": Case(NOT_GOOD, ("current_for_torque",), record=currents),
     "one current for torque": Case(
-        NOT_GOOD, ("current_for_torque",),
+        NOT_GOOD, ("current_for_torque", "torque_scale"),
         record=of_torque(lambda arm: ones_but(arm, [arm.elbow], 0.1)),
     ),
     "torque clipped": Case(NOT_GOOD, ("clipped",), record=clipped),
@@ -574,7 +574,7 @@ CASES = {
         REFUSED, ("position_order", "joint_order"), record=swapped("q", "v")
     ),
     "elbow zero off by 0.1 rad": Case(
-        NOT_GOOD, ("position_offset",), record=shifted_zero, fits=is_long, is_hidden=True
+        NOT_GOOD, ("position_offset",), record=shifted_zero, fits=is_long
     ),
     "degrees": Case(REFUSED, ("angle_unit",), record=degrees),
     "milliseconds": Case(REFUSED, ("time_unit",), record=milliseconds),
@@ -593,7 +593,7 @@ CASES = {
     ),
     "1 kg in both": Case(FINE, loads=(True, True)),
     "URDF of another size": Case(
-        NOT_GOOD, ("urdf_mismatch", "unexplained_torque"), world="resized"
+        NOT_GOOD, ("joint_origin", "urdf_mismatch", "unexplained_torque"), world="resized"
     ),
     "mounted on a wall": Case(NOT_GOOD, ("gravity",), world="turned", fits=has_gravity),
     "base tilted by 15 deg": Case(NOT_GOOD, ("gravity",), world="tilted", fits=has_gravity),
@@ -602,16 +602,19 @@ CASES = {
         NOT_GOOD, ("static_joint", "excitation", "undetermined"), plant=still_joint
     ),
     "2 s only": Case(NOT_GOOD, ("excitation", "undetermined", "too_short"), seconds=2.0),
+    "wrist torques x 1.5": Case(
+        NOT_GOOD, ("torque_scale", "current_for_torque"),
+        record=of_torque(lambda arm: ones_but(arm, arm.wrists, 1.5)),
+    ),
+    "time x 1.1, no dq": Case(
+        NOT_GOOD, ("time_scale",),
+        record=lambda run, arm: replace(slow_clock(run, arm), v=None),
+    ),
+    "time x 1.1": Case(NOT_GOOD, ("time_scale", "velocity_scale"), record=slow_clock),
+    "angles x 1.1, no dq": Case(NOT_GOOD, ("angle_scale",), record=wide_angles),
     # what another robot may look like
     "all torques x 0.8": Case(NOT_GOOD, record=of_torque(lambda arm: 0.8), is_hidden=True),
     "all torques x 1.1": Case(NOT_GOOD, record=of_torque(lambda arm: 1.1), is_hidden=True),
-    "wrist torques x 1.5": Case(
-        NOT_GOOD, record=of_torque(lambda arm: ones_but(arm, arm.wrists, 1.5)), is_hidden=True
-    ),
-    "time x 1.1, no dq": Case(
-        NOT_GOOD, record=lambda run, arm: replace(slow_clock(run, arm), v=None), is_hidden=True
-    ),
-    "angles x 1.1, no dq": Case(NOT_GOOD, record=wide_angles, is_hidden=True),
 }  # fmt: skip
 
 
