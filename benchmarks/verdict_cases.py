@@ -19,6 +19,7 @@ import scipy.signal
 
 from robotid.robot.bodies import held_parameters
 from robotid.robot.examples import example_urdf
+from robotid.robot.geometry import body_points
 from robotid.robot.model import GRAVITY, RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 
@@ -171,7 +172,7 @@ def build(robot, key, *, is_far=False, turn=None, resize=False, folder=None):
     pi = model.standard_parameters()
     size = model.layout.n_inertial
     held = held_parameters(model)  # links beyond locked joints stay as they are
-    pi[:size] = held + deformed(pi[:size] - held, rng, 0.35 if is_far else 0.1)
+    pi[:size] = held + deformed(model, pi[:size] - held, rng, 0.35 if is_far else 0.1)
     arm = Arm(model, pi, key, np.zeros(len(model.joints)))
     motion = move(model, np.random.default_rng([*key, 2]), 100.0, 20.0)
     rigid = np.sqrt(np.mean(arm.rigid(motion) ** 2, axis=0))
@@ -189,16 +190,37 @@ def build(robot, key, *, is_far=False, turn=None, resize=False, folder=None):
     return replace(arm, stiffness=level)
 
 
-def deformed(inertial, rng, share):
-    """Return bodies whose points were moved by an affine map, with another density."""
-    bodies = []
-    for J in pseudo_inertia(inertial):
-        D = scipy.linalg.expm(share * rng.standard_normal((4, 4)))
-        gyration = np.sqrt(np.trace(J[:3, :3]) / J[3, 3])
-        D[3, :3] = 0.0
-        D[:3, 3] = share * gyration * rng.standard_normal(3)
-        bodies.append(inertial_from_pseudo_inertia(D @ J @ D.T))
+def deformed(model, inertial, rng, share):
+    """Return bodies whose points were moved by an affine map, with another density.
+
+    They can exist: inside the box around its geometry lies the centre of mass of each body, unless
+    the URDF's does not either, and no farther from it than the box reaches does its mass lie.
+    """
+    bodies, points = [], body_points(model)
+    for name, J in zip(model.layout.bodies, pseudo_inertia(inertial), strict=True):
+        for _ in range(1000):
+            moved = deform(J, rng, share)
+            if name not in points or fits(moved, points[name]) or not fits(J, points[name]):
+                break
+        bodies.append(inertial_from_pseudo_inertia(moved))
     return np.concatenate(bodies)
+
+
+def deform(J, rng, share):
+    D = scipy.linalg.expm(share * rng.standard_normal((4, 4)))
+    gyration = np.sqrt(np.trace(J[:3, :3]) / J[3, 3])
+    D[3, :3] = 0.0
+    D[:3, 3] = share * gyration * rng.standard_normal(3)
+    return D @ J @ D.T
+
+
+def fits(J, points):
+    """Return whether a body of that pseudo-inertia can lie in the box around points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = J[:3, 3] / J[3, 3]
+    spread = np.sqrt(np.diag(J)[:3] / J[3, 3] - centre**2)  # root mean square about the centre
+    inside = (low <= centre) & (centre <= high)
+    return bool((inside & (spread < np.maximum(high - centre, centre - low))).all())
 
 
 def move(model, rng, rate, duration, is_kept=False):

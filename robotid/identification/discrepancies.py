@@ -62,7 +62,7 @@ def discrepancy_findings(identification: "Identification") -> list[Finding]:
         identification: What was found.
 
     Returns:
-        Findings "position_offset", "angle_scale", "torque_scale", "time_scale" and
+        Findings "position_offset", "angle_scale", "torque_scale", "time_scale", "gravity" and
         "joint_origin", what explains most of the residual first.
     """
     sample = take_sample(identification)
@@ -98,6 +98,12 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
     still = tuple(replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at)
     inertial = _torques(model, bodies, sample) - _torques(model, bodies, replace(sample, at=still))
     yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
+    down = np.array(model.pin_model.gravity.linear)
+    if down.any():
+        across = np.linalg.svd(down[None])[2][1:]  # two directions at right angles to gravity
+        pulls = [_torques(_pulled(model, axis), pi, sample) - tau for axis in across]
+        Z = np.linalg.norm(down) * np.stack(pulls, axis=-1) / _STEP
+        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down))
     origins = [_origins(model, pi, sample, joint, tau) for joint in model.joints]
     for joint, Z in zip(model.joints, origins, strict=True):
         yield _Alteration("joint_origin", joint, Z, 0.01, _origin(joint))
@@ -126,6 +132,13 @@ def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:
     pin_model = model.pin_model.copy()
     placement = pin_model.jointPlacements[pin_model.getJointId(joint)]
     placement.translation = placement.translation + _STEP * axis
+    return replace(model, pin_model=pin_model)
+
+
+def _pulled(model: RobotModel, axis: Array) -> RobotModel:
+    """Return the robot with a little gravity more along an axis."""
+    pin_model = model.pin_model.copy()
+    pin_model.gravity.linear = pin_model.gravity.linear + _STEP * axis
     return replace(model, pin_model=pin_model)
 
 
@@ -212,6 +225,20 @@ def _clock(x: Array, error: Array) -> str:
         f"time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the clock, or gravity "
         "is stated wrongly"
     )
+
+
+def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
+    def words(x: Array, error: Array) -> str:
+        turned = down + np.linalg.norm(down) * x @ across
+        turned *= np.linalg.norm(down) / np.linalg.norm(turned)
+        angle, sure = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
+        shown = ", ".join(f"{value:.2f}" for value in turned)
+        return (
+            f"gravity is tilted by about {angle:.2g} +- {sure:.1g} degrees from what is stated: if "
+            f"the base is not level, state gravity = [{shown}] in the job file"
+        )
+
+    return words
 
 
 def _origin(joint: str) -> Callable[[Array, Array], str]:

@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
@@ -23,9 +24,9 @@ def model():
     return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
 
 
-def found(model, change, robot="ur5_robot.urdf"):
+def found(model, change, robot="ur5_robot.urdf", turn=None):
     """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
-    arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,)), []
+    arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,), turn=turn), []
     for part in (0, 1):
         run = move(arm.model, np.random.default_rng([3, part]), 100.0, 25.0)
         run = replace(run, tau=arm.rigid(run) + arm.drives(run))
@@ -90,3 +91,12 @@ def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
     first = found(model, lambda log: log, robot=path)[0]
     assert (first.code, first.where) == ("joint_origin", "elbow_joint")
     assert first.evidence["size"] == pytest.approx(0.1, rel=0.25)
+
+
+def test_a_base_that_is_not_level_is_named(model):
+    turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
+    first = found(model, lambda log: log, turn=turn)[0]
+    assert (first.code, first.where) == ("gravity", "all joints")
+    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.1)
+    stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
+    np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)
