@@ -85,16 +85,20 @@ def main():
     parser.add_argument("--robots", nargs="+", choices=ROBOTS)
     parser.add_argument("--cases", nargs="+", choices=CASES)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--list", type=Path, help="write every answer to this file, as JSON lines")
+    parser.add_argument("--list", type=Path, help="add every answer to this file, as JSON lines")
     options = parser.parse_args()
     robots, cases = QUICK if options.quick else (ROBOTS, CASES)
     pairs = itertools.product(options.robots or robots, options.cases or cases)
     tasks = [(robot, case, options.seed) for robot, case in pairs]
-    answers = [answer for answer in run(tasks, options.jobs) if answer is not None]
-    if options.list:
-        lines = [json.dumps(asdict(a) | {"right": a.is_right, "named": a.is_named})
-                 for a in answers]  # fmt: skip
-        options.list.write_text("\n".join(lines) + "\n")
+    answers = []
+    for answer in run(tasks, options.jobs):
+        if answer is None:
+            continue
+        answers.append(answer)
+        if options.list:
+            line = asdict(answer) | {"right": answer.is_right, "named": answer.is_named}
+            with options.list.open("a") as file:
+                file.write(json.dumps(line) + "\n")
     summary(answers, options.seed)
     table("What is clean", [a for a in answers if CASES[a.case].right == GOOD])
     table("What is not", [a for a in answers if is_fault(a)])
@@ -109,9 +113,10 @@ def is_fault(answer):
 
 def run(tasks, jobs):
     if jobs == 1:
-        return list(map(ask, tasks))
+        yield from map(ask, tasks)
+        return
     with ProcessPoolExecutor(jobs) as pool:
-        return list(pool.map(ask, tasks))
+        yield from pool.map(ask, tasks)
 
 
 def ask(task):
