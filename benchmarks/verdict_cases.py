@@ -580,7 +580,9 @@ CASES = {
     "gravity taken off the torque": Case(
         NOT_GOOD, ("gravity_compensated", "gravity"), plant=compensated, fits=has_gravity
     ),
-    "currents for torques": Case(NOT_GOOD, ("current_for_torque",), record=currents),
+    "currents for torques": Case(
+        NOT_GOOD, ("current_for_torque", "torque_scale"), record=currents
+    ),
     "one current for torque": Case(
         NOT_GOOD, ("current_for_torque", "torque_scale"),
         record=of_torque(lambda arm: ones_but(arm, [arm.elbow], 0.1)),
