@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from robotid.estimators import (
     NormalisedGradient,
     RecursiveEstimator,
 )
-from robotid.estimators.consistent.weighting import choose_weight
+from robotid.estimators.consistent.weighting import choose_weight, contradicted_extents
 from robotid.exceptions import SettingsError
 from robotid.identification.settings import (
     BoundedSettings,
@@ -40,7 +41,7 @@ from robotid.identification.settings import (
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors, gather
 from robotid.robot.bodies import held_parameters
-from robotid.robot.geometry import geometry_half_spaces
+from robotid.robot.geometry import body_boxes, geometry_half_spaces
 from robotid.robot.model import RobotModel
 
 __all__ = ["Known", "consistent_fit", "make_constraints", "make_estimator"]
@@ -122,8 +123,9 @@ def consistent_fit(
     Raises:
         SettingsError: If constraints contradict each other or do not fit the robot.
     """
-    geometry = geometry_half_spaces(model, settings.bounds.com_within)
-    weight = settings.prior_weight
+    bounds, weight = settings.bounds, settings.prior_weight
+    geometry = geometry_half_spaces(model, bounds.com_within)
+    extent = body_boxes(model) if bounds.extent == "box" else {}
     fit = Consistent(
         layout=model.layout,
         K=mapping.K,
@@ -134,19 +136,26 @@ def consistent_fit(
         prior_weight=1.0 if isinstance(weight, str) else weight,
         independent_share=prior.share,
         metric=settings.prior,
-        constraints=make_constraints(settings.bounds, geometry),
+        constraints=make_constraints(bounds, geometry, extent),
         solver=settings.solver,
         check=settings.check,
     )
     folds = gather(prior.stretches, _FOLDS)
+    if extent:
+        beyond = contradicted_extents(fit, folds)
+        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
     if not isinstance(weight, str) or (weight == "auto" and len(folds) < 2):
         return fit
     choice = choose_weight(fit, folds, "cv" if weight == "auto" else weight)
-    return replace(fit, prior_weight=choice.weight, choice=choice)
+    return replace(
+        fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
+    )
 
 
 def make_constraints(
-    bounds: ConstraintSettings, geometry: Mapping[str, tuple[Array, Array]]
+    bounds: ConstraintSettings,
+    geometry: Mapping[str, tuple[Array, Array]],
+    extent: Mapping[str, Array] = MappingProxyType({}),
 ) -> Constraints:
     """Return the constraints as the estimator takes them.
 
@@ -154,9 +163,12 @@ def make_constraints(
         bounds: The constraints as a job states them.
         geometry: Half-spaces A c <= b of the centres of mass from the URDF's geometry, by name of
             the body; boxes stated in ``com`` go before them.
+        extent: Box that holds all mass of each body, by its name.
     """
     A = np.vstack([np.eye(3), -np.eye(3)])
-    com = dict(geometry)
+    com, kept = dict(geometry), dict(extent)
     for name, (low, high) in bounds.boxes.items():
         com[name] = (A, np.concatenate([high, np.negative(low)]))
-    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned))
+        if name in kept:  # what is stated is known better
+            kept[name] = np.array([np.minimum(kept[name][0], low), np.maximum(kept[name][1], high)])
+    return Constraints(bounds.masses, bounds.total, com, tuple(bounds.pinned), kept)

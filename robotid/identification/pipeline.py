@@ -319,13 +319,14 @@ def _measured(
         sigma = np.ones_like(rough.sigma) if weighing == "alike" else rough.sigma
         if estimate.names == mapping.names:
             sigma = estimate.sigma
-        redraws = None  # of what no bound can bind
+        redraws, pull = None, 1.0  # of what no bound can bind
         if fit is not None and isinstance(choice, BoundedSettings):
-            redraws = Redraws(fit, choice.draws, np.random.default_rng(0))
+            redraws, pull = Redraws(fit, choice.draws, np.random.default_rng(0)), fit.pull
         is_filter = weighing == "by age"
         estimate, errors = measured_errors(
-            estimate, stretches, factors, share, K, sigma, is_filter=is_filter, redraws=redraws
-        )
+            estimate, stretches, factors, share, K, sigma,
+            is_filter=is_filter, pull=pull, redraws=redraws,
+        )  # fmt: skip
     if ground.grown != 1.0:
         estimate = replace(estimate, covariance=ground.grown * estimate.covariance)
         wls = replace(wls, covariance=ground.grown * wls.covariance)

@@ -52,6 +52,12 @@ class ConstraintSettings(Settings):
         "URDF, where it has one and its meshes are found; or none",
         among=("none", "box", "hull"),
     )
+    extent: str = setting(
+        "box",
+        "where all mass of a link is kept: box of its geometry in the URDF, or of its frames if it "
+        "has none, as far as the data do not clearly contradict it; or none",
+        among=("box", "none"),
+    )
     pinned: Sequence[str] = setting((), "links that keep the URDF's values")
 
     def __post_init__(self) -> None:
@@ -185,13 +191,13 @@ class BoundedSettings(EstimatorSettings):
         within=_FINITE,
     )
     prior: str = setting(
-        "euclidean",
+        "entropic",
         "metric of the distance from the URDF's values",
-        among=("euclidean", "riemannian", "entropic"),
+        among=("entropic", "euclidean", "riemannian"),
     )
     prior_weight: float | str = setting(
         "auto",
-        "weight of the URDF's values [-], or how it is chosen from the fitted logs, 1 at most: cv "
+        "weight of the URDF's values [-], or how it is chosen from the fitted logs: cv "
         "(stretches held out in turn), evidence, or auto (cv, or 1 for a log too short to be cut)",
         among=("auto", "cv", "evidence"),
         within=_FINITE,

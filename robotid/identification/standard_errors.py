@@ -110,6 +110,7 @@ def measured_errors(
     sigma: Array,
     *,
     is_filter: bool = False,
+    pull: float = 1.0,
     redraws: Redraws | None = None,
 ) -> tuple[Estimate, StandardErrors]:
     """Return an estimate with the covariance that the scatter of the stretches shows.
@@ -117,10 +118,10 @@ def measured_errors(
     With bread B, the covariance if rows were independent, and meat M, the covariance of the score:
 
     * of base parameters: B M B, as of any least squares on correlated rows;
-    * of standard parameters, with the prior's information L in B = (K^T H K + L)^-1:
-      B (K^T M K + L) B, the mean square error about a truth that the prior describes. Where
-      inequalities bind, fits to redrawn data and prior tell it; without ``redraws`` they are left
-      out;
+    * of standard parameters, with the prior's information L in B = (K^T H K + L)^-1 and that of
+      the truth's plausible spread, L over the pull g: B (K^T M K + g L) B, the mean square error
+      about a truth so spread. Where inequalities bind, fits to redrawn data and prior tell it;
+      without ``redraws`` they are left out;
     * of a filter that forgets: its own covariance, grown by the mean inflation.
 
     Args:
@@ -132,6 +133,7 @@ def measured_errors(
         K: Map to the base parameters, shape (b, p).
         sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
         is_filter: Whether it weighs rows otherwise, too, as a filter that forgets or gates.
+        pull: How much heavier the prior weighs than the truth's plausible spread says [-].
         redraws: How the spread is told of an estimate whose details name active bounds.
 
     Returns:
@@ -150,15 +152,19 @@ def measured_errors(
             f"only {len(stretches)} stretches longer than the filter's memory"
         )
         errors = StandardErrors(method, len(stretches), 1 / share, np.full(b, np.inf))
-        if redraws is None:
-            return estimate, errors
         R = factors.weighted(sigma)[:b, :b]
-        return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
+        if redraws is not None:
+            return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
+        if pull > 1.0:
+            C = _about_prior(estimate.covariance, K, share * R.T @ R, R, share, pull)
+            estimate = replace(estimate, covariance=C)
+        return estimate, errors
     is_open = ~np.isfinite(np.diag(estimate.covariance))
     C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     if len(estimate.theta) != b:
         found = scatter(stretches, K @ estimate.theta, sigma, share * K @ C @ K.T)
-        covariance = _about_prior(C, K, found, factors.weighted(sigma)[:b, :b], share)
+        R = factors.weighted(sigma)[:b, :b]
+        covariance = _about_prior(C, K, share**2 * found.meat, R, share, pull)
     elif not is_filter:
         bread = solve_factor(factors, sigma, estimate.theta).covariance
         found = scatter(stretches, estimate.theta, sigma, bread)
@@ -264,8 +270,9 @@ def _bounded(
     The meat is that of the rows as ``Consistent.rows`` has them, of which a share counts.
     """
     fit = redraws.fit
+    rows = fit.rows(factors, sigma)
     found, failures = fit.programme.redrawn(
-        fit.rows(factors, sigma), fit.prior_weight, estimate.theta, meat, redraws.draws, redraws.rng
+        rows, fit.prior_weight, estimate.theta, meat, fit.pull, redraws.draws, redraws.rng
     )
     if len(found) < _LEAST_SOLVED * redraws.draws:
         raise NotConvergedError(
@@ -284,9 +291,9 @@ def _bounded(
     )
 
 
-def _about_prior(C: Array, K: Array, found: Scatter, R: Array, share: float) -> Array:
-    """Return C (share^2 K^T M K + L) C with L = C^-1 - share K^T R^T R K."""
+def _about_prior(C: Array, K: Array, meat: Array, R: Array, share: float, pull: float) -> Array:
+    """Return C (K^T meat K + pull L) C with L = C^-1 - share K^T R^T R K."""
     KC = K @ C
     RKC = R @ KC
-    covariance: Array = C - share * RKC.T @ RKC + share**2 * KC.T @ found.meat @ KC
+    covariance: Array = pull * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
     return 0.5 * (covariance + covariance.T)

@@ -98,7 +98,8 @@ def proximity(Psi: Array, P: Array, u: Array, *, sign: Sign = "corrected") -> Ar
     the true parameters. With the plus it is 2 Psi^T u there.
 
     Args:
-        Psi: Regressor of the motion that the torque u made, shape (..., n, c).
+        Psi: Regressor of the motion that the torque u made, G at the measured acceleration, shape
+            (..., n, c). With that of (22), at q_*, PRX tells nothing: u is Psi P by (21).
         P: Estimate, shape (..., c).
         u: Torque, shape (..., n) [N m or N].
         sign: ``"corrected"`` (minus) or ``"printed"`` (plus).

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.paper.equations import LinearPlant, mass_matrix
+from robotid.paper.equations import LinearPlant, PlanarDynamics, mass_matrix, torque
 from robotid.paper.planar_2r import (
     PAPER_LINKS,
     PAPER_PARAMETERS,
@@ -31,7 +31,8 @@ class Erratum:
         where: The equation.
         printed: What it says.
         corrected: What it must say.
-        max_torque_difference: The largest over random states [N m].
+        max_torque_difference: The largest over random states [N m]; for (23) that of the residual
+            whose gradient PRX is.
         max_torque_difference_on_program: The largest along the program motion [N m].
     """
 
@@ -58,8 +59,14 @@ class EnergyDrift:
 def errata(rng: np.random.Generator) -> list[Erratum]:
     """Return the errata that change a torque, each with the largest difference it makes.
 
+    The last one is that of (22) in (23). Proof: u of (21) is C(q, v, P^) + D(q, P^) q_*, linear in
+    P^, so u = Psi P^ with its gradient Psi (22), and PRX = Psi^T (Psi P^ - u) = 0 for every P^.
+
     Args:
         rng: Source of the random states: q within pi rad, v within 10 rad/s, a within 20 rad/s^2.
+
+    References:
+        Tzvetkova, (21)-(27).
     """
     somewhere = tuple(reach * rng.uniform(-1, 1, (_STATES, 2)) for reach in _REACH)
     program = PROGRAM.evaluate(np.linspace(0, DURATION, 401))
@@ -72,6 +79,7 @@ def errata(rng: np.random.Generator) -> list[Erratum]:
         ("G, column 4", "[s₂ q̇₁²; −s₂ q̇₂²]", "[−s₂ q̇₂²; s₂ q̇₁²]"),
         ("(27), p4", "p4 = L₁ m₂ȳ₂ + L₁ L₂ m₂", "p4 = L₁ m₂x̄₂ + L₁ L₂ m₂ = p3"),
         ("(23), read as a torque residual at P̂ = P", "ΨᵀΨP̂ + Ψᵀu", "ΨᵀΨP̂ − Ψᵀu"),
+        ("(23) with Ψ of (22), residual at P̂ = P / 2", "Ψ = G(q, q̇, q_*)", "Ψ = G(q, q̇, q̈)"),
     ]
     return [Erratum(*text, *sizes) for text, *sizes in zip(texts, *largest, strict=True)]
 
@@ -99,7 +107,15 @@ def _differences(q: Array, v: Array, a: Array) -> list[Array]:
     swapped = (G_printed - G) @ five
     p4 = G_printed @ (PAPER_PARAMETERS - five)
     residual = 2 * (regressor(q, v, a) @ P)  # Psi P + u, where it should be Psi P - u = 0
-    return [missing, swapped, p4, residual]
+    return [missing, swapped, p4, residual, _unseen(q, v, a, P)]
+
+
+def _unseen(q: Array, v: Array, q_star: Array, P: Array) -> Array:
+    """Return the residual of P^ = P / 2 that (22) hides, G P^ - Psi P^, shape (N, 2)."""
+    arm, P_hat = PlanarDynamics("corrected"), P / 2
+    u = torque(arm, q, v, q_star, P_hat)  # (21), Psi P^
+    a = LinearPlant(arm, P).acceleration(q, v, u)
+    return torque(arm, q, v, a, P_hat) - u
 
 
 def _free_energy(name: str, steps: int, h: float) -> Array:

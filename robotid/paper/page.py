@@ -196,7 +196,12 @@ def _errata(content: Mapping[str, Any]) -> str:
         "<p>Largest torque difference on the physical arm. Anywhere: random states within π rad, "
         "10 rad/s and 20 rad/s². (23) changes no torque of the arm; its row gives the residual "
         "ΨP̂ + u that the printed sign leaves at the true parameters, where it should be 0: with "
-        "it the procedure never stops.</p>\n" + table("Errata", headers, rows)
+        "it the procedure never stops.</p>\n"
+        "<p>(22) in (23): u of (21) is linear in P̂, so that u = ΨP̂ with its gradient Ψ (22), and "
+        "PRX = Ψᵀ(ΨP̂ − u) = 0 for every P̂: to the letter λ is 0 and nothing is learnt. The "
+        "regressor in (23) is therefore taken at the measured acceleration, Ψ = G(q, q̇, q̈); its "
+        "row gives the residual ΨP̂ − u that this shows at half of the parameters, where the "
+        "letter has 0.</p>\n" + table("Errata", headers, rows)
     )
 
 

@@ -46,6 +46,9 @@ class LoopSettings:
         substeps: Runge-Kutta steps per update; stiff friction needs several.
         method: ``"recursive"``, (24) at each update, or ``"one_shot"``, (18) after each run.
         sign: Sign in (23); with the printed one the procedure never stops.
+        prx_acceleration: Acceleration of the regressor in (23): ``"measured"``, or ``"reference"``,
+            q_* (15), as (22) has it to the letter. Then Psi P^ = u by (21): with the corrected
+            sign PRX is zero whatever the estimate, which never moves.
         eps1: Where no entry of PRX is larger, it counts as zero [N m / s^2].
         eps2: Where |Psi|^2 is not above it, nothing is updated [1/s^4].
         bounds: Omega of (8), or None.
@@ -58,6 +61,7 @@ class LoopSettings:
     substeps: int = 1
     method: Literal["recursive", "one_shot"] = "recursive"
     sign: Sign = "corrected"
+    prx_acceleration: Literal["measured", "reference"] = "measured"
     eps1: float = 1e-9
     eps2: float | Array = 1e-12
     bounds: Bounds | None = None
@@ -69,6 +73,10 @@ class LoopSettings:
                 raise SettingsError(f"{name} is {value}, wanted a positive number")
         if self.method not in ("recursive", "one_shot"):
             raise SettingsError(f"method is {self.method!r}, wanted 'recursive' or 'one_shot'")
+        if self.prx_acceleration not in ("measured", "reference"):
+            raise SettingsError(
+                f"prx_acceleration is {self.prx_acceleration!r}, wanted 'measured' or 'reference'"
+            )
 
 
 @dataclass(frozen=True)
@@ -250,7 +258,8 @@ class _Loop:
             a = self.plant.acceleration(q, v, applied)
             a_seen = self._sensed(a, self.influences.a)
             G = self.dynamics.regressor(q_seen, v_seen, a_seen)  # (12)
-            prx = np.abs(proximity(G, self.P, u, sign=self.settings.sign)).max(axis=1)  # (23)
+            moved = G if self.settings.prx_acceleration == "measured" else Psi
+            prx = np.abs(proximity(moved, self.P, u, sign=self.settings.sign)).max(axis=1)  # (23)
             largest = np.maximum(largest, prx)
             if self.settings.method == "recursive":
                 eta = a_seen - q_star  # (20), the deviation of the real from the program motion

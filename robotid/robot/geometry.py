@@ -11,11 +11,21 @@ from robotid.exceptions import SettingsError
 from robotid.robot.bodies import link_places
 from robotid.robot.meshes import Shape, find_mesh, read_shapes
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["body_points", "box_half_spaces", "geometry_half_spaces", "hull_half_spaces"]
+__all__ = [
+    "body_boxes",
+    "body_points",
+    "box_half_spaces",
+    "geometry_half_spaces",
+    "hull_half_spaces",
+]
 
 _SIDES = 16  # of the prism around a cylinder
 _MOST_FACES = 100  # a hull with more is replaced by a polytope of this many faces around it
+_GROWN = 0.05  # of its diagonal by which the box of a body's geometry is grown on each side
+_GROWN_BLIND = 0.35  # the same of the box around its frames alone, which have no width ...
+_NARROWEST = 0.1  # ... and at least this share of the longest link
 
 
 def geometry_half_spaces(model: RobotModel, shape: str) -> dict[str, tuple[Array, Array]]:
@@ -74,6 +84,47 @@ def body_points(model: RobotModel) -> dict[str, Array]:
     return {
         body: np.vstack(parts) for body, parts in found.items() if parts and body not in open_bodies
     }
+
+
+def body_boxes(model: RobotModel) -> dict[str, Array]:
+    """Return a box that holds all mass of each body, in the frame of its moved link.
+
+    It holds the body's geometry, grown by 5 % of its diagonal on each side; of a body without
+    geometry its frames (those of its joints, links and tools), grown by 35 % and at least 10 % of
+    the robot's longest link. It is widened to hold the URDF's own body: the uniform box of equal
+    mass, centre and second moments.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Lower and upper corner by name of each body, shape (2, 3) [m].
+    """
+    bodies = model.layout.bodies
+    frames: dict[str, list[Array]] = {body: [np.zeros(3)] for body in bodies}
+    for frame in model.pin_model.frames:
+        if frame.parentJoint > 0:
+            frames[bodies[frame.parentJoint - 1]].append(frame.placement.translation)
+    for i, (parent, place) in enumerate(
+        zip(model.pin_model.parents, model.pin_model.jointPlacements, strict=True)
+    ):
+        if i > 0 and parent > 0:
+            frames[bodies[parent - 1]].append(place.translation)
+    shapes, boxes = body_points(model), {}
+    J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
+    for body, J_i in zip(bodies, J, strict=True):
+        points = np.array(shapes.get(body, frames[body]))
+        low, high = points.min(axis=0), points.max(axis=0)
+        diagonal = float(np.linalg.norm(high - low))
+        blind = max(_GROWN_BLIND * diagonal, _NARROWEST * model.length)
+        grown = _GROWN * diagonal if body in shapes else blind
+        low, high = low - grown, high + grown
+        if J_i[3, 3] > 0:
+            centre = J_i[:3, 3] / J_i[3, 3]
+            half = np.sqrt(3.0 * np.maximum(np.diag(J_i)[:3] / J_i[3, 3] - centre**2, 0.0))
+            low, high = np.minimum(low, centre - half), np.maximum(high, centre + half)
+        boxes[body] = np.array([low, high])
+    return boxes
 
 
 def box_half_spaces(points: Array) -> tuple[Array, Array]:

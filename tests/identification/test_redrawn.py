@@ -17,6 +17,8 @@ from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 
+BOUND = {"prior": "euclidean", "prior_weight": 1.0}  # which leaves bodies on their bounds
+
 
 @pytest.fixture
 def inside(ur5, rng):
@@ -56,16 +58,16 @@ def test_the_nearest_matrix_has_the_positive_eigenvalues(rng):
     np.testing.assert_allclose(unsvec(found.reshape(-1)), clipped, atol=5e-3)
 
 
-@pytest.mark.parametrize("meat_over_bread", [1.0, 9.0])
-def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread):
+@pytest.mark.parametrize(("meat_over_bread", "pull"), [(1.0, 1.0), (9.0, 1.0), (1.0, 0.25)])
+def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread, pull):
     rows = information(inside, rng, 1.0)
     R = rows[:, :-1]
     meat = meat_over_bread * R.T @ R
-    found, failures = inside.programme.redrawn(rows, 1.0, inside.prior, meat, 3000, rng)
+    found, failures = inside.programme.redrawn(rows, 1.0, inside.prior, meat, pull, 3000, rng)
     assert failures == []
     L = np.diag(inside.prior_std**-2)
     B = np.linalg.inv(inside.K.T @ R.T @ R @ inside.K + L)
-    expected = B @ (inside.K.T @ meat @ inside.K + L) @ B
+    expected = B @ (inside.K.T @ meat @ inside.K + pull * L) @ B
     scale = np.sqrt(np.diag(expected))
     difference = (found.T @ found / len(found) - expected) / np.outer(scale, scale)
     assert np.abs(np.diag(difference)).max() < 0.12  # 3000 draws know a variance to 2.6 %
@@ -79,7 +81,8 @@ def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
     prior[i] = 0.0
     fit = replace(inside, prior=prior, K=np.delete(inside.K, np.flatnonzero(inside.K[:, i]), 0))
     rows = information(fit, rng, 1.0)
-    found, _ = fit.programme.redrawn(rows, 1.0, prior, rows[:, :-1].T @ rows[:, :-1], 2000, rng)
+    meat = rows[:, :-1].T @ rows[:, :-1]
+    found, _ = fit.programme.redrawn(rows, 1.0, prior, meat, 1.0, 2000, rng)
     away = found[:, i] / fit.prior_std[i]
     assert away.min() > -2e-3
     assert np.mean(away < 2e-3) == pytest.approx(0.5, abs=0.04)
@@ -88,8 +91,8 @@ def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
 
 def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=2000, noise=NOISE)
-    found = identify(ur5, [log], signals=EXACT)
-    free = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(draws=0))
+    found = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
+    free = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(draws=0, **BOUND))
     assert found.estimate.details["active"]
     np.testing.assert_array_equal(found.standard, free.standard)
     assert "64 fits to redrawn data and prior" in found.errors.method
@@ -99,7 +102,7 @@ def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
     assert np.median(ratio) < 1.0
     assert ratio.max() < 1.4
     assert found.errors.freedom.max() < 64
-    again = identify(ur5, [log], signals=EXACT)
+    again = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
     np.testing.assert_array_equal(again.standard_error, found.standard_error)
 
 
@@ -113,17 +116,17 @@ def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, mon
 
     monkeypatch.setattr(Programme, "redrawn", some_fail)
     lost = 3
-    found = identify(ur5, [log], signals=EXACT)
+    found = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
     assert "61 fits" in found.errors.method
     assert "(3 more not solved: InsufficientProgress)" in found.errors.method
     lost = 20
     with pytest.raises(NotConvergedError, match="solved 44 of 64 fits to redrawn data; set draws"):
-        identify(ur5, [log], signals=EXACT)
+        identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
 
 
 def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=300, noise=NOISE)
-    found = identify(ur5, [log])
+    found = identify(ur5, [log], estimator=EstimatorSettings(**BOUND))
     assert "only" in found.errors.method
     assert "fits to redrawn data" in found.errors.method
 

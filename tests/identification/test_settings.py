@@ -95,7 +95,7 @@ def test_a_job_with_a_recursive_estimator_runs_from_file_to_report(ur5, rng, tmp
         "gate": 0.999999,
         "physical": True,
         "margin": 1e-4,
-        "prior": "euclidean",
+        "prior": "entropic",
         "prior_weight": "auto",
         "solver": "clarabel",
         "check": False,

@@ -70,6 +70,17 @@ def test_with_the_printed_sign_it_never_stops():
     np.testing.assert_allclose(history.estimates[-1], [P4], rtol=1e-9)
 
 
+def test_with_22_to_the_letter_prx_is_zero_and_the_estimate_never_moves():
+    # u of (21) is Psi P^, so that Psi^T (Psi P^ - u) is rounding of 1e3 N m / s^2
+    literal = run(settings=short(3, prx_acceleration="reference"), offset=DEGREE)
+    assert literal.prx.max() < 1e-10
+    np.testing.assert_array_equal(literal.NA, [1])
+    np.testing.assert_array_equal(literal.estimates[-1], [P4 / 2])
+    ours = run(settings=short(3), offset=DEGREE)
+    assert ours.prx.min() > 10.0  # 27 in the third run
+    assert ours.relative_error(P4)[1, 0] < 0.4
+
+
 def test_a_ur5_under_gravity_tracks_with_its_true_base_parameters(gentle_ur5):
     model, dynamics, motion = gentle_ur5
     pi = model.standard_parameters()
@@ -307,6 +318,10 @@ def test_a_guess_of_another_shape_is_named():
     [
         ({"alpha": -1.0}, r"^alpha is -1.0, wanted a positive number$"),
         ({"iterations": 0}, r"^iterations is 0, wanted a positive number$"),
+        (
+            {"prx_acceleration": "real"},
+            r"^prx_acceleration is 'real', wanted 'measured' or 'reference'$",
+        ),
         ({"method": "both"}, r"^method is 'both', wanted 'recursive' or 'one_shot'$"),
     ],
 )

@@ -12,10 +12,19 @@ from matplotlib.figure import Figure
 from robotid.cli import main
 from robotid.exceptions import SettingsError
 from robotid.paper import run as paper
+from robotid.paper.equations import torque
 from robotid.paper.errata import energy_drift, errata
 from robotid.paper.planar_2r import PAPER_PARAMETERS
 from robotid.paper.run import run_paper
-from robotid.paper.study import MODELS, PaperSettings, paper_arm, random_runs, study_model
+from robotid.paper.study import (
+    DURATION,
+    MODELS,
+    PROGRAM,
+    PaperSettings,
+    paper_arm,
+    random_runs,
+    study_model,
+)
 
 FIGURES = ["figure_3a", "figure_3b", "figure_4a", "figure_4b", "figure_5", "convergence"]
 FIGURES += ["disturbance", "trajectories", "energy"]
@@ -143,13 +152,19 @@ def test_one_shot_needs_one_run_and_disturbance_shows():
 
 def test_the_errata_make_the_torques_differ_as_worked_out_by_hand():
     found = {e.where: e for e in errata(np.random.default_rng(0))}
-    assert len(found) == 4
+    assert len(found) == 5
     # h = 3 s2 + 0.1 c2 <= 3.002: C122 and C112 together miss 2 h v2 (v1 + v2) <= 3.002 * 400
     assert 1000 < found["(26)"].max_torque_difference < 3.002 * 400
     # column 4 is off by s2 (v1^2 + v2^2) <= 200, times p3 = 3
     assert 500 < found["G, column 4"].max_torque_difference < 600
     # p4 of (27) is 2 instead of 3, times s2 v^2 <= 100
     assert 95 < found["(27), p4"].max_torque_difference < 100
+    # D a = u - C with u = (D q_* + C) / 2: G P^ - u = D (a - q_*) / 2 = -(D q_* + C) / 4
+    t = np.linspace(0, DURATION, 401)
+    program = torque(*paper_arm("physical")[:1], *PROGRAM.evaluate(t), paper_arm("physical")[1])
+    unseen = found["(23) with Ψ of (22), residual at P̂ = P / 2"]
+    wanted = np.abs(program).max() / 4
+    np.testing.assert_allclose(unseen.max_torque_difference_on_program, wanted, rtol=1e-12)
     for erratum in found.values():
         assert 1.0 < erratum.max_torque_difference_on_program < erratum.max_torque_difference
 

@@ -19,7 +19,11 @@ _NEAR = 1e-6  # ... and below which the steps are computed exactly
 _ROUGH = 0.1  # ... and at which it goes on to a smaller weight, in units of the penalty
 _HEAVY = 100.0  # weight at which a fit stays near its prior, from which Newton's method sets out
 _DECADE = 10.0
+_PATIENCE = 25  # steps from a weight to a lighter one before a shorter way is tried
+_SHORTEST = 1.05  # ratio of weights below which it is given up
 _HALVINGS = 40
+_ROOM = 0.1  # share of the prior's pseudo-inertias that the first point has at least
+_INSIDE = 0.9  # share of the way to where a penalty is infinite that a step goes at most
 _NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
 _FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
@@ -47,19 +51,26 @@ class Programme:
     solver: str = "clarabel"
     max_iterations: int = 200
 
+    @property
+    def binding(self) -> Cone:
+        """The inequalities that can bind: the log det of a penalty keeps matrices inside."""
+        return self.cone.linear if self.penalty.keeps_positive else self.cone
+
     def minimise(
-        self, rows: Array, weight: float, *, is_exact: bool = True
+        self, rows: Array, weight: float, *, is_exact: bool = True, start: Array | None = None
     ) -> tuple[ConeSolution, Array]:
         """Return the minimum.
 
         A penalty that is not quadratic is minimised by Newton's method: its expansion to second
         order is a fit like any other, and a step keeps to the cone since that is convex. It sets
-        out near the prior, at a weight of 100, and goes down by decades.
+        out near the prior, at a weight that outweighs what the data say against it, and goes down
+        by decades: from afar a light one would creep along the boundary. Or from a start.
 
         Args:
             rows: Information on the base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
             is_exact: Whether to solve beyond 1e-3 standard deviations.
+            start: Minimum of nearly the same rows, at up to ten times the weight, shape (p,).
 
         Returns:
             The solution, its x being pi, shape (p,); and the covariance without the inequalities.
@@ -69,16 +80,15 @@ class Programme:
         """
         centre = self.penalty.centre
         if self.penalty.is_quadratic:
-            solution, R = self._expanded(rows, weight, centre, is_exact)
+            solution, R = self._expanded(rows, weight, centre, self.cone, is_exact)
             return solution, self._covariance(R)
-        heavy = max(weight, _HEAVY)
-        solution, _ = self._expanded(rows, heavy, centre, False)
-        steps = 0
-        while heavy > weight:
-            value = self.objective(rows, solution.x, heavy)
-            rough = max(_ROUGH * heavy, _NEAR * (1.0 + value))
-            solution, _, count = self._settle(rows, heavy, solution, rough)
-            heavy, steps = max(heavy / _DECADE, weight), steps + count
+        if start is None:
+            heavy = max(weight, _HEAVY, self._against(rows, centre))
+            solution, _, steps = self._settle(rows, heavy, self._start(rows, heavy), _ROUGH * heavy)
+        else:
+            solution, heavy, steps = ConeSolution(start, 0, ""), _DECADE * weight, 0
+        solution, count = self._lighten(rows, heavy, weight, solution)
+        steps += count
         value = self.objective(rows, solution.x, weight)
         solution, R, count = self._settle(rows, weight, solution, _NEAR * (1.0 + value))
         if is_exact:
@@ -94,21 +104,23 @@ class Programme:
         weight: float,
         pi: Array,
         meat: Array,
+        pull: float,
         draws: int,
         rng: np.random.Generator,
     ) -> tuple[Array, list[str]]:
         """Return how fits lie about this one whose data and prior are drawn anew.
 
         Noise of the data with the covariance that their score has, and of the prior with that of
-        the penalty, moves the minimum without the inequalities; its nearest point in the cone, in
-        the metric of the fit, is the minimum with them. A penalty that is not quadratic is
-        expanded at the fit.
+        the penalty over its pull, moves the minimum without the inequalities; its nearest point in
+        the cone, in the metric of the fit, is the minimum with them. A penalty that is not
+        quadratic is expanded at the fit.
 
         Args:
             rows: Information on the base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
             pi: The fit, shape (p,).
             meat: Covariance of the score of the rows, shape (b, b).
+            pull: How much heavier the penalty weighs than the truth's plausible spread says [-].
             draws: How many.
             rng: Source of the noise.
 
@@ -120,21 +132,37 @@ class Programme:
             Bardsley, Fox (2012), An MCMC method for uncertainty quantification in nonnegativity
             constrained inverse problems, section 3.
         """
-        triangle, cone = self._system(rows, weight, pi)
+        triangle, cone = self._system(rows, weight, pi, self.binding)
         R, space = triangle[:, :-1], self.space
         at = space.basis.T @ (pi / self.scale - space.origin)
         inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
         # y = R (x - at): of independent rows, whose meat is their information, the noise is white
         data = self.K * self.scale @ space.basis @ inverse
         prior = space.basis @ inverse
-        H = weight * self._scaled_hessian(pi)
-        size, axes = np.linalg.eigh(data.T @ meat @ data + prior.T @ H @ prior)
+        # the score of the prior: weight H (pi - truth), the truth of covariance pull / (weight H)
+        S = np.sqrt(pull * weight) * self._scaled_root(pi) @ prior
+        size, axes = np.linalg.eigh(data.T @ meat @ data + S.T @ S)
         noise = rng.standard_normal((draws, len(R))) * np.sqrt(np.maximum(size, 0.0)) @ axes.T
         lowest = triangle[:, -1] - R @ at
         y, failures = nearest(
             lowest + noise, cone.restrict(Subspace(at, inverse)), max_iterations=self.max_iterations
         )
         return self.scale * (y @ prior.T), failures
+
+    def _start(self, rows: Array, weight: float) -> ConeSolution:
+        """Return a point that no Newton step must lead away from the boundary, if there is one."""
+        centre = self.penalty.centre
+        inside = self.cone.around(centre / self.scale, _ROOM)
+        try:
+            return self._expanded(rows, weight, centre, inside, False)[0]
+        except NotConvergedError:  # bounds leave no such room
+            return self._expanded(rows, weight, centre, self.cone, False)[0]
+
+    def _against(self, rows: Array, pi: Array) -> float:
+        """Return by how much the squares of the residual exceed those of least squares."""
+        A, d = rows[:, :-1], rows[:, -1]
+        best = np.linalg.lstsq(A, d, rcond=None)[0]
+        return float(np.sum((A @ (self.K @ pi - best)) ** 2))
 
     def objective(self, rows: Array, pi: Array, weight: float) -> float:
         """Return what is minimised: the squares of the residual plus the weighted penalty [-].
@@ -158,14 +186,12 @@ class Programme:
             centre and r the number of directions that the equalities leave.
         """
         centre, basis = self.penalty.centre / self.scale, self.space.basis
-        H = self._scaled_hessian(self.penalty.centre)
-        inner = basis.T @ H @ basis
+        S = self._scaled_root(self.penalty.centre)
         # the point of the subspace that is nearest to the centre
-        nearest = self.space.origin + basis @ np.linalg.solve(
-            inner, basis.T @ H @ (centre - self.space.origin)
-        )
+        away = np.linalg.lstsq(S @ basis, S @ (centre - self.space.origin), rcond=None)[0]
+        nearest = self.space.origin + basis @ away
         A = rows[:, :-1] @ self.K * self.scale
-        L = scipy.linalg.cholesky(inner)
+        L = scipy.linalg.qr(S @ basis, mode="r")[0][: basis.shape[1]]
         directions = scipy.linalg.solve_triangular(L, (A @ basis).T, trans="T").T
         return directions, rows[:, -1] - A @ nearest
 
@@ -210,8 +236,31 @@ class Programme:
         Args:
             weight: Weight of the penalty [-].
         """
-        H, basis = weight * self._scaled_hessian(self.penalty.centre), self.space.basis
-        return self._covariance(scipy.linalg.cholesky(basis.T @ H @ basis))
+        S = np.sqrt(weight) * self._scaled_root(self.penalty.centre) @ self.space.basis
+        return self._covariance(scipy.linalg.qr(S, mode="r")[0][: S.shape[1]])
+
+    def _lighten(
+        self, rows: Array, heavy: float, weight: float, solution: ConeSolution
+    ) -> tuple[ConeSolution, int]:
+        """Go from near the minimum at a heavy weight to near that at a weight; count the steps.
+
+        By decades, or less where a decade takes too many steps.
+        """
+        ratio, steps = _DECADE, 0
+        while heavy > weight:
+            lighter = max(heavy / ratio, weight)
+            value = self.objective(rows, solution.x, lighter)
+            rough = max(_ROUGH * lighter, _NEAR * (1.0 + value))
+            try:
+                moved, _, count = self._settle(rows, lighter, solution, rough, limit=_PATIENCE)
+            except NotConvergedError:
+                ratio = np.sqrt(ratio)
+                if ratio < _SHORTEST:
+                    raise
+                steps += _PATIENCE
+            else:
+                solution, heavy, steps = moved, lighter, steps + count
+        return solution, steps
 
     def _settle(
         self,
@@ -220,12 +269,13 @@ class Programme:
         start: ConeSolution,
         tolerance: float,
         *,
+        limit: int = _STEPS,
         is_exact: bool = False,
     ) -> tuple[ConeSolution, Array, int]:
         """Go from a point of the cone to the minimum at a weight; return also R and the steps."""
         pi, value, before = start.x, self.objective(rows, start.x, weight), np.inf
-        for step in range(1, _STEPS + 1):
-            solution, R = self._expanded(rows, weight, pi, is_exact)
+        for step in range(1, limit + 1):
+            solution, R = self._expanded(rows, weight, pi, self.binding, is_exact)
             direction = solution.x - pi
             decrease = float(np.sum((R @ self.space.basis.T @ (direction / self.scale)) ** 2))
             share, lower = self._along(rows, weight, pi, direction, value)
@@ -236,7 +286,7 @@ class Programme:
                 return replace(solution, x=pi), R, step
             before = decrease
         raise NotConvergedError(
-            f"the fit still changes after {_STEPS} Newton steps at a prior weight of {weight:g}; "
+            f"the fit still changes after {limit} Newton steps at a prior weight of {weight:g}; "
             "use the 'euclidean' prior or a larger weight",
             "max_iterations",
         )
@@ -245,7 +295,8 @@ class Programme:
         self, rows: Array, weight: float, pi: Array, direction: Array, value: float
     ) -> tuple[float, float]:
         """Return the share of a step that lowers the objective, and the objective there."""
-        best, lowest, share = 0.0, value, 1.0
+        share = min(1.0, _INSIDE * self.penalty.reach(pi, direction))
+        best, lowest = 0.0, value
         for _ in range(_HALVINGS):
             lower = self.objective(rows, pi + share * direction, weight)
             if best > 0 and lower >= lowest:
@@ -256,10 +307,10 @@ class Programme:
         return best, lowest
 
     def _expanded(
-        self, rows: Array, weight: float, pi: Array, is_exact: bool
+        self, rows: Array, weight: float, pi: Array, cone: Cone, is_exact: bool
     ) -> tuple[ConeSolution, Array]:
         """Minimise with the penalty expanded at pi; return also R, R^T R half the Hessian."""
-        triangle, cone = self._system(rows, weight, pi)
+        triangle, cone = self._system(rows, weight, pi, cone)
         solution = least_squares(
             triangle[:, :-1],
             triangle[:, -1],
@@ -272,25 +323,24 @@ class Programme:
         x = solution.x if len(triangle) == len(pi) else space.origin + space.basis @ solution.x
         return replace(solution, x=x * self.scale), triangle[:, :-1]
 
-    def _system(self, rows: Array, weight: float, pi: Array) -> tuple[Array, Cone]:
-        """Return the triangle [R d] and the cone of what the equalities leave, expanded at pi."""
-        H = weight * self._scaled_hessian(pi)
+    def _system(self, rows: Array, weight: float, pi: Array, cone: Cone) -> tuple[Array, Cone]:
+        """Return the triangle [R d] and a cone of what the equalities leave, expanded at pi."""
+        L = np.sqrt(weight) * self._scaled_root(pi)  # half the Hessian is L^T L
         slope = 0.5 * weight * self.penalty.gradient(pi) * self.scale
-        L = scipy.linalg.cholesky(H)  # H = L^T L
         lowest = pi / self.scale - scipy.linalg.cho_solve((L, False), slope)
         # the data rows stand over prior rows, both in units of the scale
         A = np.vstack([rows[:, :-1] @ self.K * self.scale, L])
         d = np.concatenate([rows[:, -1], L @ lowest])
-        space, cone = self.space, self.cone
+        space = self.space
         free = space.basis.shape[1]
         if free < len(pi):
             A, d, cone = A @ space.basis, d - A @ space.origin, cone.restrict(space)
         triangle: Array = scipy.linalg.qr(np.column_stack([A, d]), mode="r")[0][:free]
         return triangle, cone
 
-    def _scaled_hessian(self, pi: Array) -> Array:
-        """Return half the Hessian of the penalty in units of the scale."""
-        scaled: Array = 0.5 * self.penalty.hessian(pi) * np.outer(self.scale, self.scale)
+    def _scaled_root(self, pi: Array) -> Array:
+        """Return the root of half the Hessian of the penalty in units of the scale."""
+        scaled: Array = self.penalty.root(pi) * self.scale
         return scaled
 
     def _covariance(self, R: Array) -> Array:

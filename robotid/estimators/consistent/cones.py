@@ -4,7 +4,7 @@ Linear inequalities, pseudo-inertias and equalities; Clarabel, and SCS as a seco
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +41,7 @@ _SCS_STATUS = {
     -6: "DualInfeasible",
     -7: "PrimalInfeasible",
 }
+_FAR = 1e3  # distance from the cone beyond which a longer unit is used
 _NEAREST = 1e-6  # gap at which a point in units of its spread is right to 1e-3
 _SCS_ITERATIONS = 100  # of SCS for one of an interior-point method: each is a back-substitution
 
@@ -110,6 +111,20 @@ class Cone:
     def rows(self) -> tuple[Array, Array]:
         """All coefficients and constants, linear rows first."""
         return np.vstack([self.G, self.S]), np.concatenate([self.h, self.s])
+
+    @property
+    def linear(self) -> "Cone":
+        """Its linear rows alone."""
+        return Cone(self.G, self.h, self.S[:0], self.s[:0], self.labels[: len(self.h)])
+
+    def around(self, x: Array, share: float) -> "Cone":
+        """Return the points whose matrices are at least a share of those of a point.
+
+        Args:
+            x: The point, shape (p,).
+            share: The share [-].
+        """
+        return Cone(self.G, self.h, self.S, self.s - share * (self.S @ x + self.s), self.labels)
 
     def matrices(self, x: Array) -> Array:
         """Return the matrices S_i(x), shape (m, 4, 4).
@@ -296,6 +311,15 @@ def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Ar
 
     p = points.shape[1]
     G, h = cone.rows
+    # rows, and matrices, of unit size: they come in units of a standard deviation, great or small
+    size = np.linalg.norm(G, axis=1)
+    k = len(cone.h)
+    size[k:] = np.repeat(np.linalg.norm(size[k:].reshape(-1, _ENTRIES), axis=1), _ENTRIES)
+    G, h = G / size[:, None], h / size
+    unit = replace(cone, G=G[:k], h=h[:k], S=G[k:], s=h[k:])
+    # far from the cone, a longer unit: a solver holds bounds of 1e10 for contradictory
+    reach = max(1.0, max(-unit.slack(point).min() for point in points) / _FAR)
+    h = h / reach
     settings = _clarabel_settings(max_iterations, _NEAREST)
     settings.tol_feas = _NEAREST
     # without these the data of a solver cannot change
@@ -306,10 +330,10 @@ def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Ar
     )
     found, failures = [], []
     for point in points:
-        solver.update(q=-point)
+        solver.update(q=-point / reach)
         solution = solver.solve()
         if str(solution.status) in (_SOLVED, _ALMOST):
-            found.append(np.array(solution.x))
+            found.append(reach * np.array(solution.x))
         else:
             failures.append(str(solution.status))
     return np.array(found).reshape(-1, p), failures

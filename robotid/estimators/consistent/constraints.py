@@ -1,6 +1,7 @@
 """What else is known of the bodies: bounds of mass, centre of mass, and bodies that are known."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from robotid.estimators.consistent.cones import Cone, svec
 from robotid.exceptions import SettingsError
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
-__all__ = ["SIGN_MARGIN", "Constraints"]
+__all__ = ["SIGN_MARGIN", "Constraints", "slabs"]
 
 #: Drive terms stay above this share of their scale, so that rounding cannot make them negative.
 SIGN_MARGIN = 1e-9
@@ -27,12 +28,27 @@ class Constraints:
         com: Half-spaces A c <= b that hold the centre of mass c of a body in its own frame, by
             name: A of shape (k, 3), unit rows, and b of shape (k,) [m].
         pinned: Bodies that keep the prior's values.
+        extent: Box that holds all mass of a body, by name: lower and upper corner in its own
+            frame, shape (2, 3) [m]; see ``slabs``.
+        relaxed: Bodies whose extent was left out, for the data contradict it.
     """
 
     mass: dict[str, tuple[float, float]] = field(default_factory=dict)
     total_mass: tuple[float, float] | None = None
     com: dict[str, tuple[Array, Array]] = field(default_factory=dict)
     pinned: tuple[str, ...] = ()
+    extent: dict[str, Array] = field(default_factory=dict)
+    relaxed: tuple[str, ...] = ()
+
+    def without_extent(self, bodies: Iterable[str]) -> "Constraints":
+        """Return the same constraints with the extents of some bodies left out.
+
+        Args:
+            bodies: Names of the bodies.
+        """
+        relaxed = tuple(body for body in self.extent if body in set(bodies))
+        kept = {body: box for body, box in self.extent.items() if body not in relaxed}
+        return replace(self, extent=kept, relaxed=(*self.relaxed, *relaxed))
 
     def check(self, layout: ParameterLayout, prior: Array, held: Array) -> None:
         """Refuse bounds that no parameters meet, before a solver looks for them.
@@ -46,7 +62,7 @@ class Constraints:
             SettingsError: If a body is unknown, bounds contradict each other, or a pinned body lies
                 outside its bounds or is not physically possible.
         """
-        known = {*self.mass, *self.com, *self.pinned}
+        known = {*self.mass, *self.com, *self.extent, *self.pinned}
         unknown = sorted(known - set(layout.bodies))
         if unknown:
             raise SettingsError(
@@ -160,6 +176,16 @@ class Constraints:
                 rows.append(row)
                 constants.append(0.0)
                 labels.append(f"centre_of_mass {body}")
+        for body, box in self.extent.items():
+            if body in self.pinned:
+                continue
+            i = layout.bodies.index(body)
+            for Q in slabs(box):
+                row = np.zeros(p)
+                row[10 * i : 10 * i + 10] = np.einsum("kij,ij->k", pseudo_inertia_basis(), Q)
+                rows.append(row)
+                constants.append(0.0)
+                labels.append(f"extent {body}")
         return np.array(rows).reshape(-1, p), np.array(constants), labels
 
     def _check_pinned(self, body: str, values: Array, held: Array) -> None:
@@ -201,6 +227,28 @@ class Constraints:
                 f"total_mass is bounded by [{low:g}, {high:g}] kg, but the bodies' own bounds and "
                 f"pinned masses allow [{least:g}, {most:g}] kg; make them agree"
             )
+
+
+def slabs(box: Array) -> Array:
+    """Return the matrices Q_k, shape (3, 4, 4), with tr(J Q_k) >= 0 of mass inside a box.
+
+    With x_k between the corners l and u, (x_k - l_k) (u_k - x_k) >= 0 of every grain of mass; its
+    integral over the body is tr(J Q_k). Together with J >= 0 it keeps the centre of mass and the
+    radii of gyration inside the box.
+
+    Args:
+        box: Lower and upper corner, shape (2, 3) [m].
+
+    References:
+        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent Inertial
+        Parameter Identification, (12), with an ellipsoid that is a slab.
+    """
+    Q = np.zeros((3, 4, 4))
+    for k, (low, high) in enumerate(box.T.tolist()):
+        Q[k, k, k] = -1.0
+        Q[k, k, 3] = Q[k, 3, k] = 0.5 * (low + high)
+        Q[k, 3, 3] = -low * high
+    return Q
 
 
 def _all_masses(layout: ParameterLayout) -> Array:

@@ -55,6 +55,7 @@ class Consistent(BatchEstimator):
             locked joints, shape (10 bodies,); None for nothing.
         margin: Smallest eigenvalue of a body's pseudo-inertia relative to its prior size [-].
         prior_weight: Weight of the prior [-].
+        plausible_weight: Weight whose spread about the prior the truth plausibly has [-].
         independent_share: Share of the rows that count as independent, 2 cutoff / rate.
         max_iterations: Bound on the iterations of the cone solver.
         metric: How the distance from the prior is measured: "euclidean",
@@ -77,6 +78,7 @@ class Consistent(BatchEstimator):
     held: Array | None = None
     margin: float = 1e-4
     prior_weight: float = 1.0
+    plausible_weight: float = 1.0
     independent_share: float = 1.0
     max_iterations: int = 200
     metric: str = "euclidean"
@@ -205,7 +207,7 @@ class Consistent(BatchEstimator):
             Gradients with respect to pi, shape (a, p), of what the constraints hold at 0, and the
             family and owner of each, as "pseudo_inertia forearm"; equalities are not among them.
         """
-        gradients, labels = self.programme.cone.active(pi / self.prior_std, tolerance)
+        gradients, labels = self.programme.binding.active(pi / self.prior_std, tolerance)
         return gradients / self.prior_std, labels
 
     @cached_property
@@ -225,9 +227,18 @@ class Consistent(BatchEstimator):
         return self.programme.penalty
 
     @property
+    def pull(self) -> float:
+        """How much heavier the prior weighs than its plausible spread says, at least 1 [-].
+
+        A heavy weight says that the data are explained near the prior, not that all parameters
+        are: what they leave open stays as uncertain as at ``plausible_weight``.
+        """
+        return max(self.prior_weight / self.plausible_weight, 1.0)
+
+    @property
     def spread_before(self) -> Array:
-        """Standard deviation of each parameter by the prior alone, shape (p,)."""
-        covariance = self.programme.prior_covariance(self.prior_weight)
+        """Plausible standard deviation of each parameter by the prior alone, shape (p,)."""
+        covariance = self.programme.prior_covariance(self.prior_weight / self.pull)
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
@@ -257,7 +268,11 @@ class Consistent(BatchEstimator):
     def _details(self, pi: Array) -> dict[str, Any]:
         """Return how it was fitted, as plain values."""
         is_bound = self.programme.space.basis.shape[1] < len(pi)
-        prior: dict[str, Any] = {"metric": self.metric, "weight": self.prior_weight}
+        prior: dict[str, Any] = {
+            "metric": self.metric,
+            "weight": self.prior_weight,
+            "plausible_weight": self.prior_weight / self.pull,
+        }
         if self.choice is not None:
             prior["chosen_by"] = self.choice.how
             prior["curve"] = [list(pair) for pair in self.choice.curve]
@@ -267,6 +282,7 @@ class Consistent(BatchEstimator):
             "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
             "active": sorted(set(self.active(pi)[1])),
             "pinned": list(self.constraints.pinned),
+            "relaxed": list(self.constraints.relaxed),
         }
 
     def _second_opinion(self, rows: Array, pi: Array, factors: Factors) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The consistent fit without a cone: nonlinear least squares in log-Cholesky parameters."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -24,6 +25,9 @@ _FLAT = 1e-9  # smallest curvature that damping counts with, relative
 _TOO_STIFF = 1e16  # damping at which no step lowers the objective any more
 _LONGEST = 4.0  # change of a coordinate in one step: most stand in an exponential
 _SPREAD = 1.0  # of random starts, in log-Cholesky parameters
+_STIFF = 10.0  # of the augmented Lagrangian, over the objective where it starts
+_ROUNDS = 12  # of it at most ...
+_PAID = 1e-7  # ... until the extents, free of units, are met to that
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +35,11 @@ class LogCholesky(BatchEstimator):
     """The fit of ``Consistent``, over coordinates in which every point is possible.
 
     Beside its held share and its margin, a body's pseudo-inertia is U U^T with U an upper
-    triangle whose diagonal is exponential, and a drive's coefficient an exponential. The problem
-    is not convex in them: it starts from the cone programme's solution, moved inside, and from
-    random points; the best end is taken. How far each ends above the cone programme is in the
-    details as ``gaps``, relative to the objective.
+    triangle whose diagonal is exponential, and a drive's coefficient an exponential. The extents
+    of bodies are kept by an augmented Lagrangian. The problem is not convex in these coordinates:
+    it starts from the cone programme's solution, moved inside, and from random points; the best
+    end is taken. How far each ends above the cone programme is in the details as ``gaps``,
+    relative to the objective.
 
     Attributes:
         fit_in_cone: The cone programme of the same problem.
@@ -42,7 +47,8 @@ class LogCholesky(BatchEstimator):
         rng: Source of the random starts.
 
     References:
-        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
+        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14); Nocedal,
+        Wright (2006), Numerical Optimization, 17.4.
     """
 
     fit_in_cone: Consistent
@@ -53,8 +59,8 @@ class LogCholesky(BatchEstimator):
         bounds: Constraints = self.fit_in_cone.constraints
         if bounds.mass or bounds.total_mass or bounds.com or bounds.pinned:
             raise SettingsError(
-                "estimator 'log_cholesky' knows no constraints beside physical consistency; use "
-                "'consistent' for bounds and pinned links"
+                "estimator 'log_cholesky' knows no constraints beside physical consistency and "
+                "extents; use 'consistent' for bounds and pinned links"
             )
 
     @property
@@ -85,37 +91,78 @@ class LogCholesky(BatchEstimator):
         )
 
     def _descend(self, rows: Array, z: Array) -> tuple[Array, float, int, bool]:
-        """Minimise from a point by damped Newton steps; return the end, its value and the steps."""
-        fit, damping = self.fit_in_cone, 1e-3
+        """Minimise from a point; return the end, its value, the steps and whether it converged."""
+        fit, steps = self.fit_in_cone, 0
         value = fit.objective(rows, self._parameters(z)[0])
+        price = np.zeros(len(self._extents))  # multipliers of the extents
+        stiffness = _STIFF * value
+        for _ in range(_ROUNDS):
+            z, count, converged = self._settle(rows, z, price, stiffness)
+            pi, steps = self._parameters(z)[0], steps + count
+            slack = self._extents @ pi
+            owed = np.maximum(price - stiffness * slack, 0.0)
+            change, price = np.abs(owed - price), owed
+            if (change <= _PAID * stiffness).all():
+                break
+        return z, fit.objective(rows, pi), steps, converged
+
+    def _settle(
+        self, rows: Array, z: Array, price: Array, stiffness: float
+    ) -> tuple[Array, int, bool]:
+        """Minimise by damped Newton steps at given multipliers; return also the steps."""
+        damping = 1e-3
+        value = self.objective(rows, z, price, stiffness)
         for step in range(1, _STEPS + 1):
-            slope, H = self.derivatives(rows, z)
+            slope, H = self.derivatives(rows, z, price, stiffness)
             unit = np.sqrt(np.maximum(np.abs(np.diag(H)), _FLAT * np.abs(np.diag(H)).max()))
             while True:
                 move = _damped_step(H / np.outer(unit, unit), slope / unit, damping) / unit
                 move *= min(1.0, _LONGEST / np.abs(move).max())
                 predicted = -float(slope @ move)
                 if predicted <= _SETTLED * value or damping > _TOO_STIFF:
-                    return z, value, step, damping <= _TOO_STIFF
-                lower = fit.objective(rows, self._parameters(z + move)[0])
+                    return z, step, damping <= _TOO_STIFF
+                lower = self.objective(rows, z + move, price, stiffness)
                 if lower < value:
                     break
                 damping = max(4.0 * damping, 1e-12)
             z, value, damping = z + move, lower, damping / 10.0
-        return z, value, _STEPS, False
+        return z, _STEPS, False
 
-    def derivatives(self, rows: Array, z: Array) -> tuple[Array, Array]:
-        """Return gradient, shape (p,), and Hessian, shape (p, p), of the objective by coordinates.
+    def objective(self, rows: Array, z: Array, price: Array, stiffness: float) -> float:
+        """Return the fit's objective with the augmented Lagrangian of the extents.
+
+        f + 1/(2 s) sum_i max(0, l_i - s g_i)^2, g_i = tr(J Q_i) of ``slabs``.
 
         Args:
             rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
             z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
+            price: Multipliers l of the extents, at least 0.
+            stiffness: The s.
+        """
+        pi = self._parameters(z)[0]
+        owed = np.maximum(price - stiffness * (self._extents @ pi), 0.0)
+        return self.fit_in_cone.objective(rows, pi) + float(owed @ owed) / (2.0 * stiffness)
+
+    def derivatives(
+        self, rows: Array, z: Array, price: Array, stiffness: float
+    ) -> tuple[Array, Array]:
+        """Return gradient, shape (p,), and Hessian, shape (p, p), of ``objective`` by coordinates.
+
+        Args:
+            rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
+            z: Ten log-Cholesky parameters per body, then those of the drives, shape (p,).
+            price: Multipliers of the extents.
+            stiffness: Of the augmented Lagrangian.
         """
         fit, size = self.fit_in_cone, self.fit_in_cone.layout.n_inertial
         pi, J = self._parameters(z)
         D = rows[:, :-1] @ fit.K
         in_pi = 2.0 * D.T @ (D @ pi - rows[:, -1]) + fit.prior_weight * fit.penalty.gradient(pi)
         curvature = 2.0 * D.T @ D + fit.prior_weight * fit.penalty.hessian(pi)
+        G_e = self._extents
+        owed = np.maximum(price - stiffness * (G_e @ pi), 0.0)
+        in_pi -= G_e.T @ owed
+        curvature += stiffness * G_e[owed > 0].T @ G_e[owed > 0]
         H = J.T @ curvature @ J
         # what the coordinates themselves bend: tr(G d2M) with G the gradient in the matrices
         grow = np.linalg.inv(self._shrink)
@@ -156,6 +203,14 @@ class LogCholesky(BatchEstimator):
         pi = np.concatenate([_inertial(rest).reshape(-1) + fit.known_share, drives * scale])
         blocks = [_inertial(slopes_i).T for slopes_i in slopes]
         return pi, scipy.linalg.block_diag(*blocks, np.diag(slope * scale))
+
+    @cached_property
+    def _extents(self) -> Array:
+        """Rows E, shape (k, p), with E pi >= 0 of the extents."""
+        cone = self.fit_in_cone.programme.cone.linear
+        chosen = [i for i, label in enumerate(cone.labels) if label.startswith("extent ")]
+        E: Array = cone.G[chosen] / self.fit_in_cone.prior_std
+        return E
 
     @property
     def _shrink(self) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
+from robotid.estimators.consistent.cones import svec
 from robotid.robot.parameters import (
     ParameterLayout,
     inertial_from_pseudo_inertia,
@@ -41,11 +42,13 @@ class WeightChoice:
         how: "cv" or "evidence".
         curve: Pairs of weight and score, ascending: prediction error of held-out stretches over
             the noise level ("cv"), or minus the log evidence; smaller is better.
+        plausible: The weight with the largest log evidence [-].
     """
 
     weight: float
     how: str
     curve: tuple[tuple[float, float], ...]
+    plausible: float
 
 
 class Penalty(ABC):
@@ -53,10 +56,12 @@ class Penalty(ABC):
 
     Attributes:
         is_quadratic: Whether its Hessian is the same everywhere.
+        keeps_positive: Whether it is finite for positive definite pseudo-inertias only.
         centre: Where it is 0, shape (p,).
     """
 
     is_quadratic: ClassVar[bool]
+    keeps_positive: ClassVar[bool] = False
     centre: Array
 
     @abstractmethod
@@ -76,12 +81,33 @@ class Penalty(ABC):
         """
 
     @abstractmethod
+    def root(self, pi: Array) -> Array:
+        """Return S with S^T S half its second derivative, shape (p, p), upper triangular.
+
+        The second derivative of a thin body is too ill-conditioned to be factorised, its root not.
+
+        Args:
+            pi: Standard parameters, shape (p,).
+        """
+
     def hessian(self, pi: Array) -> Array:
         """Return its second derivative, shape (p, p), positive definite.
 
         Args:
             pi: Standard parameters, shape (p,).
         """
+        S = self.root(pi)
+        H: Array = 2.0 * S.T @ S
+        return H
+
+    def reach(self, pi: Array, step: Array) -> float:
+        """Return the largest multiple of a step at which the value is finite.
+
+        Args:
+            pi: Standard parameters with a finite value, shape (p,).
+            step: Change of them, shape (p,).
+        """
+        return float("inf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +130,9 @@ class Quadratic(Penalty):
         slope: Array = 2.0 * self.M @ (pi - self.centre)
         return slope
 
-    def hessian(self, pi: Array) -> Array:
-        return 2.0 * self.M
+    def root(self, pi: Array) -> Array:
+        S: Array = scipy.linalg.cholesky(self.M)
+        return S
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +149,7 @@ class _Entropic(Penalty):
     """
 
     is_quadratic = False
+    keeps_positive = True
     centre: Array
     precision: Array
     held: Array
@@ -141,10 +169,19 @@ class _Entropic(Penalty):
         inertial = 2.0 * np.einsum("nij,kij->nk", slope, pseudo_inertia_basis()).reshape(-1)
         return np.concatenate([inertial, 2.0 * self.precision * self._drives(pi)])
 
-    def hessian(self, pi: Array) -> Array:
-        inertial = pull_back_metric(self._rest(pi))
-        H: Array = 2.0 * scipy.linalg.block_diag(*inertial, np.diag(self.precision))
-        return H
+    def root(self, pi: Array) -> Array:
+        S: Array = scipy.linalg.block_diag(
+            *metric_root(self._rest(pi)), np.diag(np.sqrt(self.precision))
+        )
+        return S
+
+    def reach(self, pi: Array, step: Array) -> float:
+        U = np.linalg.cholesky(self._rest(pi))
+        D = pseudo_inertia(step[: len(self.held)])
+        # J + s D is positive definite while 1 + s eig(U^-1 D U^-T) > 0
+        whitened = np.linalg.solve(U, np.linalg.solve(U, D).transpose(0, 2, 1))
+        lowest = float(np.linalg.eigvalsh(whitened)[:, 0].min())
+        return -1.0 / lowest if lowest < 0 else float("inf")
 
     def _rest(self, pi: Array) -> Array:
         return pseudo_inertia(pi[: len(self.held)] - self.held)
@@ -200,9 +237,24 @@ def pull_back_metric(J: Array) -> Array:
     References:
         Lee, Wensing, Park (2019), as of ``make_penalty``, (22).
     """
-    slopes = np.linalg.solve(J[:, None], pseudo_inertia_basis()[None])  # (n, 10, 4, 4)
-    metric: Array = np.einsum("nkij,nlji->nkl", slopes, slopes)
+    S = metric_root(J)
+    metric: Array = S.transpose(0, 2, 1) @ S
     return metric
+
+
+def metric_root(J: Array) -> Array:
+    """Return upper triangles S with S^T S the metric of ``pull_back_metric``, shape (n, 10, 10).
+
+    With J = L L^T, g_kl = tr(C_k C_l) of the symmetric C_k = L^-1 B_k L^-T.
+
+    Args:
+        J: Pseudo-inertias, shape (n, 4, 4), positive definite.
+    """
+    L = np.linalg.cholesky(J)[:, None]
+    half = np.linalg.solve(L, pseudo_inertia_basis()[None])
+    C = np.linalg.solve(L, half.transpose(0, 1, 3, 2))  # (n, 10, 4, 4)
+    S: Array = np.asarray(np.linalg.qr(svec(C).transpose(0, 2, 1), mode="r"))
+    return S
 
 
 def body_units(spread: Array) -> Array:

@@ -1,22 +1,25 @@
-"""The weight of the prior, chosen from the fitted data alone."""
+"""What held-out stretches of the fitted data say: the prior's weight, and of bodies' extents."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.penalties import WeightChoice
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, merge
 
-__all__ = ["choose_weight", "held_out_errors", "log_evidence"]
+__all__ = ["choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
 
-_LIGHTEST, _HEAVIEST = -4.0, 0.0  # decades of the weights tried
-_LIGHTEST_ENTROPIC = -1.0  # below, each fit of a penalty that is not quadratic takes a second
+_LIGHTEST, _HEAVIEST = -4.0, 2.0  # decades of the weights tried
+_LIGHTEST_ENTROPIC = -1.0  # below, bodies become thin, and fits take long
 _PATIENCE = 2  # decades without a better score that end the search
 _ALIKE = 2.0  # standard errors of the difference by which a heavier weight may be worse
-_STEPS = (0.5, 0.25)  # decades by which the best one is refined
+_BEYOND = 4.0  # standard errors by which a body must leave its box
+_CLEAR = 0.02  # share of the mean square by which an extent must be worse, to be left out
+_STEP = 0.5  # decades by which the best one is refined
 
 
 def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> WeightChoice:
@@ -26,10 +29,10 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
       smallest ones, stretch by stretch: a weight that wins by chance follows the noise.
     * "evidence": the weight with the largest ``log_evidence``.
 
-    Weights are tried from 1 down to 1e-4 (entropic: 0.1) at most, by decades until two in a row
-    are worse than those before, then around the best one. None is heavier than 1: a good
-    prediction shows that most parameters are near the prior, not that all are, and standard
-    errors must hold for those that are not, as of a link with a tool.
+    Weights are tried from 100 down to 1e-4 (entropic: 0.1) at most, by decades until two in a
+    row are worse than those before, then around the best one. A weight beyond 1 keeps parameters
+    near the prior, but not their standard errors narrow; see ``Consistent.pull``. One at which the
+    fit does not converge, as bodies shrink to points, counts as infinitely bad.
 
     Args:
         fit: The fit, whose own weight does not matter.
@@ -38,19 +41,69 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
 
     Raises:
         DataError: If "cv" has fewer than two stretches.
-        NotConvergedError: If a fit does not converge.
+        NotConvergedError: If the fit does not converge at the heaviest weight.
     """
     sigma = fit.noise(merge(stretches))
     lightest = _LIGHTEST if fit.penalty.is_quadratic else _LIGHTEST_ENTROPIC
+    rows = fit.rows(merge(stretches), sigma)
+    by_evidence = _search(
+        lambda w: (-log_evidence(fit, rows, w), np.zeros(0)), "evidence", lightest
+    )
     if how == "evidence":
-        rows = fit.rows(merge(stretches), sigma)
-        return _search(lambda w: (-log_evidence(fit, rows, w), np.zeros(0)), how, lightest)
+        return by_evidence
+
+    starts = None  # the fits at the weight before
 
     def score(weight: float) -> tuple[float, Array]:
-        errors = held_out_errors(fit, stretches, sigma, weight)
+        nonlocal starts
+        try:
+            errors, starts = _held_out(fit, stretches, sigma, weight, starts)
+        except NotConvergedError:
+            if starts is None:
+                raise
+            return float("inf"), np.full(len(stretches), np.inf)
         return float(np.sqrt(errors.sum())), errors
 
-    return _search(score, how, lightest)
+    return replace(_search(score, how, lightest), plausible=by_evidence.plausible)
+
+
+def contradicted_extents(fit: Consistent, stretches: Sequence[Factors]) -> tuple[str, ...]:
+    """Return the bodies whose mass the data put outside the box that should hold it.
+
+    They are those that a fit without extents, at a weight of 1, puts outside by more than four
+    standard errors; if it also predicts held-out stretches better than the fit with extents, by
+    more than two standard errors and 2 % of the mean square.
+
+    Args:
+        fit: The fit, whose own weight does not matter.
+        stretches: Factors of contiguous stretches of the fitted data; one cannot be held out.
+    """
+    whole, cone = merge(stretches), fit.programme.cone.linear
+    sigma = fit.noise(whole)
+    rows = fit.rows(whole, sigma)
+    free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
+    try:
+        solution, covariance = free.programme.minimise(rows, 1.0, is_exact=False)
+    except NotConvergedError:  # bodies run away: that contradicts no extent
+        return ()
+    G = cone.G / fit.prior_std
+    error = np.sqrt(np.einsum("ki,ij,kj->k", G, covariance, G))
+    beyond = G @ solution.x + cone.h < -_BEYOND * error
+    outside = [label for label, is_out in zip(cone.labels, beyond, strict=True) if is_out]
+    bodies = tuple(body for body in fit.layout.bodies if f"extent {body}" in outside)
+    if not bodies or len(stretches) < 2:
+        return bodies
+    starts = [solution.x] * len(stretches)
+    try:
+        unbound = _held_out(free, stretches, sigma, 1.0, starts)[0]
+    except NotConvergedError:
+        return ()
+    try:
+        bound = _held_out(fit, stretches, sigma, 1.0, None)[0]
+    except NotConvergedError:  # data without noise cannot be fitted at all
+        return bodies
+    is_clear = bound.sum() > (1.0 + _CLEAR) * unbound.sum() and not _is_as_good(bound, unbound)
+    return bodies if is_clear else ()
 
 
 def held_out_errors(
@@ -72,17 +125,32 @@ def held_out_errors(
         DataError: If there are fewer than two stretches.
         NotConvergedError: If a fit does not converge.
     """
+    return _held_out(fit, stretches, sigma, weight, None)[0]
+
+
+def _held_out(
+    fit: Consistent,
+    stretches: Sequence[Factors],
+    sigma: Array,
+    weight: float,
+    starts: Sequence[Array] | None,
+) -> tuple[Array, list[Array]]:
+    """Return the errors of ``held_out_errors``, and the fits that made them, to start others."""
     if len(stretches) < 2:
         raise DataError(
             f"the prior's weight cannot be chosen from {len(stretches)} stretch; fit longer logs, "
             "or use prior_weight = 'evidence'"
         )
-    squares = []
+    squares, fits = [], []
     for k, kept in enumerate(stretches):
         others = merge([*stretches[:k], *stretches[k + 1 :]])
-        solution, _ = fit.programme.minimise(fit.rows(others, sigma), weight, is_exact=False)
+        start = None if starts is None else starts[k]
+        solution, _ = fit.programme.minimise(
+            fit.rows(others, sigma), weight, is_exact=False, start=start
+        )
+        fits.append(solution.x)
         squares.append((kept.residual_squares(fit.K @ solution.x) / sigma**2).sum())
-    return np.array(squares) / sum(int(kept.rows.sum()) for kept in stretches)
+    return np.array(squares) / sum(int(kept.rows.sum()) for kept in stretches), fits
 
 
 def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
@@ -111,7 +179,7 @@ def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
 def _search(
     score: Callable[[float], tuple[float, Array]], how: str, lightest: float
 ) -> WeightChoice:
-    """Return the weight with the smallest score, from 1 down by decades until it only grows.
+    """Return the weight with the smallest score, from 100 down by decades until it only grows.
 
     Beside the score come its parts, one per stretch or none; the heaviest weight wins that is not
     worse by more than two standard errors of the parts' differences.
@@ -126,15 +194,14 @@ def _search(
     while decade >= lightest and _is_promising(tried):
         attempt(decade)
         decade -= 1.0
-    for step in _STEPS:
-        best = min(tried, key=lambda k: tried[k])
-        for k in (best - step, best + step):
-            if lightest <= k <= _HEAVIEST and k not in tried:
-                attempt(k)
     best = min(tried, key=lambda k: tried[k])
-    alike = [k for k in tried if _is_as_good(parts[k], parts[best])]
-    curve = tuple((float(10.0**k), tried[k]) for k in sorted(tried))
-    return WeightChoice(float(10.0 ** max([best, *alike])), how, curve)
+    for k in (best - _STEP, best + _STEP):
+        if lightest <= k <= _HEAVIEST and np.isfinite(tried.get(k - _STEP, 0.0)):
+            attempt(k)
+    best = min(tried, key=lambda k: tried[k])
+    alike = [k for k in tried if np.isfinite(tried[k]) and _is_as_good(parts[k], parts[best])]
+    curve = tuple((float(10.0**k), tried[k]) for k in sorted(tried) if np.isfinite(tried[k]))
+    return WeightChoice(float(10.0 ** max([best, *alike])), how, curve, float(10.0**best))
 
 
 def _is_as_good(parts: Array, best: Array) -> bool:
@@ -149,4 +216,6 @@ def _is_as_good(parts: Array, best: Array) -> bool:
 def _is_promising(tried: dict[float, float]) -> bool:
     """Return whether one of the last two weights had the smallest score."""
     scores = list(tried.values())
+    if scores and not np.isfinite(scores[-1]):
+        return False
     return len(scores) <= _PATIENCE or min(scores[-_PATIENCE:]) < min(scores[:-_PATIENCE])

@@ -20,6 +20,7 @@ from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.regressor.factors import compress
+from robotid.robot.geometry import body_boxes
 from robotid.robot.parameters import inertial_from_pseudo_inertia
 
 
@@ -59,17 +60,20 @@ def test_curvature_is_that_of_finite_differences(rng):
 
 
 @pytest.mark.parametrize("metric", ["riemannian", "entropic"])
-def test_gradient_and_hessian_of_the_fit_are_those_of_finite_differences(case, metric, rng):
+def test_gradient_and_hessian_of_the_fit_are_those_of_finite_differences(case, ur5, metric, rng):
     fit, factors = case
-    fit = replace(fit, metric=metric)
+    fit = replace(fit, metric=metric, constraints=Constraints(extent=body_boxes(ur5)))
     smooth, rows = LogCholesky(fit), fit.rows(factors, NOISE)
     z = smooth._coordinates(fit.fit(factors).theta) + 0.2 * rng.standard_normal(len(fit.prior))
-    slope, hessian = smooth.derivatives(rows, z)
+    # some extents are left, others not
+    price, stiffness = np.linspace(0.0, 1e3, 18), 1e4
+    assert 0 < ((smooth._extents @ smooth._parameters(z)[0]) < price / stiffness).sum() < 18
+    slope, hessian = smooth.derivatives(rows, z, price, stiffness)
     h, numeric, bent = 1e-5, [], []
     for step in h * np.eye(len(z)):
-        ends = [fit.objective(rows, smooth._parameters(z + s)[0]) for s in (step, -step)]
+        ends = [smooth.objective(rows, z + s, price, stiffness) for s in (step, -step)]
         numeric.append((ends[0] - ends[1]) / (2 * h))
-        slopes = [smooth.derivatives(rows, z + s)[0] for s in (step, -step)]
+        slopes = [smooth.derivatives(rows, z + s, price, stiffness)[0] for s in (step, -step)]
         bent.append((slopes[0] - slopes[1]) / (2 * h))
     np.testing.assert_allclose(slope, numeric, atol=1e-6 * np.abs(slope).max())
     np.testing.assert_allclose(hessian, bent, atol=1e-6 * np.abs(hessian).max())

@@ -103,19 +103,19 @@ def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
         assert prior["weight"] >= weights[np.argmin(scores)]
         assert (np.diff(weights) > 0).all()
         assert len(weights) >= 5
-        assert weights.max() == 1.0
+        assert weights.max() == 100.0
 
 
-@pytest.mark.parametrize(("gain", "weight"), [(0.01, 1.0), (0.5, 0.01)])
+@pytest.mark.parametrize(("gain", "weight"), [(0.01, 100.0), (0.5, 0.01)])
 def test_a_lighter_weight_must_be_better_beyond_chance(case, monkeypatch, gain, weight):
     fit, problem = case
     chance = np.array([0.1, -0.1, 0.05, -0.1, 0.1, -0.05])  # in favour of some stretches only
 
-    def errors(fit, stretches, sigma, w):
+    def errors(fit, stretches, sigma, w, starts):
         distance = abs(np.log10(w) + 2.0)  # smallest at 0.01
-        return 1.0 + distance * (gain + chance)
+        return 1.0 + distance * (gain + chance), []
 
-    monkeypatch.setattr("robotid.estimators.consistent.weighting.held_out_errors", errors)
+    monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
     choice = choose_weight(fit, cut(problem, 6), "cv")
     assert choice.weight == pytest.approx(weight)
     weights, scores = zip(*choice.curve, strict=True)
@@ -130,7 +130,7 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
     for how in ("cv", "evidence"):
         good = choose_weight(replace(fit, prior=true), stretches, how).weight
         bad = choose_weight(replace(fit, prior=wrong), stretches, how).weight
-        assert good == 1.0
+        assert good == 100.0
         assert bad <= 0.1, how
 
 
