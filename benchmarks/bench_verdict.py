@@ -37,6 +37,7 @@ QUICK = (("ur5", "tiago"), ("clean", "clean, far from the URDF", "torque 20 ms l
          "all torques reversed", "two torque columns swapped", "degrees", "1 kg in the fitted log",
          "mounted on a wall", "all torques x 0.8"))  # fmt: skip
 
+UNCHECKED = "rests on the sensors alone"
 NOTE = re.compile(r"doctor: \w+: (?P<code>\w+): ")
 
 
@@ -56,13 +57,14 @@ class Answer:
     @property
     def is_right(self):
         case = CASES[self.case]
+        if case.is_off_scale and self.status == "usable":
+            return all(UNCHECKED in reason for reason in self.reasons)
         return self.status in case.right or (case.is_hidden and self.says_unchecked)
 
     @property
     def says_unchecked(self):
-        """Whether it says that the scale of the recordings rests on nothing else."""
-        said = " ".join(self.reasons)
-        return any(words in said for words in ("rests on", "could not be checked", "weigh"))
+        """Whether it says that the scale of the recordings rests on the sensors alone."""
+        return any(UNCHECKED in reason for reason in self.reasons)
 
     @property
     def is_named(self):
