@@ -57,6 +57,8 @@ class Candidate:
             is the torque of the term, root mean square.
         turns: Whether only a joint that turns has it.
         coupled: The other joint of a coupling; empty for none.
+        is_imitated: Whether a drive that sticks at its reversals looks like it behind a filter: it
+            is no more than a note then.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Candidate:
     units: tuple[str, str] | None = None
     turns: bool = False
     coupled: str = ""
+    is_imitated: bool = False
 
 
 def _usual(x: Array) -> float:
@@ -120,8 +123,10 @@ CANDIDATES = (
         "Raise min_velocity to leave the slow rows out",
     ),
     Candidate(
-        "presliding", "friction_shape", _presliding, f"{_FRICTION} but sets in with speed",
+        "presliding", "friction_shape", _presliding,
+        f"{_FRICTION} but sets in with speed, or a drive that sticks",
         "Set friction_band, or raise min_velocity to leave the slow rows out",
+        is_imitated=True,
     ),
     Candidate(
         "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],

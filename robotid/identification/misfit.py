@@ -11,6 +11,7 @@ before the data. What a term explains of the stretches left out, it explains bey
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from scipy.special import stdtr
 from robotid._typing import Array
 from robotid.findings import Finding, listed
 from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
-from robotid.identification.evaluation import Evaluation
+from robotid.identification.evaluation import Evaluation, Recording
 from robotid.identification.rows import independent_share
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
@@ -60,6 +61,7 @@ _MATTERS = 0.02  # ... and than this is no warning
 _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
 _OF_POSITION = ("position_periodic", "spring")
 _OF_MASSES = ("current_for_torque", "urdf_mismatch")
+_NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
@@ -80,7 +82,7 @@ class Misfit:
         size: Its parameter, or the root mean square of its torque, as the term's units say.
         std_error: Standard error of the size.
         unit: Unit of the size.
-        error: Residual over torque, root mean square, without the term [-].
+        error: Residual that base parameters leave without the term, over the torque [-].
     """
 
     joint: str
@@ -98,7 +100,8 @@ class Misfit:
         """Whether it is a warning."""
         explained = np.sqrt(self.share) * self.error
         is_denied = self.confirmed is not None and self.confirmed < _CONFIRMED * self.share
-        return bool(self.share >= _MOST and explained >= _MATTERS and not is_denied)
+        is_doubted = is_denied or self.term.is_imitated
+        return bool(self.share >= _MOST and explained >= _MATTERS and not is_doubted)
 
 
 def misfit_findings(identification: "Identification") -> list[Finding]:
@@ -170,7 +173,7 @@ class Sample:
         motions: How each joint moves in the N rows.
         at: The motions of the recordings, those rows alone.
         weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
-        error: Usual residual over usual torque, shape (n,) [-].
+        torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
         stretches: Which rows each of the K stretches has, those of the logs kept apart last.
         fitted: How many of the stretches are of fitted logs.
         rows: How many of the rows are.
@@ -185,7 +188,7 @@ class Sample:
     motions: tuple[JointMotion, ...]
     at: tuple[Trajectory, ...]
     weight: Array
-    error: Array
+    torque: Array
     stretches: tuple[slice, ...]
     fitted: int
     rows: int
@@ -211,9 +214,10 @@ def take_sample(identification: "Identification") -> Sample | None:
     tau = np.concatenate([m.tau for m in motion])
     r = tau - np.concatenate([e.torques["estimate"][k] for e, k in parts])
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
+    used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
     used = used & (np.abs(r) <= _OUTLIER * _usual_size(r[:own], used[:own]))
-    squares = [np.sum(x[:own] ** 2, axis=0, where=used[:own]) for x in (r, tau)]
-    scale = np.sqrt(squares[0] / np.maximum(used[:own].sum(axis=0), 1))
+    squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
+    scale = np.sqrt(squares / np.maximum(used[:own].sum(axis=0), 1))
     weight = used * np.sqrt(independent) / np.where(scale > 0, scale, np.inf)
     size = model.layout.n_inertial
     load = Y[:, :, :size] @ identification.standard[:size]
@@ -228,7 +232,7 @@ def take_sample(identification: "Identification") -> Sample | None:
         motions=_joint_motions([e.recording.trajectory for e, _ in parts], rows, load, model),
         at=tuple(motion),
         weight=weight,
-        error=np.sqrt(squares[0] / np.where(squares[1] > 0, squares[1], np.inf)),
+        torque=np.sum((weight * tau)[:own] ** 2, axis=0),
         stretches=stretches,
         fitted=number,
         rows=own,
@@ -294,13 +298,9 @@ def _joint_motions(
     def joined(of: Callable[[Trajectory], Array]) -> Array:
         return np.concatenate([of(m)[k] for m, k in zip(motions, rows, strict=True)])
 
-    def directions(m: Trajectory) -> Array:
-        n = len(model.joints)
-        own = friction_directions(model.layout, m.v, m.direction)[:, :n]
-        return own if own.shape[1] else np.sign(m.v)
-
     q, v, a = (joined(attrgetter(name)) for name in "qva")
-    signs, way = joined(directions), joined(_travelled)
+    signs = joined(partial(_directions, model))
+    way = joined(_travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
     alone = [
         JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time)
@@ -311,6 +311,30 @@ def _joint_motions(
         replace(motion, others={model.joints[k]: alone[k] for k in near})
         for motion, near in zip(alone, beside, strict=True)
     )
+
+
+def _is_steady(recording: Recording) -> Array:
+    """Return where no reversal of a joint, nor its standing still, is near, shape (N, n), bool.
+
+    A drive that sticks there is smeared by the filter, and no friction.
+    """
+    motion, signals = recording.trajectory, recording.signals
+    if signals.cutoff is None:
+        return np.ones(motion.v.shape, dtype=bool)
+    slow = (np.abs(motion.v) < signals.min_velocity) | (_travelled(motion) == 0.0)
+    steady = np.empty(slow.shape, dtype=bool)
+    for j, at in enumerate(slow.T):
+        times = np.concatenate([[-np.inf], motion.t[at], [np.inf]])
+        after = np.searchsorted(times, motion.t, side="right")
+        near = np.minimum(motion.t - times[after - 1], times[after] - motion.t)
+        steady[:, j] = near > _NEAR / signals.cutoff
+    return steady
+
+
+def _directions(model: RobotModel, motion: Trajectory) -> Array:
+    """Return which way the friction of each joint's own drive acts, shape (N, n)."""
+    signs = friction_directions(model.layout, motion.v, motion.direction)[:, : len(model.joints)]
+    return signs if signs.shape[1] else np.sign(motion.v)
 
 
 def _travelled(motion: Trajectory) -> Array:
@@ -404,6 +428,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     apart, whole = trials(sample, slice(j, j + 1), np.hstack(columns)[:, None])
     chosen: list[int] = []
     total = before = apart.left([])
+    error = float(np.sqrt(total[: sample.fitted].sum() / sample.torque[j]))
     for _ in range(_TERMS):
         left = {c: apart.left([*chosen, *place[c]]) for c in own}
         best = _best(left, before, place, total, sample.fitted)
@@ -416,7 +441,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
             whole.left(which)[sample.fitted :].sum()
             for which in ([], chosen, [*chosen, *place[best]])
         ]
-        if np.sqrt(share) * sample.error[j] >= _SEEN:
+        if np.sqrt(share) * error >= _SEEN:
             yield Misfit(
                 joint=sample.joints[j],
                 term=best,
@@ -426,7 +451,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 size=size,
                 std_error=std_error,
                 unit=unit,
-                error=float(sample.error[j]),
+                error=error,
             )
         chosen += place[best]
         before, own = left[best], [c for c in own if c.code != best.code]

@@ -129,6 +129,8 @@ def test_a_real_recording_in_pieces_ends_where_it_ends_in_memory(
     recordings, tmp_path, monkeypatch, without_page
 ):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
+    # of a log in pieces, what drives lack is judged by the stretches at hand: here 1 s of 5 s
+    monkeypatch.setattr("robotid.identification.misfit.find_misfits", lambda _: ())
     job = read_job(Path(__file__).parents[1] / "jobs" / "tx40.toml")
     compare(job, tmp_path, held=8000)
 

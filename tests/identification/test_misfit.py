@@ -76,9 +76,9 @@ def test_the_size_holds_the_truth(ur5, effect, joint, size, unit):
 
 def test_the_size_of_several_columns_is_their_torque(ur5):
     """A torque that no base parameter explains is seen as it was added, root mean square."""
-    log, clean = (log_with(ur5, 1, effect, 3, noise=0.0) for effect in ("periodic", None))
-    added = np.sqrt(np.mean((log.tau - clean.tau)[:, 3] ** 2))
-    (found,) = find_misfits(identified(ur5, 1, "periodic", 3))
+    log, clean = (log_with(ur5, 1, effect, 2, noise=0.0) for effect in ("periodic", None))
+    added = np.sqrt(np.mean((log.tau - clean.tau)[:, 2] ** 2))
+    (found,) = find_misfits(identified(ur5, 1, "periodic", 2))
     # gravity explains a part of a slow harmonic
     assert 0.6 * added < found.size < 1.05 * added
     assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
@@ -203,7 +203,8 @@ def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, 
     assert guess in {finding.code for finding in guesses}
     found = identify(ur5, logs[:1], validation=logs[1:])
     said = {f.code for f in settled(guesses, fit_findings(found)) if f.severity != "note"}
-    assert said == {EFFECTS[effect].code}
+    assert EFFECTS[effect].code in said
+    assert not said & {"urdf_mismatch", "current_for_torque", "unexplained_torque"}
 
 
 def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
