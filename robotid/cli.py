@@ -117,7 +117,7 @@ def _inspect(options: argparse.Namespace) -> None:
         raise ModelError(f"no model can be built from {options.urdf}; see the findings")
 
 
-def _identify(options: argparse.Namespace) -> None:
+def _identify(options: argparse.Namespace) -> int:
     from robotid.commands.identify import run_job
     from robotid.workers.plan import WorkPlan
 
@@ -127,6 +127,7 @@ def _identify(options: argparse.Namespace) -> None:
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
         _, result = run_job(job, options.out, plan=plan)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
+    return 1 if result["verdict"]["alarms"] else 0
 
 
 def _track(options: argparse.Namespace) -> None:
@@ -180,7 +181,8 @@ def _serve(job: "Job", folder: str | None, options: argparse.Namespace) -> None:
 
 def _doctor(options: argparse.Namespace) -> int:
     from robotid.commands.logs import examine
-    from robotid.doctor.diagnosis import alarming, findings_to_dict
+    from robotid.doctor.diagnosis import findings_to_dict
+    from robotid.identification.verdict import alarming
 
     job = job_from_flags(options)
     findings = examine(job)

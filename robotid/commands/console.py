@@ -150,10 +150,11 @@ def _print_result(result: dict[str, Any]) -> None:
     from robotid.identification.summary import error_lines, verdict_lines
 
     structure, wls = result["structure"], result["wls"]
+    before, after, _ = result["witness"]["masses"]
     print(
         f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
         f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
-        f"total mass {result['consistency']['total_mass']:.2f} kg"
+        f"total mass {before:.2f} -> {after:.2f} kg"
     )
     _print_lines("fitted recordings", *error_lines(result["identification"], wls["identification"]))
     for ours, theirs in zip(result["validation"], wls["validation"], strict=True):

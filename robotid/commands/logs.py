@@ -7,11 +7,12 @@ from typing import Any
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
-from robotid.doctor.diagnosis import alarming, diagnose
+from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import check_locked
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity
 from robotid.identification.survey import SurveyedLog, survey_log
+from robotid.identification.verdict import check_ignored
 from robotid.logs.read import LogLayout
 from robotid.logs.table import Table
 from robotid.robot.model import RobotModel
@@ -80,7 +81,7 @@ def examine(job: Job) -> tuple[Finding, ...]:
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
-    alarming([], job.ignore)
+    check_ignored(job.ignore)
     model = job.model()
     refused: list[Finding] = []
 

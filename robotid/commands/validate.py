@@ -8,13 +8,19 @@ from typing import Any
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
-from robotid.doctor.diagnosis import alarming, diagnose
-from robotid.export.result import load_result, recording_metrics, stated_parameters
+from robotid.doctor.diagnosis import diagnose
+from robotid.export.result import (
+    load_result,
+    recording_metrics,
+    stated_parameters,
+    stated_urdf_with_drives,
+    stated_witness,
+)
 from robotid.findings import Finding
 from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
 from robotid.identification.metrics import Metrics
 from robotid.identification.survey import SurveyedLog
-from robotid.identification.verdict import Doubt, Verdict, doubts_of, judge
+from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 
@@ -51,7 +57,8 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     prior = source.standard_parameters()
     entries, parameters = [LogEntry(Path(log)) for log in logs], {"estimate": pi}
     (kept,) = survey_logs(job, model, entries)
-    _, evaluations = evaluate_logs((), kept, parameters, prior)
+    driven = stated_urdf_with_drives(result, source)
+    _, evaluations = evaluate_logs((), kept, parameters, prior, driven)
     verdict = _verdict(job, source, result, evaluations, kept)
     return {
         "result": str(path),
@@ -101,11 +108,13 @@ def _verdict(
         Metrics({}, 0.0),
         {e.recording.name: e.metrics["estimate"] for e in compress(evaluations, is_new)},
         undetermined=result["structure"]["undetermined"],
+        is_poorly_excited=result["structure"].get("poorly_excited", True),
         is_consistent=result["consistency"]["is_consistent"],
         joints=model.joints,
         alarms=list(dict.fromkeys([*stated.get("alarms", ()), *(f.message for f in alarms)])),
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
         refitted=[e.recording.name for e in compress(evaluations, again)],
+        witness=stated_witness(result),
     )
 
 

@@ -4,7 +4,6 @@ Findings never change data. An error is what would give a wrong answer; it stops
 unless its code is ignored.
 """
 
-import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,15 +13,14 @@ from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
 from robotid.doctor.torque_delay import check_torque_delay
 from robotid.doctor.torques import check_torques
-from robotid.exceptions import DataError, SettingsError
-from robotid.findings import Finding, by_severity, listed, log_finding
-from robotid.identification.verdict import DOUBTFUL, is_outvoted
+from robotid.exceptions import DataError
+from robotid.findings import Finding, by_severity, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
-__all__ = ["CODES", "alarming", "check_logs", "diagnose", "findings_to_dict"]
+__all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
@@ -85,31 +83,6 @@ def diagnose(
         moving = [probe.motion for probe in probes]
         findings += check_excitation(model, structural_mapping(model), moving, signals, names)
     return by_severity(findings)
-
-
-def alarming(
-    findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
-) -> tuple[Finding, ...]:
-    """Return the errors that make an identification wrong, but for those the user knows better.
-
-    Args:
-        findings: What the doctor found.
-        ignore: Codes of errors, or of what makes a result doubtful, that the user knows better.
-        is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
-
-    Raises:
-        SettingsError: If a code to ignore is unknown.
-    """
-    known = sorted({*CODES, *DOUBTFUL})
-    for code in ignore:
-        if code not in known:
-            near = difflib.get_close_matches(code, known, n=1)
-            hint = f". Did you mean {near[0]!r}?" if near else ""
-            raise SettingsError(
-                f"doctor: ignore names {code!r}, wanted some of {listed(known)}{hint}"
-            )
-    errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
-    return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
 
 
 def findings_to_dict(findings: Sequence[Finding]) -> dict[str, Any]:

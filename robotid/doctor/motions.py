@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
-from robotid.estimators import WLS
+from robotid.estimators import WLS, Estimate
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RobotIdError
 from robotid.findings import Finding, log_finding
-from robotid.identification.prior import prior_spread
-from robotid.identification.rows import base_problem, independent_share, row_mask
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import compress, merge
+from robotid.regressor.used_rows import base_problem, independent_share, row_mask
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
-__all__ = ["check_excitation", "check_repeated_motion"]
+__all__ = ["check_excitation", "check_repeated_motion", "is_poorly_excited"]
 
 _AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] positions compared: the same now and in a second
 _NEAR = 0.02  # of the range of each joint
@@ -81,7 +81,7 @@ def check_excitation(
         noise of a rich one or all are determined.
     """
     prior, step = model.standard_parameters(), -(-max(len(m.t) for m in motions) // _ROWS)
-    thinned = [_every(step, motion) for motion in motions]
+    thinned = [motion.every(step) for motion in motions]
     try:
         masks = [row_mask(model, m, signals.min_velocity) for m in thinned]
         problems = (
@@ -105,7 +105,7 @@ def check_excitation(
         f"the motion determines {known.rank} of {len(mapping.K)} base parameters "
         f"(condition number {found.condition:.3g})"
     )
-    is_poor = found.rank < len(mapping.K) or found.condition > _ILL_CONDITIONED
+    is_poor = is_poorly_excited(found, len(mapping.K))
     if known.groups:
         advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
         message += f": {known.in_words()}; {advice}"
@@ -119,14 +119,14 @@ def check_excitation(
     yield log_finding(name, "excitation", severity, message, **evidence)
 
 
-def _every(step: int, motion: Trajectory) -> Trajectory:
-    """Return every so many rows of a motion."""
-    if step == 1:
-        return motion
-    rows, m = slice(None, None, step), motion
-    direction = None if m.direction is None else m.direction[rows]
-    arrays = (m.t[rows], m.q[rows], m.v[rows], m.a[rows], m.tau[rows])
-    return Trajectory(*arrays, m.joints, None, m.segment[rows], direction=direction)
+def is_poorly_excited(wls: Estimate, count: int) -> bool:
+    """Return whether it is the motion, not the noise, that leaves base parameters open.
+
+    Args:
+        wls: Weighted least squares on the motion.
+        count: Number of base parameters.
+    """
+    return wls.rank < count or wls.condition > _ILL_CONDITIONED
 
 
 def _stretches(motion: Trajectory, size: Array, count: int | None) -> Array:

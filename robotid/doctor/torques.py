@@ -17,6 +17,8 @@ _CERTAIN = 2.5  # gain in the logarithm of the unexplained share, a factor 12, t
 _EXPLAINED = 0.2  # a reading that explains no torque better than this proves nothing
 _WRONG = 0.5  # a torque of the right sign is explained at least this well
 _EXCUSED = 0.3  # a torque that is explained so well with some load may have the right sign
+_MUCH_BETTER = 12.0  # ... unless the other sign explains it that many times better
+_NOISE = 3e-3  # share of a torque's variance that is as good as explained
 _TILT = 5.0  # [deg] gravity farther than this off is worth a warning
 _TURNED = 30.0  # [deg] ... and farther than this gives wrong answers
 _HINT = 0.7  # gain from which a tilt is believed
@@ -181,7 +183,11 @@ _FINDINGS: dict[str, Callable[[_Reading], Iterator[Finding]]] = {
 
 def _is_excused(best: Explanation, loaded: Explanation) -> bool:
     if best.kind == "torque_sign":
-        return any(loaded.share[j] < _EXCUSED for j in best.joints)
+        excused = (
+            loaded.share[j] < min(_EXCUSED, _MUCH_BETTER * (best.share[j] + _NOISE))
+            for j in best.joints
+        )
+        return all(excused)
     return loaded.misfit - best.misfit < _CERTAIN
 
 

@@ -1,6 +1,6 @@
 """Inertials against the geometry that a URDF has: where no body of that shape can be so."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Inertial
 
-__all__ = ["audit_links"]
+__all__ = ["audit_bodies", "audit_links"]
 
 _HEAVIEST, _LIGHTEST = 20_000.0, 10.0  # [kg/m^3] over the box: beyond solid tungsten, below foam
 _MARGIN = 0.1  # of the box's diagonal by which a centre of mass may lie outside
@@ -40,13 +40,7 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
     """
     yield from _templates(model)
     points = body_points(model)
-    size = model.layout.n_inertial
-    J = pseudo_inertia(model.standard_parameters()[:size])
-    for body, J_i in zip(model.layout.bodies, J, strict=True):
-        if body in points and J_i[3, 3] > 0:
-            is_small = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
-            for finding in _against_geometry(body, J_i, points[body]):
-                yield replace(finding, severity="note") if is_small else finding
+    yield from audit_bodies(model, model.standard_parameters(), points)
     yield from _copies(model, points)
     unread = [body for body in model.layout.bodies if body not in points]
     if unread and next(model.tree.robot.iter("mesh"), None) is not None:
@@ -56,6 +50,25 @@ def audit_links(model: RobotModel) -> Iterator[Finding]:
             "ROS_PACKAGE_PATH to compare them"
         )
         yield Finding("geometry_unread", "note", f"link {unread[0]}", message)
+
+
+def audit_bodies(model: RobotModel, pi: Array, points: Mapping[str, Array]) -> Iterator[Finding]:
+    """Yield which bodies cannot be so in the box around their geometry.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), as of the URDF or as identified.
+        points: Points of the geometry of each body that has one, shape (k, 3) [m].
+
+    Yields:
+        "com_outside", "density", "gyration"; of a body that weighs next to nothing as notes.
+    """
+    J = pseudo_inertia(pi[: model.layout.n_inertial])
+    for body, J_i in zip(model.layout.bodies, J, strict=True):
+        if body in points and J_i[3, 3] > 0:
+            is_small = J_i[3, 3] < _SMALL * np.abs(J[:, 3, 3]).sum()
+            for finding in _against_geometry(body, J_i, points[body]):
+                yield replace(finding, severity="note") if is_small else finding
 
 
 def _against_geometry(body: str, J: Array, points: Array) -> Iterator[Finding]:

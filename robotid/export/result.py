@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,10 +15,10 @@ from robotid._files import file_sha256
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export.urdf import load_identified
-from robotid.findings import Finding
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import Identification
+from robotid.identification.witness import Witness
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -31,6 +31,8 @@ __all__ = [
     "read_result",
     "recording_metrics",
     "stated_parameters",
+    "stated_urdf_with_drives",
+    "stated_witness",
 ]
 
 SCHEMA_VERSION = 1
@@ -41,7 +43,6 @@ _WANTED = ("settings", "inputs", "outputs", "structure", "consistency")
 def build_result(
     identification: Identification,
     settings: Mapping[str, Any],
-    findings: Sequence[Finding] = (),
     outputs: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Return the content of result.json, plain values only and all of them finite.
@@ -49,7 +50,6 @@ def build_result(
     Args:
         identification: What was found.
         settings: The job, in the shape of its file.
-        findings: Warnings.
         outputs: Files written beside it, by kind.
     """
     model, size = identification.model, identification.model.layout.n_inertial
@@ -69,6 +69,7 @@ def build_result(
             "rank": identification.determination.rank,
             "condition": _finite(identification.wls.condition),
             "undetermined": list(identification.determination.undetermined),
+            "poorly_excited": identification.is_poorly_excited,
             "not_told_apart": identification.determination.to_list(),
         },
         "base_parameters": _base_parameters(identification),
@@ -78,20 +79,31 @@ def build_result(
             "inflation": identification.errors.inflation,
         },
         "standard_parameters": _entries(identification, range(size)),
-        "drive_parameters": _entries(identification, range(size, len(identification.standard))),
+        "drive_parameters": [
+            entry | {"with_urdf": float(value)}
+            for entry, value in zip(
+                _entries(identification, range(size, len(identification.standard))),
+                identification.urdf_with_drives[size:],
+                strict=True,
+            )
+        ],
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
             recording_metrics(e, "estimate") | {"band": _band(identification, e)}
             for e in identification.validation
         ],
-        "warnings": [{"code": f.code, "message": f.message, "where": f.where} for f in findings],
+        "warnings": [
+            {"code": f.code, "message": f.message, "where": f.where}
+            for f in identification.findings
+        ],
         "wls": {
             "base_values": identification.wls.theta.tolist(),
             "base_std_errors": [_finite(error) for error in identification.wls.std_error],
             "identification": identification.metrics("wls").to_dict(),
             "validation": [recording_metrics(e, "wls") for e in identification.validation],
         },
+        "witness": identification.witness.to_dict(),
         "verdict": identification.verdict.to_dict(),
     }
 
@@ -127,7 +139,7 @@ class Result:
 
     @property
     def has_urdf(self) -> bool:
-        """Whether the identified URDF was written: it is if the parameters are possible."""
+        """Whether the identified URDF was written: none is of a result that cannot be right."""
         return "urdf" in self.content["outputs"]
 
     @cached_property
@@ -135,8 +147,8 @@ class Result:
         """The robot of the identified URDF with its sidecar, and its standard parameters."""
         if not self.has_urdf:
             raise DataError(
-                f"{self.path.name} has no URDF, for its parameters are not physically consistent; "
-                "identify with the 'consistent' estimator"
+                f"{self.path.name} has no URDF, for its parameters are wrong or impossible: "
+                f"{self.verdict['reasons'][0]}"
             )
         outputs, folder = self.content["outputs"], self.path.parent
         return load_identified(folder / outputs["urdf"], folder / outputs["sidecar"])
@@ -207,6 +219,33 @@ def read_result(path: str | Path) -> dict[str, Any]:
     if missing:
         raise DataError(f"{source.name} has no {missing}; identify again, it is not whole")
     return dict(result)
+
+
+def stated_witness(result: Mapping[str, Any]) -> Witness | None:
+    """Return what speaks for the scale of a result, if it says so.
+
+    Args:
+        result: Content of a result.json.
+    """
+    stated = result.get("witness")
+    if stated is None:
+        return None
+    return Witness(**{each.name: stated[each.name] for each in dataclasses.fields(Witness)})
+
+
+def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Array | None:
+    """Return the URDF's bodies with the drives that fit best beside them, if a result states them.
+
+    Args:
+        result: Content of a result.json.
+        model: The robot.
+    """
+    drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
+    if None in drives:
+        return None
+    pi = model.standard_parameters()
+    pi[model.layout.n_inertial :] = drives
+    return pi
 
 
 def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:

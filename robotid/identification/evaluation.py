@@ -21,7 +21,6 @@ from robotid.workers.plan import WorkPlan
 
 __all__ = ["Evaluation", "Extent", "Recording", "evaluate_logs", "pool", "predict", "shares_rows"]
 
-_BASELINES = ("urdf", "gravity_only")
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
 _SAMPLED = 200  # rows spread over a log that are looked for in others
 _SHARED = 0.02  # share of them that another recording may hold: windows that meet share a row
@@ -87,7 +86,7 @@ class Evaluation:
     Attributes:
         recording: The recording.
         torques: Predicted torques by name of the parameters, each of shape (N, n_rows) [N m, N];
-            among them the baselines "urdf" and "gravity_only".
+            among them the baselines "urdf", "gravity_only" and "urdf_with_drives".
         sums: What the metrics over the whole log are made of, by name of the parameters, without
             the baselines.
         metrics: Metrics over the whole log, likewise.
@@ -106,6 +105,7 @@ def evaluate_logs(
     kept: Sequence[SurveyedLog],
     parameters: Mapping[str, Array],
     prior: Array,
+    driven: Array | None = None,
     *,
     plan: WorkPlan | None = None,
 ) -> tuple[tuple[Evaluation, ...], tuple[Evaluation, ...]]:
@@ -116,6 +116,7 @@ def evaluate_logs(
         kept: Logs kept apart.
         parameters: Standard parameters by name, each of shape (p,).
         prior: Those of the URDF, shape (p,): the baselines are its torque, with and without motion.
+        driven: Those of the URDF with drives fitted to the logs, shape (p,): a baseline, if known.
         plan: Who works on the pieces of logs in files; this process if None.
 
     Returns:
@@ -125,7 +126,7 @@ def evaluate_logs(
     Raises:
         DataError: If no row of a log is used.
     """
-    work = partial(_score, parameters=parameters, prior=prior)
+    work = partial(_score, parameters=parameters, prior=prior, driven=driven)
     apart = _score_logs(kept, work, plan)
     sought = [score.sampled for score in apart]
     own = _score_logs(fitted, partial(work, sought=sought), plan)
@@ -240,15 +241,18 @@ def _score(
     *,
     parameters: Mapping[str, Array],
     prior: Array,
+    driven: Array | None,
     sought: Sequence[Array] = (),
 ) -> _Score:
     """Return what is known of a piece, with the torques of a part of it."""
     header, rows = whole.piece.header, whole.piece.read()
     model, motion, mask = header.model, rows.trajectory, rows.mask
-    torques = {name: np.empty((0, model.n_rows)) for name in (*parameters, *_BASELINES)}
+    moving = {"urdf": prior} if driven is None else {"urdf": prior, "urdf_with_drives": driven}
+    every = {**parameters, **moving}
+    torques = {name: np.empty((0, model.n_rows)) for name in (*every, "gravity_only")}
     if len(motion.t):
-        torques = _predict_all(model, motion, parameters, prior, header.is_compiled)
-    baselines = {name: torques[name] for name in _BASELINES}
+        torques = _predict_all(model, motion, every, prior, header.is_compiled)
+    baselines = {name: torques[name] for name in ("gravity_only", *moving)}
     shown: tuple[_Shown, ...] = ()
     if whole.shown is not None and len(motion.t):
         part = slice(*whole.shown.indices(len(motion.t)))
@@ -274,14 +278,13 @@ def _predict_all(
     prior: Array,
     compiled: bool | None,
 ) -> dict[str, Array]:
-    """Return the torques that parameters and baselines predict, by name, each (N, n_rows)."""
-    every = [*parameters.values(), prior]
-    torques = predict(model, every, trajectory, compiled=compiled)
+    """Return the torques that parameters and the URDF's gravity predict, each (N, n_rows)."""
+    torques = predict(model, [*parameters.values()], trajectory, compiled=compiled)
     inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
     still = np.zeros_like(trajectory.v)
     at_rest = replace(trajectory, v=still, a=still, direction=None)
     torques += predict(model, [inertial], at_rest, compiled=compiled)
-    return dict(zip((*parameters, *_BASELINES), torques, strict=True))
+    return dict(zip((*parameters, "gravity_only"), torques, strict=True))
 
 
 def _conclude(log: SurveyedLog, score: _Score, is_refitted: bool = False) -> Evaluation:

@@ -1,21 +1,38 @@
 """What a user should know of a fit: open parameters, outliers, mass matrix, solvers, bounds."""
 
-from collections.abc import Collection, Sequence
-from pathlib import Path
+from __future__ import annotations
 
-from robotid.findings import Finding
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotid.doctor.urdf_geometry import audit_bodies
+from robotid.findings import Finding, listed
 from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import misfit_findings
-from robotid.identification.pipeline import Identification
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
+from robotid.robot.geometry import body_points
 from robotid.robot.model import RobotModel
 
-__all__ = ["consistency_findings", "fit_findings", "locked_findings", "log_findings"]
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = [
+    "consistency_findings",
+    "fit_findings",
+    "locked_findings",
+    "log_findings",
+    "unwritten",
+]
 
 _SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, disagree
 _SAME_OPTIMUM = 1e-3  # the same of the objectives of log-Cholesky and cone programme
 _COSTS = 1.05  # residual over that of WLS from which bounds cost torque
+_FAR = 3.0  # a total mass so many times the URDF's, or its share, is no robot's
 _NAMED = 5  # outliers that a finding names
 _WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is reported
@@ -37,14 +54,11 @@ def fit_findings(identification: Identification) -> list[Finding]:
             f"{known.in_words()}. What they leave open keeps the URDF's values; record a richer "
             "trajectory to determine it"
         )
-        findings.append(Finding("undetermined", "warning", "base_parameters", message))
-    if not identification.is_consistent:
-        message = (
-            f"the {identification.estimator.name} estimate is not physically consistent, so no "
-            "URDF was written; use the 'consistent' estimator for one that loads"
-        )
-        findings.append(Finding("urdf_not_written", "warning", "urdf", message))
+        severity = "warning" if identification.is_poorly_excited else "note"
+        findings.append(Finding("undetermined", severity, "base_parameters", message))
     findings += consistency_findings(identification)
+    findings += _total_mass(identification)
+    findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
     findings += discrepancy_findings(identification)
@@ -68,6 +82,29 @@ def fit_findings(identification: Identification) -> list[Finding]:
             evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
             findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
     return findings
+
+
+def unwritten(identification: Identification, alarms: Sequence[Finding]) -> list[Finding]:
+    """Return a warning that no URDF is written, and why.
+
+    Args:
+        identification: What was found.
+        alarms: Faults that make it wrong.
+    """
+    if alarms:
+        codes = listed(dict.fromkeys(finding.code for finding in alarms))
+        message = (
+            f"no URDF was written, for the result is wrong by what was found: {codes}. Correct it, "
+            "or, if you know better, state these codes as ignore in [doctor]"
+        )
+    elif not identification.is_consistent:
+        message = (
+            f"the {identification.estimator.name} estimate is not physically consistent, so no "
+            "URDF was written; use the 'consistent' estimator for one that loads"
+        )
+    else:
+        return []
+    return [Finding("urdf_not_written", "warning", "urdf", message)]
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
@@ -153,6 +190,44 @@ def consistency_findings(identification: Identification) -> list[Finding]:
             "the 'consistent' estimator, or more starts"
         )
         findings.append(Finding("optimum_gap", "warning", "estimator", message))
+    return findings
+
+
+def _total_mass(identification: Identification) -> list[Finding]:
+    """Return the error that all links together weigh what no robot like the URDF's does."""
+    size = identification.model.layout.n_inertial
+    pi = np.array([identification.prior, identification.standard])
+    before, after = pi[:, :size:10].sum(axis=1).tolist()
+    if identification.estimator.bounds.total is not None:  # the user knows better
+        return []
+    if not before > 0 or before / _FAR <= after <= _FAR * before:
+        return []
+    message = (
+        f"the identified links weigh {after:.4g} kg together, the URDF's {before:.4g} kg; wanted "
+        f"within a factor of {_FAR:g}. Check the sign, the order and the unit of the torques and "
+        "the masses of the URDF; if the URDF is that wrong, ignore total_mass"
+    )
+    evidence = {"urdf": before, "identified": after}
+    return [Finding("total_mass", "error", "standard_parameters", message, evidence)]
+
+
+def _impossible_shapes(identification: Identification) -> list[Finding]:
+    """Return which identified bodies cannot be so in their geometry; as notes where the URDF's."""
+    model, points = identification.model, body_points(identification.model)
+    before = {
+        (finding.code, finding.where)
+        for finding in audit_bodies(model, identification.prior, points)
+    }
+    findings = []
+    for finding in audit_bodies(model, identification.standard, points):
+        if (finding.code, finding.where) in before:
+            message = f"{finding.message.partition(';')[0]}; so it is in the URDF already"
+            finding = replace(finding, severity="note", message=message)
+        else:
+            said = finding.message.partition(";")[0]
+            message = f"as identified, {said}; record more motion of it, or pin it to the URDF"
+            finding = replace(finding, message=message)
+        findings.append(finding)
     return findings
 
 

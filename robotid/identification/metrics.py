@@ -58,7 +58,7 @@ class Metrics:
                     "relative_error_pct": m.relative_error_pct,
                     "r2": m.r2,
                     "rows": m.rows,
-                    **{f"{x}_relative_error_pct": m.baselines[x] for x in ("urdf", "gravity_only")},
+                    **{f"{x}_relative_error_pct": error for x, error in m.baselines.items()},
                     "better_than_constant": m.better_than_constant,
                 }
                 for joint, m in self.per_joint.items()

@@ -23,10 +23,10 @@ from robotid._typing import Array
 from robotid.findings import Finding, listed
 from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
 from robotid.identification.evaluation import Evaluation, Recording
-from robotid.identification.rows import independent_share
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:

@@ -1,21 +1,29 @@
 """identify(): from a model and logs to parameters and how far they can be trusted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.doctor.diagnosis import diagnose
+from robotid.doctor.motions import is_poorly_excited
+from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.estimators import WLS, Consistent, Estimate
 from robotid.estimators.determination import Determination, base_spread, determine
 from robotid.estimators.estimator import Weighing
-from robotid.exceptions import DataError, RankDeficientError
+from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
+from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
+from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
-from robotid.identification.prior import prior_spread
+from robotid.identification.misfit import settled
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -31,7 +39,16 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.survey import hold_log
-from robotid.identification.verdict import Doubt, Verdict, judge
+from robotid.identification.verdict import (
+    Doubt,
+    Verdict,
+    alarming,
+    check_ignored,
+    doubts_of,
+    judge,
+    refuted,
+)
+from robotid.identification.witness import Witness, call_witness
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
@@ -40,6 +57,7 @@ from robotid.robot.bodies import held_parameters
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.prior import prior_spread
 
 __all__ = ["EstimatorSettings", "Identification", "conclude", "identify"]
 
@@ -59,6 +77,7 @@ class Identification:
         estimate: What the estimator returned: base parameters, or standard ones ("consistent").
         wls: Weighted least squares on the same factors, base parameters.
         prior: Standard parameters of the URDF, shape (p,).
+        urdf_with_drives: The same with the drive terms that then fit best, shape (p,).
         prior_std: How far they may plausibly be wrong, shape (p,).
         standard: Standard parameters, shape (p,).
         standard_covariance: Their covariance given the prior, shape (p, p).
@@ -69,6 +88,7 @@ class Identification:
         errors: What the standard errors rest on.
         factors: What the fitted rows come down to, base parameters.
         determination: Which base parameters the fitted rows determine.
+        findings: What the user should know of the robot, of the logs and of the fit.
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
         doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
@@ -80,6 +100,7 @@ class Identification:
     estimate: Estimate
     wls: Estimate
     prior: Array
+    urdf_with_drives: Array
     prior_std: Array
     standard: Array
     standard_covariance: Array
@@ -90,6 +111,7 @@ class Identification:
     errors: StandardErrors
     factors: Factors
     determination: Determination
+    findings: tuple[Finding, ...] = ()
     alarms: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     report: str = ""
@@ -119,6 +141,11 @@ class Identification:
         signs = self.standard[self.model.layout.is_nonnegative()]
         is_possible = bool((np.linalg.eigvalsh(J) > 0).all() and (signs >= 0).all())
         return is_possible and self.mass_matrix.is_positive
+
+    @property
+    def has_urdf(self) -> bool:
+        """Whether a URDF may be written of it: it is possible, and no fault makes it wrong."""
+        return self.is_consistent and not self.alarms
 
     @property
     def mass_matrix(self) -> MassMatrixCheck:
@@ -182,18 +209,35 @@ class Identification:
         return tuple(e for e in self.validation if e.is_refitted)
 
     @property
+    def is_poorly_excited(self) -> bool:
+        """Whether the motion, not the noise, leaves parameters open that a richer one would not."""
+        return is_poorly_excited(self.wls, len(self.base))
+
+    @property
+    def predictions(self) -> dict[str, Metrics]:
+        """Metrics of each validation recording that shows a prediction, by its name."""
+        kept = (e for e in self.validation if not e.is_refitted)
+        return {e.recording.name: e.metrics["estimate"] for e in kept}
+
+    @cached_property
+    def witness(self) -> Witness:
+        """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
+        return call_witness(self)
+
+    @property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
-        kept = [e for e in self.validation if not e.is_refitted]
         return judge(
             self.metrics(),
-            {e.recording.name: e.metrics["estimate"] for e in kept},
+            self.predictions,
             undetermined=self.determination.undetermined,
+            is_poorly_excited=self.is_poorly_excited,
             is_consistent=self.is_consistent,
             joints=self.model.joints,
             alarms=self.alarms,
             doubts=self.doubts,
             refitted=[e.recording.name for e in self.refitted],
+            witness=self.witness,
         )
 
 
@@ -204,8 +248,10 @@ def identify(
     validation: Sequence[Log] = (),
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
+    doctor: bool = True,
+    ignore: Sequence[str] = (),
 ) -> Identification:
-    """Identify a robot's parameters from motion logs.
+    """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
         model: The robot, from its URDF.
@@ -213,32 +259,77 @@ def identify(
         validation: Recordings kept apart to measure the prediction with.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
+        doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
+        ignore: Codes of errors and doubts that you know better.
 
     Raises:
         DataError: If a log does not fit the model or is too short.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
-        SettingsError: If a setting is out of range.
+        SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     if not logs:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (logs, validation))
-    return conclude(Recordings(model, structural_mapping(model), fitted, kept), choice)
+    found = diagnose(model, logs, validation, settings) if doctor else ()
+    recordings = Recordings(model, structural_mapping(model), fitted, kept)
+    return conclude(recordings, choice, found, ignore)
 
 
-def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identification:
-    """Identify a robot's parameters from recordings, in memory or not.
+def conclude(
+    recordings: Recordings,
+    choice: EstimatorSettings,
+    found: Sequence[Finding] = (),
+    ignore: Sequence[str] = (),
+) -> Identification:
+    """Identify a robot's parameters from recordings, in memory or not, and judge the result.
 
     Args:
         recordings: The recordings.
         choice: Which estimator.
+        found: What was found of them before, as by the doctor.
+        ignore: Codes of findings that the verdict does not count.
 
     Raises:
         DataError: If a row of a log cannot be used.
         RankDeficientError, NotConvergedError: As of ``identify``.
     """
+    model, is_robust = recordings.model, choice.is_robust
+    with _explained(found):
+        fit = _fitted(recordings, choice)
+    # what the motion excites the fit tells from all rows: finding "undetermined"
+    told = [f for f in found if f.severity != "note" and f.code != "excitation"]
+    told = refuted(settled(told, fit_findings(fit)), fit.predictions, fit.witness)
+    alarms = alarming(told, ignore, is_robust=is_robust)
+    heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
+    findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
+    counted = [finding for finding in findings if finding.code not in ignore]
+    names = [Path(e.recording.log.path).name for e in fit.validation if not e.is_refitted]
+    return replace(
+        fit,
+        findings=tuple(findings),
+        alarms=tuple(finding.message for finding in alarms),
+        doubts=doubts_of(counted, model.joints, names, is_robust=is_robust),
+    )
+
+
+@contextmanager
+def _explained(found: Sequence[Finding]) -> Iterator[None]:
+    """Add what the doctor found to the error of a fit that fails."""
+    try:
+        yield
+    except (DataError, NotConvergedError, RankDeficientError) as error:
+        for finding in found:
+            if finding.severity != "note":
+                error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
+        raise
+
+
+def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification:
+    """Identify a robot's parameters from recordings."""
     model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice)
     prior, spread = ground.before.pi, ground.before.spread
@@ -246,8 +337,10 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     candidates = {"estimate": standard, "wls": mapping.to_standard(wls.theta, prior, spread)}
+    sigma = ground.before.sigma
+    driven = urdf_with_drives(model, mapping, ground.factors, sigma, ground.before.spread)
     fitted, kept = evaluate_logs(
-        recordings.fitted, recordings.kept, candidates, prior, plan=recordings.plan
+        recordings.fitted, recordings.kept, candidates, prior, driven, plan=recordings.plan
     )
     is_base = estimate.names == mapping.base_names
     return Identification(
@@ -257,6 +350,7 @@ def conclude(recordings: Recordings, choice: EstimatorSettings) -> Identificatio
         estimate=estimate,
         wls=wls,
         prior=prior,
+        urdf_with_drives=driven,
         prior_std=spread if estimate.prior_std is None else estimate.prior_std,
         standard=standard,
         standard_covariance=covariance,

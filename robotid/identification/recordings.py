@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from itertools import chain, islice
 
 from robotid._typing import Array
-from robotid.identification.rows import base_problem, independent_share
 from robotid.identification.survey import ReducedPiece, SurveyedLog
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Reduction, compress_stretches, join_stretches
 from robotid.regressor.problem import Block, Problem, concatenate
+from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan

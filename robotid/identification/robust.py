@@ -160,7 +160,7 @@ def find_outliers(
     for e in evaluations:
         motion, mask, prediction = e.recording.trajectory, e.recording.mask, e.torques["estimate"]
         scales = _scales([motion.tau - prediction], [mask])
-        turning = np.abs(motion.v) * (e.recording.signals.cutoff or np.inf) <= np.abs(motion.a)
+        turning = np.abs(motion.v) <= np.abs(motion.a) / (e.recording.signals.cutoff or np.inf)
         excess = np.abs(motion.tau - prediction) - np.where(turning, step, 0.0)
         rms = np.sqrt(np.mean(motion.tau**2, axis=0))
         sizes = np.where(excess >= _MATTERS * rms, excess / scales, 0.0)

@@ -18,6 +18,7 @@ __all__ = [
     "identification_html",
     "identification_line",
     "identification_text",
+    "verdict_cell",
     "verdict_lines",
 ]
 
@@ -59,17 +60,20 @@ def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None
     """
     others = {} if wls is None else wls["per_joint"]
     width = max(len(joint) for joint in metrics["per_joint"])
-    lines = [f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %"]
+    lines = [
+        f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %  urdf + drives %"
+    ]
     for joint, m in metrics["per_joint"].items():
-        error, urdf, gravity = (
-            m[f"{of}relative_error_pct"] for of in ("", "urdf_", "gravity_only_")
+        error, urdf, gravity, driven = (
+            m.get(f"{of}relative_error_pct")
+            for of in ("", "urdf_", "gravity_only_", "urdf_with_drives_")
         )
         cells = [cell(others.get(joint, {}).get("relative_error_pct")), cell(urdf)]
         rmse = f"{m['rmse']:.3g} {m['unit']}"
         flag = "" if m["better_than_constant"] else "  worse than a constant"
         lines.append(
             f"  {joint:{width}}  {cell(error)}   {rmse:10}{' '.join(cells)}  {cell(gravity, 9)}"
-            f"{flag}"
+            f"  {cell(driven, 15)}{flag}"
         )
     return lines
 
@@ -81,10 +85,26 @@ def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
         verdict: Status, reasons and joints, as in result.json.
     """
     lines = [f"verdict: {verdict['status']}", *(f"  - {reason}" for reason in verdict["reasons"])]
-    by_status: dict[str, list[str]] = {}
+    by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
-        by_status.setdefault(joint["status"], []).append(name)
-    return lines + [f"  {status}: {', '.join(names)}" for status, names in by_status.items()]
+        by_cell.setdefault(verdict_cell(name, joint), []).append(name)
+    return lines + [f"  {', '.join(names)}: {said}" for said, names in by_cell.items()]
+
+
+def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
+    """Return the verdict on a joint with its first reason, as in "usable: predicted to 20 %".
+
+    Args:
+        joint: The joint.
+        verdict: Its status and reasons, as in result.json.
+    """
+    status, reasons = verdict["status"], verdict["reasons"]
+    if status == "good" or not reasons:
+        return str(status)
+    why = reasons[0]
+    if why.partition(": ")[0] == joint or joint in why.partition(": ")[0].split(", "):
+        why = why.partition(": ")[2]
+    return f"{status}: {why}"
 
 
 def cell(value: float | None, width: int = 7) -> str:

@@ -16,7 +16,6 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.identification.rows import base_problem, row_mask
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.formats import open_table
 from robotid.logs.read import LogLayout
@@ -30,6 +29,7 @@ from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
 from robotid.regressor.rows import COMPILED, choose_engine
+from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.model import RobotModel
 from robotid.workers.pieces import Piece, Workload
 

@@ -1,14 +1,35 @@
 """How far to trust a result: findings with reasons, and a verdict that never passes the unknown."""
 
+import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from robotid.findings import Finding
+import numpy as np
+
+from robotid.doctor.diagnosis import CODES
+from robotid.exceptions import SettingsError
+from robotid.findings import Finding, listed
 from robotid.identification.metrics import JointMetrics, Metrics
+from robotid.identification.witness import Witness
 
-__all__ = ["DOUBTFUL", "Doubt", "JointVerdict", "Verdict", "doubts_of", "is_outvoted", "judge"]
+__all__ = [
+    "DOUBTFUL",
+    "Doubt",
+    "JointVerdict",
+    "Verdict",
+    "alarming",
+    "check_ignored",
+    "doubts_of",
+    "is_outvoted",
+    "judge",
+    "refuted",
+]
 
+_BEATEN = 1.05  # the URDF with fitted drives is better if it misses this many times less, ...
+_TIE = 0.3  # [%] ... and by this share of the torque
+_REFUTED = 5.0  # [%] a hypothesis on columns or masses is refuted by a prediction so good
+_SCALED = 2.0  # a gravity within this factor of the URDF's refutes another unit of the torque
 _GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
 _POOR = 50.0  # [%] a joint predicted worse than this is not usable
 _OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
@@ -20,13 +41,17 @@ _SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt bel
 _WORDS = {
     "angle_scale": "positions fit best times another factor",
     "bound_binds": "the data, or the masses that it leaves, speak against a stated bound",
+    "com_outside": "its centre of mass lies {outside:.2g} m outside its geometry: no such body",
     "clipped": "the torque is clipped at a limit",
     "constant_torque": "the torque never changes: the channel is dead",
     "constraint_costs": "{error_pct:.1f} % of the torque is missed where it was fitted, "
     "{wls_error_pct:.1f} % without constraints: physics and data disagree",
     "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "
     "in another unit, masses and inertias are wrong in the same proportion",
+    "density": "its mass makes {density:.2g} kg/m^3 of the box around its geometry",
     "gravity": "the direction of gravity may be stated wrongly",
+    "gyration": "its mass lies {gyration:.2g} m from its centre on average, its geometry ends at "
+    "{farthest:.2g} m: no body can be so",
     "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
@@ -61,8 +86,12 @@ _WORDS |= {
 }
 #: Codes of the warnings that make a result doubtful.
 DOUBTFUL = (*_WORDS, "repeated_motion")
+_OF_RESULTS = ("total_mass",)  # errors that a result alone can show
+_NAMED = 8  # parameters that a reason names
+_HYPOTHESES = ("current_for_torque", "unexplained_torque", "urdf_mismatch")
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
-_OF_THE_FIT = ("estimator", "standard_parameters", "all joints")  # places that are no recording
+# places that are no recording
+_OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
 
 
 @dataclass(frozen=True)
@@ -131,10 +160,12 @@ def judge(
     *,
     undetermined: Sequence[str],
     is_consistent: bool,
+    is_poorly_excited: bool = True,
     joints: Sequence[str] = (),
     alarms: Sequence[str] = (),
     doubts: Sequence[Doubt] = (),
     refitted: Sequence[str] = (),
+    witness: Witness | None = None,
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -143,10 +174,12 @@ def judge(
         validation: Metrics of each kept recording, by its name.
         undetermined: Base parameters that the data do not determine by themselves.
         is_consistent: Whether the parameters are physically possible.
+        is_poorly_excited: Whether a richer motion would determine them; else noise hides them.
         joints: The model's joints; one without a row in any recording is not evaluated.
         alarms: Faults of the recordings that make any result of them wrong.
         doubts: Why the result may be wrong however well it predicts.
         refitted: Kept recordings, by name, that are left out since they hold fitted rows.
+        witness: What speaks for the scale of the result but the sensors.
 
     Returns:
         The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
@@ -162,12 +195,15 @@ def judge(
         why = held if refitted else "no validation log given"
         reasons.append(f"the prediction of a new motion was not evaluated: {why}")
     reasons += [reason for _, doubt, _ in found.values() for reason in doubt]
+    reasons += _left_to_urdf(validation)
     reasons += _in_words(doubts)
+    if witness is not None and witness.is_against:
+        reasons.append(witness.message)
     reasons += _unseen(names, identification, validation)
-    if undetermined:
+    if undetermined and is_poorly_excited:
         reasons.append(
             f"the data do not determine {len(undetermined)} base parameters by themselves: "
-            f"{list(undetermined)}"
+            f"{listed(undetermined, _NAMED)}"
         )
     if not is_consistent:
         reasons.append(
@@ -191,7 +227,83 @@ def judge(
             "better than by a constant and than by the URDF, and every parameter is physically "
             "consistent"
         ]
+    if undetermined and not is_poorly_excited:
+        reasons.append(
+            f"{len(undetermined)} base parameters are lost in the noise of a rich motion and keep "
+            f"the URDF's values: {listed(undetermined, _NAMED)}"
+        )
+    if witness is not None and not witness.is_against:
+        reasons.append(witness.message)
     return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
+
+
+def check_ignored(ignore: Sequence[str]) -> None:
+    """Refuse codes to ignore that no error and no doubt has.
+
+    Args:
+        ignore: The codes.
+
+    Raises:
+        SettingsError: If a code is unknown.
+    """
+    known = sorted({*CODES, *DOUBTFUL, *_OF_RESULTS})
+    for code in ignore:
+        if code not in known:
+            near = difflib.get_close_matches(code, known, n=1)
+            hint = f". Did you mean {near[0]!r}?" if near else ""
+            raise SettingsError(
+                f"doctor: ignore names {code!r}, wanted some of {listed(known)}{hint}"
+            )
+
+
+def alarming(
+    findings: Sequence[Finding], ignore: Sequence[str], *, is_robust: bool = False
+) -> tuple[Finding, ...]:
+    """Return the errors that make an identification wrong, but for those the user knows better.
+
+    Args:
+        findings: What was found.
+        ignore: Codes of errors that the user knows better.
+        is_robust: Whether a robust loss was set, which outvotes jumps of the torque.
+    """
+    errors = (f for f in findings if f.severity == "error" and f.code not in ignore)
+    return tuple(f for f in errors if not (is_robust and is_outvoted(f)))
+
+
+def refuted(
+    findings: Sequence[Finding], kept: Mapping[str, Metrics], witness: Witness
+) -> list[Finding]:
+    """Return findings, hypotheses that a prediction of unseen motion refutes as notes.
+
+    That masses are not the URDF's, or that no physics explains a torque, is refuted where the
+    result predicts these torques of every kept recording within 5 %; another unit of the torque
+    if gravity as identified is also within a factor of two of the URDF's there.
+
+    Args:
+        findings: What was found.
+        kept: Metrics of each recording that was kept apart and shows a prediction.
+        witness: The identified gravity against the URDF's.
+    """
+    errors: dict[str, float] = {}
+    for metrics in kept.values():
+        for joint, measured in metrics.per_joint.items():
+            errors[joint] = max(errors.get(joint, 0.0), _error(measured))
+    if any(finding.code == "repeated_motion" for finding in findings):
+        errors = {}  # the motion was seen
+    found = []
+    for finding in findings:
+        named = [j for j in finding.where.rpartition(": ")[2].split(", ") if j in errors]
+        joints = named or [*errors]
+        worst = max((errors[joint] for joint in joints), default=np.inf)
+        is_refuted = finding.code in _HYPOTHESES and worst < _REFUTED
+        if finding.code == "current_for_torque":
+            ratios = [witness.gravity[j] for j in joints if j in witness.gravity]
+            is_refuted &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
+        if is_refuted and finding.severity == "warning":
+            but = f"; but the result predicts unseen motion within {worst:.1f} %"
+            finding = replace(finding, severity="note", message=f"{finding.message}{but}")
+        found.append(finding)
+    return found
 
 
 def doubts_of(
@@ -298,18 +410,49 @@ def _judge_joint(
     if measured.relative_error_pct is None:
         return [f"{joint}: the torque on {log} is 0 throughout: nothing was predicted"], []
     if not measured.better_than_constant:
-        return [f"{joint}: worse than a constant torque on {log} ({error:.1f} %)"], []
+        constant = error / np.sqrt(1.0 - measured.r2)
+        why = f"{error:.1f} % of it is missed, by its mean {constant:.1f} %"
+        return [f"{joint}: worse than a constant torque on {log}: {why}"], []
     if urdf is not None and error > urdf:
         return [f"{joint}: {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
     if error > _POOR:
         return [f"{joint}: predicted to {error:.1f} % only on {log}"], []
     if error > _GOOD:
-        return [], [f"{joint}: predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"]
+        why = f"predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"
+        return [], [f"{joint}: {why}; see in the report what its residual holds"]
     if fitted is not None and error > max(_OPTIMISM * _error(fitted), 5.0):
         return [], [
-            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted"
+            f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted; "
+            "record a richer motion to fit"
         ]
+    if _is_beaten(measured):
+        driven = measured.baselines["urdf_with_drives"]
+        why = f"{error:.1f} % on {log}, {driven:.1f} % by the URDF with fitted drives"
+        return [], [f"{joint}: {why}: leave its link at the URDF"]
     return [], []
+
+
+def _left_to_urdf(validation: Mapping[str, Metrics]) -> list[str]:
+    """Return which joints the URDF with fitted drives predicts better, and what to do."""
+    worse = [
+        joint
+        for metrics in validation.values()
+        for joint, measured in metrics.per_joint.items()
+        if _is_beaten(measured)
+    ]
+    if not worse:
+        return []
+    return [
+        f"the URDF with fitted drives predicts {listed(dict.fromkeys(worse))} better than the "
+        "identified bodies: leave the links of these joints at the URDF, as pinned in "
+        "[estimator.constraints]"
+    ]
+
+
+def _is_beaten(measured: JointMetrics) -> bool:
+    """Return whether the URDF's bodies with fitted drives predict clearly better."""
+    driven = measured.baselines.get("urdf_with_drives")
+    return driven is not None and _error(measured) > max(_BEATEN * driven, driven + _TIE)
 
 
 def _rank(reason: str) -> int:

@@ -170,9 +170,22 @@ class Trajectory:
             start: First sample.
             stop: Sample after the last one; beyond the end means to the end.
         """
+        return replace(self, **self._rows(slice(start, stop)))
+
+    def every(self, step: int) -> "Trajectory":
+        """Return every so many samples, without a rate.
+
+        Args:
+            step: How many samples one stands for.
+        """
+        return (
+            self if step == 1 else replace(self, rate=None, **self._rows(slice(None, None, step)))
+        )
+
+    def _rows(self, rows: slice) -> dict[str, Any]:
         names = ["t", "q", "v", "a", "tau", "segment"]
         names += [] if self.direction is None else ["direction"]
-        return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
+        return {name: getattr(self, name)[rows] for name in names}
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators import Estimate, Kalman, KalmanState
 from robotid.exceptions import DataError
-from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
 from robotid.online.change_detection import (
     ChangeDetector,
@@ -25,6 +24,7 @@ from robotid.regressor.columns import sure_rows
 from robotid.regressor.problem import Sample
 from robotid.regressor.torque import InstantRegressor
 from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
 __all__ = ["OnlineIdentifier"]
 

@@ -1,16 +1,18 @@
 """The report: one HTML file that reads without a network, on a screen, a phone or paper."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 
 from robotid._files import write_text
 from robotid._html import code, figure, number, page, percent, table, text
-from robotid.findings import Finding
+from robotid.findings import listed
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
+from robotid.identification.summary import verdict_cell
 from robotid.logs.settings import SignalSettings
 from robotid.report.diagnosis import (
     body_figures,
@@ -31,9 +33,7 @@ _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 _SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 
 
-def write_report(
-    identification: Identification, target: str | Path, *, findings: Sequence[Finding] = ()
-) -> Path:
+def write_report(identification: Identification, target: str | Path) -> Path:
     """Write what an identification found, and how far to trust it, as one HTML file.
 
     The file fetches nothing. It is made beside its target and then put in place.
@@ -41,7 +41,6 @@ def write_report(
     Args:
         identification: What was found.
         target: The file to write.
-        findings: Warnings to show; notes of the logs that are not among them are added.
 
     Returns:
         Path of the file.
@@ -60,7 +59,7 @@ def write_report(
         "consistency": ("Physical consistency", made["consistency"]),
         "information": ("Excitation and correlation", information_section(identification)),
         "open": ("What the data do not determine", made["open"]),
-        "warnings": ("Warnings and notes", _warnings(identification, findings)),
+        "warnings": ("Warnings and notes", _warnings(identification)),
         "settings": ("Settings", made["settings"]),
         "inputs": ("Inputs", made["inputs"]),
         "versions": ("Versions", made["versions"]),
@@ -85,9 +84,21 @@ def _summary(found: Identification) -> str:
     return (
         f"<h1>{escape(found.model.name)}</h1>\n"
         f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
-        f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n"
+        f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n<p>{escape(_beside(found))}</p>\n"
         f'<p class="note">Written by robotid {__version__}. SI units throughout; inertial '
         "parameters in Pinocchio's order, inertias about the joint frame.</p>\n"
+    )
+
+
+def _beside(found: Identification) -> str:
+    """Return masses, gravity and friction in a sentence, beside which a verdict is read."""
+    witness = found.witness
+    shares = [f"{joint} {100 * share:.0f} %" for joint, share in witness.friction.items()]
+    before, after, _ = witness.masses
+    gravity = [f"{joint} {ratio:.2f}" for joint, ratio in witness.gravity.items()]
+    return (
+        f"Total mass {before:.2f} -> {after:.2f} kg. Gravity torque over the URDF's: "
+        f"{listed(gravity)}. Friction as a share of the torque: {listed(shares)}."
     )
 
 
@@ -119,21 +130,23 @@ def _errors(found: Identification) -> str:
     return (
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
         "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
-        "without drive parameters, of its gravity torque alone, and of predicting zero.</p>\n"
-        + "".join(parts)
+        "without drive parameters, of the URDF's bodies with drive terms fitted to the same rows, "
+        "of the URDF's gravity torque alone, and of predicting zero.</p>\n" + "".join(parts)
     )
 
 
 def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metrics) -> str:
     headers = ["joint", "error %", "RMSE", "unit", "R²", "rows", "WLS %", "URDF %"]
-    headers += ["gravity only %", "zero %", "verdict", "remark"]
+    headers += ["URDF + drives %", "gravity only %", "zero %", "verdict", "remark"]
     rows, verdicts = [], found.verdict.joints
     for name in found.model.row_names:
-        m, status = ours.per_joint.get(name), verdicts[name].status if name in verdicts else "–"
+        m, status = ours.per_joint.get(name), "–"
+        if name in verdicts:
+            status = verdict_cell(name, asdict(verdicts[name]))
         if m is None:
             dash = number(None)
             nothing = text("does not move: no rows used")
-            rows.append([code(name), dash, dash, text(""), *[dash] * 6, text(status), nothing])
+            rows.append([code(name), dash, dash, text(""), *[dash] * 7, text(status), nothing])
             continue
         rows.append(
             [
@@ -145,9 +158,10 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
                 number(m.rows, "d"),
                 percent(wls.per_joint[name].relative_error_pct),
                 percent(m.baselines["urdf"]),
+                percent(m.baselines.get("urdf_with_drives")),
                 percent(m.baselines["gravity_only"]),
                 percent(None if m.relative_error_pct is None else 100.0),
-                text(status, flag=status == "poor"),
+                text(status, flag=status.startswith("poor")),
                 text(_remark(m), flag=True),
             ]
         )
@@ -223,22 +237,14 @@ def _standard(found: Identification) -> str:
     )
 
 
-def _warnings(found: Identification, findings: Sequence[Finding]) -> str:
-    known = [finding.message for finding in findings]
-    notes = [
-        Finding("log_note", "note", str(e.recording.log.path), note)
-        for e in (*found.fitted, *found.validation)
-        for note in e.recording.log.notes
-        if not any(message.endswith(note) for message in known)
-    ]
-    if not findings and not notes:
+def _warnings(found: Identification) -> str:
+    if not found.findings:
         return "<p>None.</p>\n"
-    every = [*findings, *notes]
     html = ""
     for severity, title in _SEVERITIES.items():
         rows = [
             [code(f.code), text(f.message, flag=severity == "error"), code(f.where)]
-            for f in every
+            for f in found.findings
             if f.severity == severity
         ]
         if rows:

@@ -14,6 +14,7 @@ from robotid.cli import main
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import DataError, SettingsError
+from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import write_log
 
@@ -97,7 +98,7 @@ def test_a_result_that_is_none_is_refused(tmp_path, capsys, content, said):
 def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refused(
     ur5, rng, tmp_path, capsys
 ):
-    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0)
+    log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=1.0)
     write_log(log, tmp_path / "log.csv")
     text, urdf = Path(ur5.tree.path).read_text(), tmp_path / "robot.urdf"
     command = ["identify", str(urdf), str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]
@@ -112,3 +113,70 @@ def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refuse
     assert finding["where"] == "link forearm_link"
     assert "are not all positive" in finding["message"]
     assert "takes the nearest possible body" in finding["message"]
+
+
+@pytest.fixture
+def logs(ur5, rng, tmp_path):
+    """Two logs of a UR5; `spoil` changes both."""
+
+    def write(spoil=lambda log: log):
+        found = []
+        for name in ("run.csv", "kept.csv"):
+            log = exact_log(ur5, truth(ur5), rng, samples=1500, rate=100.0, noise=0.2)
+            found.append(spoil(log))
+            write_log(found[-1], tmp_path / name)
+        return found
+
+    return write
+
+
+def test_a_result_of_reversed_torques_is_no_urdf_and_exit_code_1(ur5, logs, tmp_path, capsys):
+    logs(lambda log: replace(log, tau=-log.tau))
+    files = [ur5.tree.path, str(tmp_path / "run.csv"), "--validate", str(tmp_path / "kept.csv")]
+    command = ["identify", *files, "--out", str(tmp_path / "out"), "--json"]
+    assert main(command) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert "urdf" not in result["outputs"]
+    assert not list((tmp_path / "out").glob("*.urdf"))
+    assert result["verdict"]["status"] == "poor"
+    (said,) = [w["message"] for w in result["warnings"] if w["code"] == "urdf_not_written"]
+    assert "wrong by what was found: torque_sign" in said
+    # whoever says that the sign is right still gets no robot of tons
+    assert main([*command, "--ignore", "torque_sign"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert "urdf" not in result["outputs"]
+    assert "within a factor of 3" in str(result["verdict"]["alarms"])
+    assert main([*command, "--ignore", "torque_sign", "--ignore", "total_mass"]) == 0
+    assert "urdf" in json.loads(capsys.readouterr().out)["outputs"]
+
+
+def test_the_unit_of_the_torque_off_by_a_thousand_is_no_urdf(ur5, logs, tmp_path):
+    logs(lambda log: replace(log, tau=1000.0 * log.tau))
+    job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "run.csv"),))
+    found, result = run_job(job, tmp_path / "out")
+    assert found.verdict.status == "poor"
+    assert "urdf" not in result["outputs"]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05])
+def test_python_says_what_the_command_line_says(ur5, logs, tmp_path, delay):
+    def late(log):
+        return replace(
+            log, tau=np.column_stack([np.interp(log.t - delay, log.t, tau) for tau in log.tau.T])
+        )
+
+    run, kept = logs(late)
+    entries = tuple(LogEntry(tmp_path / name) for name in ("run.csv", "kept.csv"))
+    job = Job(Path(ur5.tree.path), identification=entries[:1], validation=entries[1:])
+    shell = run_job(job, tmp_path / "out")[0].verdict
+    named = [replace(log, path=name) for log, name in ((run, "run.csv"), (kept, "kept.csv"))]
+    python = identify(ur5, named[:1], validation=named[1:]).verdict
+    assert {doubt.code for doubt in python.doubts} == ({"torque_delay"} if delay else set())
+    assert python.status == shell.status
+    assert python.doubts == shell.doubts
+    blind = identify(ur5, named[:1], validation=named[1:], doctor=False)
+    known = identify(ur5, named[:1], validation=named[1:], ignore=["torque_delay"])
+    assert "torque_delay" not in {doubt.code for doubt in (*blind.doubts, *known.doubts)}
+    assert (known.findings != blind.findings) == (delay > 0)
+    with pytest.raises(SettingsError, match="ignore names 'late'"):
+        identify(ur5, named[:1], ignore=["late"])

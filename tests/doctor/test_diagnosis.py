@@ -12,9 +12,10 @@ from helpers.synthetic import exact_log, truth
 from robotid.cli import main
 from robotid.commands.job import Job, LogEntry, read_job
 from robotid.commands.logs import examine
-from robotid.doctor.diagnosis import alarming, check_logs, diagnose, findings_to_dict
+from robotid.doctor.diagnosis import check_logs, diagnose, findings_to_dict
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding
+from robotid.identification.verdict import alarming, check_ignored
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
@@ -234,7 +235,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
         f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
-    assert main(words) == 0
+    assert main(words) == 1
     result = json.loads(capsys.readouterr().out)
     assert result["verdict"]["status"] == "poor"
     assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
@@ -251,7 +252,7 @@ def test_an_unknown_code_to_ignore_is_wrong_use(wrong_sign, tmp_path, capsys):
     assert main(words) == 2
     assert "Did you mean 'torque_sign'?" in capsys.readouterr().err
     with pytest.raises(SettingsError, match="ignore names 'x'"):
-        alarming([], ["x"])
+        check_ignored(["x"])
 
 
 def test_only_errors_alarm_and_only_those_that_are_not_ignored():

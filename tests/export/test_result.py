@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ FINDINGS = [Finding("late", "warning", "a.csv", "late by 4 ms"), Finding("b", "n
 @pytest.fixture(scope="module")
 def result(identified):
     settings = {"estimator": {"name": "consistent"}}
-    return build_result(identified, settings, FINDINGS, {"report": "report.html"})
+    return build_result(replace(identified, findings=FINDINGS), settings, {"report": "report.html"})
 
 
 def test_the_head_says_what_was_identified_and_how(result, identified):
@@ -49,6 +50,7 @@ def test_the_structure_counts_parameters(result, identified):
         "rank": identified.determination.rank,
         "condition": pytest.approx(identified.wls.condition),
         "undetermined": list(identified.determination.undetermined),
+        "poorly_excited": identified.wls.condition > 1e3,
         "not_told_apart": identified.determination.to_list(),
     }
 
@@ -89,6 +91,7 @@ def test_standard_and_drive_parameters_have_value_error_prior_and_source(result,
             "unit": layout.units[i],
             "prior": identified.prior[i],
             "source": identified.sources[i],
+            **({} if i < 60 else {"with_urdf": identified.urdf_with_drives[i]}),
         }
     np.testing.assert_allclose(
         [entry["prior"] for entry in entries[:60]], np.concatenate(urdf), atol=1e-12
@@ -107,6 +110,7 @@ def assert_metrics(found, wanted):
             "rows": row["rows"],
             "urdf_relative_error_pct": pytest.approx(row["urdf"]),
             "gravity_only_relative_error_pct": pytest.approx(row["gravity_only"]),
+            "urdf_with_drives_relative_error_pct": pytest.approx(row["urdf_with_drives"]),
             "better_than_constant": bool(row["r2"] > 0),
         }
     squares = sum(row["rows"] * row["rmse"] ** 2 for row in wanted.values())

@@ -16,13 +16,13 @@ from robotid.estimators import (
     LogCholesky,
     NormalisedGradient,
 )
-from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.problem import Problem
 from robotid.regressor.torque import build_problem, joint_torque_regressor, mass_regressor
+from robotid.robot.prior import prior_spread
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 NOISE = np.array([4.0, 2.0, 1.0, 0.3, 0.2, 0.1])  # [N m]

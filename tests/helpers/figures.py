@@ -18,6 +18,7 @@ def torques(found, trajectory):
         "wls": (W[:, found.mapping.independent] @ found.wls.theta).reshape(still.shape),
         "urdf": (W @ urdf).reshape(still.shape),
         "gravity_only": (G @ urdf).reshape(still.shape),
+        "urdf_with_drives": (W @ found.urdf_with_drives).reshape(still.shape),
     }
 
 
@@ -37,7 +38,7 @@ def figures(found, evaluations, name="estimate"):
         size, r = np.linalg.norm(y), y - predicted[name][used, j]
         others = {
             key: 100 * np.linalg.norm(y - predicted[key][used, j]) / size
-            for key in ("wls", "urdf", "gravity_only")
+            for key in ("wls", "urdf", "gravity_only", "urdf_with_drives")
         }
         table[joint] = {
             "error": 100 * np.linalg.norm(r) / size,

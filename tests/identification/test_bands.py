@@ -57,7 +57,7 @@ def test_intervals_hold_the_truth(found):
 
 def test_result_json_states_bands_intervals_and_method(found):
     identification, _ = found
-    result = build_result(identification, {}, [], {})
+    result = build_result(identification, {})
     assert result["uncertainty"]["stretches"] in (47, 48)
     assert 0.5 < result["uncertainty"]["inflation"] < 2
     band = result["validation"][0]["band"]["elbow_joint"]

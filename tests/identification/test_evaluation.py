@@ -3,10 +3,10 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import evaluate_logs, pool, predict, shares_rows
-from robotid.identification.rows import row_mask
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.used_rows import row_mask
 from robotid.robot.parameters import Coupling
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)

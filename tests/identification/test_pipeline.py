@@ -147,7 +147,6 @@ def test_noise_levels_that_settle_slowly_on_few_rows_do_not_stop_it(ur5, monkeyp
 
 
 def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng, monkeypatch):
-    found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
     asked = []
 
     def check(model, pi):
@@ -155,6 +154,7 @@ def test_the_mass_matrix_is_checked_once_and_again_for_other_parameters(ur5, rng
         return MassMatrixCheck(1, 1.0, 1.0)
 
     monkeypatch.setattr(pipeline, "check_mass_matrix", check)
+    found = identify(ur5, [exact_log(ur5, truth(ur5), rng)], signals=EXACT, estimator="wls")
     assert found.mass_matrix is replace(found, alarms=("x",)).mass_matrix is found.mass_matrix
     assert len(asked) == 1
     other = replace(found, standard=found.prior)

@@ -12,10 +12,10 @@ from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import Cone, nearest, svec, unsvec
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.identification.pipeline import identify
-from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.prior import prior_spread
 
 BOUND = {"prior": "euclidean", "prior_weight": 1.0}  # which leaves bodies on their bounds
 

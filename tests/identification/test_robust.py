@@ -9,12 +9,12 @@ from robotid.exceptions import SettingsError
 from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import LOSSES, loss_slope, loss_weight
-from robotid.identification.rows import base_problem
 from robotid.identification.settings import EstimatorSettings
 from robotid.identification.survey import survey_log
 from robotid.logs.read import lay_out, write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.used_rows import base_problem
 
 NOISE = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])
 ROWS = {"wrist_2_joint": 584, "elbow_joint": 1148, "shoulder_pan_joint": 1287, "wrist_1_joint": 900}

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 from robotid.findings import Finding
@@ -19,4 +21,4 @@ def findings():
 def report(identified, findings, tmp_path_factory):
     """The report of the identified UR5, as HTML."""
     target = tmp_path_factory.mktemp("report") / "report.html"
-    return write_report(identified, target, findings=findings).read_text(encoding="utf-8")
+    return write_report(replace(identified, findings=findings), target).read_text(encoding="utf-8")

@@ -2,6 +2,8 @@
 
 import hashlib
 import re
+from dataclasses import asdict
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from helpers.figures import figures
 from helpers.pages import number, percent, tables
 
 from robotid.identification.information import information
+from robotid.identification.summary import verdict_cell
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import versions
 
@@ -49,9 +52,10 @@ def test_errors_are_those_of_estimate_wls_and_baselines(shown, identified, capti
             "rows": str(measured["rows"]),
             "WLS %": percent(measured["wls"]),
             "URDF %": percent(measured["urdf"]),
+            "URDF + drives %": percent(measured["urdf_with_drives"]),
             "gravity only %": percent(measured["gravity_only"]),
             "zero %": "100.0",
-            "verdict": identified.verdict.joints[joint].status,
+            "verdict": verdict_cell(joint, asdict(identified.verdict.joints[joint])),
             "remark": "",
         }
     # figures that are alike would hide a swap
@@ -63,7 +67,8 @@ def test_the_verdict_stands_with_its_reasons_and_no_other(report, identified):
     box = report.split('<div class="verdict ')[1].split("</div>")[0]
     assert box.startswith(f'{identified.verdict.status}"')
     assert f"<strong>{identified.verdict.status}</strong>" in box
-    assert re.findall(r"<li>(.*?)</li>", box) == list(identified.verdict.reasons)
+    said = [unescape(reason) for reason in re.findall(r"<li>(.*?)</li>", box)]
+    assert said == list(identified.verdict.reasons)
 
 
 def test_the_head_counts_parameters_samples_and_rows(report, identified):

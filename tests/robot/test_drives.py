@@ -10,7 +10,6 @@ from helpers.synthetic import exact_log, truth
 from robotid.commands.job import job_from_settings
 from robotid.export.urdf import load_identified, read_sidecar, write_urdf
 from robotid.identification.pipeline import identify
-from robotid.identification.prior import prior_spread
 from robotid.logs.data import Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
@@ -24,6 +23,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
+from robotid.robot.prior import prior_spread
 from robotid.simulation.closed_loop import simulate
 from robotid.simulation.motions import random_fourier
 from robotid.simulation.plant import RobotPlant

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,10 +30,11 @@ def pages(tmp_path_factory):
     results = []
     for name in ("consistent", "wls"):
         found = identify(arm, logs[:1], validation=logs[1:], estimator=name)
+        found = replace(found, findings=findings)
         results.append(folder / f"{name}.json")
         settings = {"estimator": {"name": name}}
-        write_json(build_result(found, settings, findings), results[-1])
-    report = write_report(found, folder / "report.html", findings=findings)
+        write_json(build_result(found, settings), results[-1])
+    report = write_report(found, folder / "report.html")
     write_comparison(results, folder / "compare.html")
     return {"report": report, "compare": folder / "compare.html"}
 

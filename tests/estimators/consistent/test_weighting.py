@@ -12,12 +12,12 @@ from robotid.estimators import Consistent
 from robotid.estimators.consistent.weighting import choose_weight, held_out_errors, log_evidence
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.pipeline import identify
-from robotid.identification.prior import prior_spread
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress, compress_stretches, gather, merge
 from robotid.regressor.torque import build_problem
+from robotid.robot.prior import prior_spread
 
 
 @pytest.fixture

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.identification.prior import prior_spread
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.prior import prior_spread
 
 
 def test_the_spread_has_the_size_of_the_robot(ur5, rng):

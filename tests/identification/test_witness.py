@@ -1,0 +1,100 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.identification.pipeline import identify
+from robotid.identification.settings import EstimatorSettings
+from robotid.logs.settings import SignalSettings
+
+EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
+NOISE = 0.05 * np.array([4, 4, 2, 1, 1, 0.5])
+
+
+def near_urdf(model, scale=1.0):
+    pi, size = model.standard_parameters(), model.layout.n_inertial
+    pi[size:] = truth(model)[size:]
+    return scale * pi
+
+
+def found_of(model, pi, estimator="consistent"):
+    logs = [exact_log(model, pi, r, noise=NOISE) for r in np.random.default_rng(0).spawn(2)]
+    return identify(
+        model, logs[:1], validation=logs[1:], signals=EXACT, doctor=False, estimator=estimator
+    )
+
+
+def test_a_robot_like_its_urdf_is_good_and_its_urdf_bears_witness(ur5):
+    found = found_of(ur5, near_urdf(ur5))
+    assert found.witness.factor == pytest.approx(1.0, abs=0.01)
+    for joint, ratio in found.witness.gravity.items():
+        assert ratio == pytest.approx(1.0, abs=5 * found.witness.gravity_error[joint] + 1e-3)
+    assert found.witness.agrees
+    assert found.verdict.status == "good"
+    assert "agree within 5 %" in found.verdict.reasons[-1]
+
+
+def test_torques_of_another_gain_are_told_from_other_masses_and_never_good(ur5):
+    found = found_of(ur5, near_urdf(ur5, 0.8))
+    assert found.witness.factor == pytest.approx(0.8, abs=0.01)
+    assert found.witness.has_one_factor
+    assert found.verdict.status == "usable"
+    (reason,) = [r for r in found.verdict.reasons if "could not be checked" in r]
+    assert "All joints alike are off by 0.80" in reason
+    stated = EstimatorSettings("consistent", constraints={"total_mass": [10.0, 20.0]})
+    found = found_of(ur5, near_urdf(ur5, 0.8), stated)
+    assert found.verdict.status == "good"
+    assert "rests on the mass that was stated" in found.verdict.reasons[-1]
+
+
+def test_a_load_in_the_hand_is_no_other_scale(ur5):
+    found = found_of(ur5, truth(ur5))  # links 10 to 30 % off, and 1.2 kg in the hand
+    assert found.witness.factor > 1.2
+    assert found.witness.masses[2] == pytest.approx(1.2, abs=0.4)
+    assert not found.witness.has_one_factor
+    assert found.verdict.status == "good", found.verdict.reasons
+    assert "could not be checked" in found.verdict.reasons[-1]
+
+
+def test_without_gravity_nothing_bears_witness(ur5):
+    model = ur5.from_urdf(ur5.tree.path, gravity=(0.0, 0.0, 0.0))
+    found = found_of(model, near_urdf(model))
+    assert found.witness.scale is None
+    assert not found.witness.agrees
+    assert "gravity loads no joint" in found.verdict.reasons[-1]
+
+
+def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
+    found = found_of(ur5, near_urdf(ur5))
+    layout, (e,) = ur5.layout, found.fitted
+    viscous, coulomb = (
+        found.standard[layout.names.index(f"wrist_3_joint.{term}")]
+        for term in ("viscous", "coulomb")
+    )
+    v, tau = e.recording.trajectory.v[:, 5], e.recording.trajectory.tau[:, 5]
+    share = np.linalg.norm(viscous * v + coulomb * np.sign(v)) / np.linalg.norm(tau)
+    assert found.witness.friction["wrist_3_joint"] == pytest.approx(share, rel=1e-9)
+    json.dumps(found.witness.to_dict(), allow_nan=False)
+
+
+def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(ur5):
+    from robotid.identification.findings import fit_findings
+
+    found = found_of(ur5, near_urdf(ur5))
+    shapes = {f.code for f in fit_findings(found) if f.severity == "warning"}
+    assert not shapes & {"com_outside", "gyration", "density"}
+    i = ur5.layout.names.index("forearm_link.mcx")
+
+    def is_forearm(finding):
+        return (finding.code, finding.where) == ("com_outside", "link forearm_link")
+
+    far = found.standard.copy()
+    far[i] += 1.0 * far[i - 1]  # the centre of mass a metre aside
+    (finding,) = [f for f in fit_findings(replace(found, standard=far)) if is_forearm(f)]
+    assert (finding.severity, finding.where) == ("warning", "link forearm_link")
+    assert finding.message.startswith("as identified, link 'forearm_link'")
+    (finding,) = [f for f in fit_findings(replace(found, standard=far, prior=far)) if is_forearm(f)]
+    assert finding.severity == "note"
+    assert "so it is in the URDF already" in finding.message
