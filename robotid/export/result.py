@@ -17,7 +17,7 @@ from robotid.exceptions import DataError, ModelError
 from robotid.export.urdf import load_identified
 from robotid.identification.bands import REACH
 from robotid.identification.evaluation import Evaluation
-from robotid.identification.pipeline import Identification
+from robotid.identification.pipeline import SOURCES, Identification
 from robotid.identification.witness import Witness
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -305,7 +305,7 @@ def _base_parameters(found: Identification) -> list[dict[str, Any]]:
 
 
 def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
-    layout = found.model.layout
+    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
     return [
         {
             "name": layout.names[i],
@@ -313,7 +313,8 @@ def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
             "std_error": _finite(found.standard_error[i]),
             "unit": layout.units[i],
             "prior": float(found.prior[i]),
-            "source": found.sources[i],
+            "source": sources[i],
+            "at_bound": bool(at_bound[i]),
         }
         for i in numbers
     ]
@@ -332,7 +333,7 @@ def _consistency(found: Identification) -> dict[str, Any]:
         "total_mass": float(J[:, 3, 3].sum()),
         "mass_matrix": dataclasses.asdict(found.mass_matrix),
         "fit": dict(found.estimate.details),
-        "sources": {kind: found.sources.count(kind) for kind in ("data", "mixed", "prior")},
+        "sources": {kind: found.sources.count(kind) for kind in SOURCES},
     }
 
 

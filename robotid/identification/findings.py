@@ -57,6 +57,7 @@ def fit_findings(identification: Identification) -> list[Finding]:
         severity = "warning" if identification.is_poorly_excited else "note"
         findings.append(Finding("undetermined", severity, "base_parameters", message))
     findings += consistency_findings(identification)
+    findings += _bound_findings(identification)
     findings += _total_mass(identification)
     findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
@@ -228,6 +229,27 @@ def _impossible_shapes(identification: Identification) -> list[Finding]:
             message = f"as identified, {said}; record more motion of it, or pin it to the URDF"
             finding = replace(finding, message=message)
         findings.append(finding)
+    return findings
+
+
+def _bound_findings(identification: Identification) -> list[Finding]:
+    """Return notes on drive terms at 0, and warnings of bodies beyond their extents."""
+    findings, names = [], identification.model.layout.names
+    at_bound = [name for name, is_at in zip(names, identification.at_bound, strict=True) if is_at]
+    if at_bound:
+        message = (
+            f"{listed(at_bound, _NAMED)}: 0, at the bound, so how uncertain is not known. The data "
+            "ask for less than 0, which no drive can have: the friction model lacks something "
+            "there, or the motion does not tell these terms from others"
+        )
+        findings.append(Finding("at_bound", "note", ", ".join(at_bound), message))
+    for body in identification.estimate.details.get("relaxed", ()):
+        message = (
+            f"{body}: the data clearly put mass outside the box of its geometry, which was left "
+            "out of the fit for it. If something is mounted there, add it to the URDF; otherwise "
+            "check the URDF's geometry and the torque scale"
+        )
+        findings.append(Finding("extent_contradicted", "warning", f"link {body}", message))
     return findings
 
 

@@ -59,11 +59,16 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import prior_spread
 
-__all__ = ["EstimatorSettings", "Identification", "conclude", "identify"]
+__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify"]
+
+#: What may have determined a standard parameter.
+SOURCES = ("data", "mixed", "prior", "bound")
 
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
-_FROM_PRIOR = 0.9  # ... and above this share, the prior's
+_FROM_PRIOR = 0.9  # ... and above this share, the prior's, if it stayed there
+_STAYED = 0.3  # spreads that such a parameter may have moved
+_AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,28 +160,52 @@ class Identification:
         return self._checked[-1][1]
 
     @property
+    def at_bound(self) -> Array:
+        """Which drive terms are 0 only since they cannot be negative, shape (p,).
+
+        What they would be without that bound is hidden, so they have no standard error.
+        """
+        is_bounded = bool(self.estimate.details.get("constraints"))
+        is_zero = self.standard <= _AT_BOUND * self.prior_std
+        return np.asarray(self.model.layout.is_nonnegative() & is_zero & is_bounded)
+
+    @property
     def standard_error(self) -> Array:
-        """Standard errors of the standard parameters given the prior, shape (p,)."""
+        """Standard errors of the standard parameters, shape (p,), by the prior; inf at bounds."""
         # exact data leave a variance of rounding size, of either sign
-        errors: Array = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
-        return errors
+        errors = np.sqrt(np.maximum(np.diag(self.standard_covariance), 0.0))
+        return np.where(self.at_bound, np.inf, errors)
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Where each standard parameter comes from: "data", "mixed" or "prior"."""
+        """What determined each standard parameter.
+
+        * "data": the motion, which shrinks its plausible spread below 30 %;
+        * "prior": nothing, so that the URDF's value stands, within 30 % of that spread;
+        * "bound": physics forbids the URDF's value or what the data ask for: a drive term at 0, a
+          body held by its extent;
+        * "mixed": data and URDF together, in sums with others; or a wish of the user.
+        """
         layout, unbounded = self.model.layout, self.errors.unbounded
         after = self.standard_error if unbounded is None else unbounded  # a bound is no source
         share = after / np.maximum(self.prior_std, _KNOWN)
+        moved = np.abs(self.standard - self.prior) > _STAYED * self.prior_std
+        active = self.estimate.details.get("active", ())
+        held = layout.owned_by([label.split(" ", 1)[1] for label in active if " " in label])
         masses = self.estimator.bounds.masses.items()
         known = [f"{link}.m" for link, mass in masses if np.ptp(mass) == 0]
         kept = layout.owned_by(self.estimate.details.get("pinned", ()))
-        kept = kept | np.isin(layout.names, known) | (share > _FROM_PRIOR)
-        names = np.where(kept, "prior", np.where(share < _FROM_DATA, "data", "mixed"))
+        kept = kept | np.isin(layout.names, known) | ((share > _FROM_PRIOR) & ~moved)
+        held = self.at_bound | (held & moved & (share >= _FROM_DATA))
+        names = np.select([kept, held, share < _FROM_DATA], ["prior", "bound", "data"], "mixed")
         return tuple(names.tolist())
 
     @property
     def base_interval(self) -> Array:
-        """95 % interval of each base parameter, shape (b, 2); infinite where it is open."""
+        """95 % interval of each base parameter, shape (b, 2); infinite where it is open.
+
+        It is open where the data say nothing, and where the parameter is at its bound.
+        """
         half = self.errors.reach * self.base_error
         return np.column_stack([self.base - half, self.base + half])
 
@@ -343,7 +372,8 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
         recordings.fitted, recordings.kept, candidates, prior, driven, plan=recordings.plan
     )
     is_base = estimate.names == mapping.base_names
-    return Identification(
+    base_error = estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0))
+    found = Identification(
         model=model,
         mapping=mapping,
         estimator=choice,
@@ -355,13 +385,15 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
         standard=standard,
         standard_covariance=covariance,
         base=mapping.to_base(standard),
-        base_error=estimate.std_error if is_base else np.sqrt(np.maximum(base_variance, 0.0)),
+        base_error=base_error,
         fitted=fitted,
         validation=kept,
         errors=errors,
         factors=ground.factors,
         determination=ground.determination,
     )
+    hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at their bounds
+    return replace(found, base_error=np.where(hidden, np.inf, base_error))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """The report's tables as HTML: parameters, consistency, what is open, settings, inputs."""
 
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -10,7 +11,7 @@ from robotid._files import file_sha256
 from robotid._html import Cell, code, number, percent, table, text
 from robotid.findings import listed
 from robotid.identification.evaluation import Recording
-from robotid.identification.pipeline import Identification
+from robotid.identification.pipeline import SOURCES, Identification
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 
@@ -47,13 +48,13 @@ def tables(found: Identification) -> dict[str, str]:
 
 def _drive_table(found: Identification) -> str:
     """Return the table of the drive parameters."""
-    layout, sources = found.model.layout, found.sources
+    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
     if not layout.drive_names:
         return "<p>None was identified.</p>\n"
     rows = [
         [
             code(layout.names[i]),
-            *_value(found.standard[i], found.standard_error[i]),
+            *_value(found.standard[i], found.standard_error[i], at_bound=bool(at_bound[i])),
             text(layout.units[i]),
             text(sources[i]),
         ]
@@ -223,8 +224,10 @@ def _version_table() -> str:
     return table("Versions that ran", ["what", "version"], rows)
 
 
-def _value(value: float, error: float) -> list[Cell]:
-    relative = 100 * error / abs(value) if value else None
+def _value(value: float, error: float, *, at_bound: bool = False) -> list[Cell]:
+    if at_bound:
+        return [text("0, at its bound"), number(None), percent(None)]
+    relative = 100 * error / abs(value) if value and math.isfinite(error) else None
     share = percent(relative) if relative is None or relative < 1000 else Cell("&gt; 999", "number")
     return [number(value), number(error, ".2g"), share]
 
@@ -279,6 +282,8 @@ def _consistency_notes(found: Identification) -> str:
         )
         active = ", ".join(details["active"])
         said.append(f"Constraints that bind: {active}." if active else "No constraint binds.")
+        if details["relaxed"]:
+            said.append(f"Extents that the data contradict: {', '.join(details['relaxed'])}.")
         if details["pinned"]:
             said.append(f"Kept at the URDF's values: {', '.join(details['pinned'])}.")
     if "check" in details:
@@ -295,7 +300,7 @@ def _consistency_notes(found: Identification) -> str:
 
 
 def _reach(found: Identification) -> str:
-    counts = {kind: found.sources.count(kind) for kind in ("data", "mixed", "prior")}
+    counts = {kind: found.sources.count(kind) for kind in SOURCES}
     carried = [
         body
         for body in found.model.layout.bodies
@@ -307,7 +312,8 @@ def _reach(found: Identification) -> str:
     ]
     text = (
         f"How far the data carry: of {len(found.sources)} parameters {counts['data']} come from "
-        f"the data, {counts['mixed']} from data and URDF together, {counts['prior']} from the URDF."
+        f"the data, {counts['mixed']} from data and URDF together, {counts['prior']} from the "
+        f"URDF; {counts['bound']} are at a bound of physics."
     )
     return text + (f" Nothing is known of {', '.join(carried)} but the URDF." if carried else "")
 

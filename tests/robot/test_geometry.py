@@ -7,12 +7,14 @@ from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.robot.geometry import (
+    body_boxes,
     body_points,
     box_half_spaces,
     geometry_half_spaces,
     hull_half_spaces,
 )
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
 
 URDF = """<robot name="arm">
 <link name="base"/>
@@ -134,3 +136,21 @@ def test_the_centres_of_mass_of_a_real_arm_stay_in_its_meshes(ur5, rng):
 
     assert beyond(free.standard) > 0.02
     assert beyond(found.standard) < 1e-6
+
+
+def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_body(tmp_path):
+    # BOX, and the cylinder of the flange: 0.6 x 0.4 x 1.1 m, grown by 5 % of its diagonal
+    grown = 0.05 * np.linalg.norm([0.6, 0.4, 1.1])
+    low, high = body_boxes(arm(tmp_path, BOX, CYLINDER))["one"]
+    np.testing.assert_allclose(low, np.array([-0.3, -0.2, 0.0]) - grown, atol=2e-3)
+    np.testing.assert_allclose(high, np.array([0.3, 0.2, 1.1]) + grown, atol=3e-3)
+    # frames alone: the flange is 1 m up
+    low, high = body_boxes(arm(tmp_path))["one"]
+    np.testing.assert_allclose([low, high], [[-0.35, -0.35, -0.35], [0.35, 0.35, 1.35]], atol=1e-9)
+    # a heavy flange's own body reaches beyond the sphere that is drawn: 3 sigma^2 about the centre
+    small = arm(tmp_path, SPHERE, '<visual><geometry><sphere radius="0.01"/></geometry></visual>')
+    (J,) = pseudo_inertia(small.standard_parameters()[:10])
+    centre = J[2, 3] / J[3, 3]
+    reach = np.sqrt(3.0 * (J[2, 2] / J[3, 3] - centre**2))
+    assert body_boxes(small)["one"][1][2] == pytest.approx(centre + reach, abs=1e-9)
+    assert centre + reach > 1.01 + 0.05 * 1.5

@@ -7,12 +7,14 @@ import pytest
 from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.synthetic import exact_log, truth
 
-from robotid.estimators.consistent.constraints import Constraints
+from robotid.estimators.consistent.constraints import Constraints, slabs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.identification.fitting import make_constraints
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import ConstraintSettings, EstimatorSettings
 from robotid.regressor.factors import compress
+from robotid.robot.geometry import body_boxes
+from robotid.robot.parameters import pseudo_inertia
 
 
 @pytest.fixture
@@ -201,3 +203,47 @@ def test_a_job_states_its_constraints(ur5, rng):
 def test_an_unknown_metric_is_refused(case):
     with pytest.raises(DataError, match="metric is 'manhattan', wanted one of"):
         replace(case[0], metric="manhattan")
+
+
+def test_the_slabs_of_a_box_hold_for_grains_inside_and_fail_for_one_outside(rng):
+    box = np.array([[-0.1, -0.2, 0.0], [0.3, 0.2, 0.5]])
+    grains = rng.uniform(*box, size=(50, 3))
+    homogeneous = np.column_stack([grains, np.ones(50)])
+    masses = rng.uniform(0.1, 1.0, 50)
+    J = (homogeneous * masses[:, None]).T @ homogeneous
+    value = np.einsum("kij,ij->k", slabs(box), J)
+    # the integral of (x - l) (u - x), grain by grain
+    np.testing.assert_allclose(value, masses @ ((grains - box[0]) * (box[1] - grains)), rtol=1e-12)
+    assert (value > 0).all()
+    x = np.array([0.31, 0.0, 0.1, 1.0])
+    np.testing.assert_array_equal(np.sign(np.einsum("kij,i,j->k", slabs(box), x, x)), [-1, 1, 1])
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "entropic"])
+def test_extents_keep_the_mass_of_each_body_in_its_box(case, ur5, metric):
+    boxes = {b: 0.2 * box + 0.8 * box.mean(axis=0) for b, box in body_boxes(ur5).items()}
+    fit, factors = case
+    loose = replace(fit, metric=metric)
+    tight = replace(loose, constraints=Constraints(extent=boxes))
+    free, kept = (one.fit(factors) for one in (loose, tight))
+
+    def slack(estimate):
+        J = pseudo_inertia(estimate.theta[:60])
+        return np.array(
+            [np.einsum("kij,ij->k", slabs(boxes[b]), J_i) for b, J_i in zip(boxes, J, strict=True)]
+        )
+
+    assert slack(free).min() < -1e-3
+    assert slack(kept).min() > -1e-7
+    bound = [b for b, values in zip(boxes, slack(kept), strict=True) if values.min() < 1e-7]
+    assert [f"extent {body}" for body in sorted(bound)] == [
+        label for label in kept.details["active"] if label.startswith("extent")
+    ]
+
+
+def test_what_is_stated_of_a_centre_of_mass_widens_the_extent_of_its_body(ur5):
+    bounds = ConstraintSettings(com={"forearm_link": [[1.0, -0.1, 0.0], [1.2, 0.0, 0.1]]})
+    extent = body_boxes(ur5)["forearm_link"]
+    made = make_constraints(bounds, {}, {"forearm_link": extent}).extent["forearm_link"]
+    np.testing.assert_array_equal(made[0], np.minimum(extent[0], [1.0, -0.1, 0.0]))
+    np.testing.assert_array_equal(made[1], np.maximum(extent[1], [1.2, 0.0, 0.1]))

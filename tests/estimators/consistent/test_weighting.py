@@ -9,6 +9,7 @@ from helpers.estimation import EXACT, NOISE, Case, consistent
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
+from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.weighting import choose_weight, held_out_errors, log_evidence
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.pipeline import identify
@@ -17,6 +18,8 @@ from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress, compress_stretches, gather, merge
 from robotid.regressor.torque import build_problem
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
 
@@ -194,3 +197,37 @@ def test_the_noise_level_of_few_rows_is_right_on_average(ur5, rng):
     # 15 runs of 30 degrees of freedom know it to 3 %; what the prior misses adds to it
     assert (ratio > 0.85).all()
     assert (ratio < 1.2).all()
+
+
+def test_extents_that_the_data_contradict_are_named_and_no_others(rng):
+    z1 = RobotModel.from_urdf(example_urdf("z1.urdf"))
+    link, last = z1.layout.bodies[-1], slice(z1.layout.n_inertial - 10, z1.layout.n_inertial)
+    found = {}
+    for mass in (0.0, 2.0):  # [kg], a tool 0.5 m in front of the last link
+        pi = z1.standard_parameters()
+        own = mass * 0.5**2
+        pi[last] += [mass, 0.5 * mass, 0.0, 0.0, 0.0, 0.0, own, 0.0, 0.0, own]
+        log = exact_log(z1, pi, rng, samples=1500, noise=0.05)
+        found[mass] = identify(z1, [log], signals=EXACT)
+    assert found[0.0].estimate.details["relaxed"] == []
+    relaxed = found[2.0].estimate.details["relaxed"]
+    assert link in relaxed
+    assert set(relaxed) <= {"link06", link}  # its neighbour may carry the tool, too
+    where = [f.where for f in found[2.0].findings if f.code == "extent_contradicted"]
+    assert where == [f"link {body}" for body in relaxed]
+    # and the tool is found where it is
+    m, mx = found[2.0].standard[: z1.layout.n_inertial].reshape(-1, 10)[-2:, :2].sum(axis=0)
+    true_m, true_mx = pi[: z1.layout.n_inertial].reshape(-1, 10)[-2:, :2].sum(axis=0)
+    assert mx / m == pytest.approx(true_mx / true_m, rel=0.3)
+
+
+def test_the_central_path_is_gone_along_in_shorter_steps_where_decades_are_too_long(case):
+    # a third of the true mass: bodies shrink to points, which creep
+    fit, problem = case
+    fit = replace(fit, metric="entropic", constraints=Constraints(total_mass=(5.0, 5.0)))
+    rows = fit.rows(compress(problem), NOISE)
+    long, _ = fit.programme.minimise(rows, 100.0)
+    start = long.x
+    again, _ = fit.programme.minimise(rows, 100.0, start=start)
+    assert np.abs((again.x - long.x) / fit.prior_std).max() < 1e-6
+    assert long.x[:60:10].sum() == pytest.approx(5.0, abs=1e-9)
