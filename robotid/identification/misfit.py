@@ -199,7 +199,11 @@ class Sample:
 
 
 def take_sample(identification: "Identification") -> Sample | None:
-    """Return rows spread over the recordings; None if there are too few to judge by."""
+    """Return rows spread over the recordings; None if there are too few to judge by.
+
+    Args:
+        identification: What was found.
+    """
     model, mapping = identification.model, identification.mapping
     kept = [e for e in identification.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, identification.fitted, kept)
@@ -359,13 +363,21 @@ class Trial:
     H: Array
 
     def parameters(self, which: Sequence[int]) -> Array:
-        """Return the parameters of some columns, shape (..., k)."""
+        """Return the parameters of some columns, shape (..., k).
+
+        Args:
+            which: The k columns.
+        """
         square = self.S[..., which, :][..., which]
         theta: Array = np.linalg.solve(square, self.S[..., which, -1:])[..., 0]
         return theta
 
     def left(self, which: Sequence[int]) -> Array:
-        """Return the squared residual of each stretch with some columns fitted, shape (K,)."""
+        """Return the squared residual of each stretch with some columns fitted, shape (K,).
+
+        Args:
+            which: The columns.
+        """
         if not which:
             alone: Array = self.H[:, -1, -1]
             return alone
@@ -481,6 +493,11 @@ def chance(before: Array, after: Array, fitted: int) -> float:
 
     By Student's test of the shares, each between -1 and 1, of the fitted logs' stretches or of all,
     whichever is surer.
+
+    Args:
+        before: Squared residual of each stretch, shape (K,).
+        after: The same with the term.
+        fitted: How many of the stretches are of fitted logs.
     """
     gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
     chances = [
