@@ -31,6 +31,7 @@ PAGES = {
     "memory": "long_logs.md",
     "recursive": "online_tracker.md",
     "replay": "replay.md",
+    "verdict": "verdicts.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

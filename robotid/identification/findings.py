@@ -11,7 +11,7 @@ import numpy as np
 
 from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.findings import Finding, listed
-from robotid.identification.calibration import calibration_findings
+from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import misfit_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
@@ -59,10 +59,10 @@ def fit_findings(identification: Identification) -> list[Finding]:
     findings += consistency_findings(identification)
     findings += _bound_findings(identification)
     findings += _total_mass(identification)
-    findings += calibration_findings(identification)
     findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
+    findings += discrepancy_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

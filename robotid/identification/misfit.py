@@ -32,7 +32,17 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["Misfit", "find_misfits", "misfit_findings", "settled"]
+__all__ = [
+    "Misfit",
+    "Sample",
+    "Trial",
+    "chance",
+    "find_misfits",
+    "misfit_findings",
+    "settled",
+    "take_sample",
+    "trials",
+]
 
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
 _NUMBERS = 2**24  # of the regressor in them
@@ -109,7 +119,7 @@ def find_misfits(identification: "Identification") -> tuple[Misfit, ...]:
     Args:
         identification: What was found.
     """
-    sample = _take_sample(identification)
+    sample = take_sample(identification)
     if sample is None:
         return ()
     found = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
@@ -154,13 +164,14 @@ def _explains(term: Finding, guess: Finding) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sample:
+class Sample:
     """Rows of the recordings, each joint's over its usual residual, 0 where they are not used.
 
     Attributes:
         joints: Names of the n joints.
         slides: Which of them slide, shape (n,), bool.
         motions: How each joint moves in the N rows.
+        at: The motions of the recordings, those rows alone.
         weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
         torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
         stretches: Which rows each of the K stretches has, those of the logs kept apart last.
@@ -175,6 +186,7 @@ class _Sample:
     joints: tuple[str, ...]
     slides: Array
     motions: tuple[JointMotion, ...]
+    at: tuple[Trajectory, ...]
     weight: Array
     torque: Array
     stretches: tuple[slice, ...]
@@ -186,8 +198,12 @@ class _Sample:
     B: Array
 
 
-def _take_sample(identification: "Identification") -> _Sample | None:
-    """Return rows spread over the recordings; None if there are too few to judge by."""
+def take_sample(identification: "Identification") -> Sample | None:
+    """Return rows spread over the recordings; None if there are too few to judge by.
+
+    Args:
+        identification: What was found.
+    """
     model, mapping = identification.model, identification.mapping
     kept = [e for e in identification.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, identification.fitted, kept)
@@ -214,10 +230,11 @@ def _take_sample(identification: "Identification") -> _Sample | None:
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
     r = weight * r
     by_stretch = [(W[k].reshape(-1, len(mapping.K)), r[k].ravel()) for k in stretches]
-    return _Sample(
+    return Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
         motions=_joint_motions([e.recording.trajectory for e, _ in parts], rows, load, model),
+        at=tuple(motion),
         weight=weight,
         torque=np.sum((weight * tau)[:own] ** 2, axis=0),
         stretches=stretches,
@@ -334,7 +351,7 @@ def _travelled(motion: Trajectory) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
+class Trial:
     """What columns Z of a joint, beside the base parameters, leave of its residual.
 
     Attributes:
@@ -346,13 +363,21 @@ class _Trial:
     H: Array
 
     def parameters(self, which: Sequence[int]) -> Array:
-        """Return the parameters of some columns, shape (..., k)."""
+        """Return the parameters of some columns, shape (..., k).
+
+        Args:
+            which: The k columns.
+        """
         square = self.S[..., which, :][..., which]
         theta: Array = np.linalg.solve(square, self.S[..., which, -1:])[..., 0]
         return theta
 
     def left(self, which: Sequence[int]) -> Array:
-        """Return the squared residual of each stretch with some columns fitted, shape (K,)."""
+        """Return the squared residual of each stretch with some columns fitted, shape (K,).
+
+        Args:
+            which: The columns.
+        """
         if not which:
             alone: Array = self.H[:, -1, -1]
             return alone
@@ -363,31 +388,44 @@ class _Trial:
         return left
 
 
-def _trials(sample: _Sample, j: int, Z: Array) -> tuple[_Trial, _Trial]:
-    """Return trials of columns (N, c): fitted without the stretch that judges, and to all."""
-    X = np.column_stack([sample.weight[:, [j]] * Z, sample.r[:, j]])
-    W, A = sample.W[:, j], sample.A
-    D = np.array([X[k].T @ X[k] for k in sample.stretches])  # (K, c + 1, c + 1)
-    B = np.array([W[k].T @ X[k] for k in sample.stretches])  # (K, b, c + 1)
+def trials(sample: Sample, joints: slice, Z: Array) -> tuple[Trial, Trial]:
+    """Return trials of columns: fitted without the stretch that judges, and to all.
+
+    Args:
+        sample: The rows.
+        joints: Which m joints are looked at.
+        Z: What sizes of 1 add to their torques, shape (N, m, c).
+    """
+    X = np.concatenate([sample.weight[:, joints, None] * Z, sample.r[:, joints, None]], axis=2)
+    every_X = [X[k].reshape(-1, X.shape[2]) for k in sample.stretches]
+    every_W = [
+        sample.W[k, joints].reshape(len(x), -1)
+        for k, x in zip(sample.stretches, every_X, strict=True)
+    ]
+    A = sample.A
+    D = np.array([x.T @ x for x in every_X])  # (K, c + 1, c + 1)
+    B = np.array([w.T @ x for w, x in zip(every_W, every_X, strict=True)])  # (K, b, c + 1)
     B[:, :, -1] = sample.B  # other joints know of the base parameters, too
     is_fitted = np.arange(len(D)) < sample.fitted
 
-    def trial(used: Array) -> _Trial:
+    def trial(used: Array) -> Trial:
         D_fit, B_fit, A_fit = (np.tensordot(used, x, axes=1) for x in (D, B, A))
         T = np.linalg.solve(A_fit + np.eye(A.shape[-1]), B_fit)  # (..., b, c + 1)
         S = D_fit - B_fit.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
         still = D_fit[..., c, c] == 0  # a column of a joint that does not move
         S[..., c, c] += np.where(still, 1.0, _RIDGE * D_fit[..., c, c])
-        every_T = np.broadcast_to(T, B.shape)
-        E = [X[k] - W[k] @ T_k for k, T_k in zip(sample.stretches, every_T, strict=True)]
-        return _Trial(S, np.array([E_k.T @ E_k for E_k in E]))
+        E = [
+            x - w @ T_k
+            for x, w, T_k in zip(every_X, every_W, np.broadcast_to(T, B.shape), strict=True)
+        ]
+        return Trial(S, np.array([E_k.T @ E_k for E_k in E]))
 
     apart = is_fitted & ~np.eye(len(D), dtype=bool)  # (K, K): what judges row k is fitted to
     return trial(apart.astype(float)), trial(is_fitted.astype(float))
 
 
-def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
+def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     """Yield the terms that a joint's drive lacks, one after the other."""
     motion = sample.motions[j]
     if not sample.weight[: sample.rows, j].any():
@@ -399,7 +437,7 @@ def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
         candidate: list(range(end - x.shape[1], end))
         for candidate, x, end in zip(own, columns, ends, strict=True)
     }
-    apart, whole = _trials(sample, j, np.hstack(columns))
+    apart, whole = trials(sample, slice(j, j + 1), np.hstack(columns)[:, None])
     chosen: list[int] = []
     total = before = apart.left([])
     error = float(np.sqrt(total[: sample.fitted].sum() / sample.torque[j]))
@@ -420,7 +458,7 @@ def _of_joint(sample: _Sample, j: int) -> Iterator[Misfit]:
                 joint=sample.joints[j],
                 term=best,
                 share=share,
-                chance=_chance(before, left[best], sample.fitted),
+                chance=chance(before, left[best], sample.fitted),
                 confirmed=float((kept[1] - kept[2]) / kept[0]) if kept[0] > 0 else None,
                 size=size,
                 std_error=std_error,
@@ -444,17 +482,22 @@ def _best(
     sure = {
         candidate: gain
         for candidate, gain in gains.items()
-        if gain > _LEAST and _chance(before, left[candidate], fitted) < _CHANCE
+        if gain > _LEAST and chance(before, left[candidate], fitted) < _CHANCE
     }
     alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
 
 
-def _chance(before: Array, after: Array, fitted: int) -> float:
+def chance(before: Array, after: Array, fitted: int) -> float:
     """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
 
     By Student's test of the shares, each between -1 and 1, of the fitted logs' stretches or of all,
     whichever is surer.
+
+    Args:
+        before: Squared residual of each stretch, shape (K,).
+        after: The same with the term.
+        fitted: How many of the stretches are of fitted logs.
     """
     gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
     chances = [
@@ -465,7 +508,7 @@ def _chance(before: Array, after: Array, fitted: int) -> float:
 
 
 def _size(
-    sample: _Sample, j: int, term: Candidate, whole: _Trial, before: list[int], new: list[int]
+    sample: Sample, j: int, term: Candidate, whole: Trial, before: list[int], new: list[int]
 ) -> tuple[float, float, str]:
     """Return the size of a term beside those found before, its standard error and unit.
 

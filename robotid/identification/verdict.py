@@ -39,8 +39,7 @@ _SMALL = 5.0  # [%] of the torque: a term that a drive lacks leaves no doubt bel
 #: Warnings that make a result doubtful, in words that a verdict can hold. A word in braces is a
 #: figure of the evidence.
 _WORDS = {
-    "angle_scale": "the angles may be in another scale: divided by 1 + {fault:.3f} they leave "
-    "{share_pct:.0f} % less",
+    "angle_scale": "positions fit best times another factor",
     "bound_binds": "the data, or the masses that it leaves, speak against a stated bound",
     "com_outside": "its centre of mass lies {outside:.2g} m outside its geometry: no such body",
     "clipped": "the torque is clipped at a limit",
@@ -55,6 +54,7 @@ _WORDS = {
     "held_torque": "the torque is held for {rows:.0f} rows at a time, so it is late and stepped",
     "gyration": "its mass lies {gyration:.2g} m from its centre on average, its geometry ends at "
     "{farthest:.2g} m: no body can be so",
+    "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
@@ -63,11 +63,11 @@ _WORDS = {
     "position_order": "the position may be that of another joint",
     "position_sign": "the position may have the opposite sign",
     "solvers_differ": "two solvers found different parameters",
+    "time_scale": "inertia and gravity contradict each other: the time stamps, or the size of "
+    "gravity, may be wrong",
     "torque_delay": "the torque is late against the position by {delay:.3f} s",
     "torque_order": "the torque may be that of another joint",
-    "time_scale": "the clock may run in another scale: time divided by 1 + {fault:.3f} leaves "
-    "{share_pct:.0f} % less",
-    "torque_scale": "the torque may be in another scale than the other joints', by 1 + {fault:.2f}",
+    "torque_scale": "the torque is in another scale than those of the other joints",
     "torque_sign": "the torque may have the opposite sign",
     "unexplained_torque": "much of the torque fits neither gravity, inertia nor friction",
     "unsigned_torque": "the torque may be a size without its sign",
@@ -95,7 +95,8 @@ _OF_RESULTS = ("total_mass",)  # errors that a result alone can show
 _NAMED = 8  # parameters that a reason names
 _HYPOTHESES = ("current_for_torque", "unexplained_torque", "urdf_mismatch")
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
-_OF_THE_FIT = ("estimator", "recordings", "standard_parameters")  # places that are no recording
+# places that are no recording
+_OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,248 @@
+"""What recordings or URDF have otherwise than stated: zeros, scales, the clock, where joints lie.
+
+A robot of other masses could imitate none of these for long: each changes the torque tau(q, v, a)
+that the estimate gives in its own way. To first order, in all joints together,
+
+    tau_measured - tau = W delta + Z x + e,    Z = d tau / d x,
+
+where W delta is what other base parameters may do, and x is refitted without one stretch of the
+recordings after the other (``misfit``). x is the size of what is otherwise, with its own error.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.findings import Finding, listed
+from robotid.identification.misfit import Sample, Trial, chance, take_sample, trials
+from robotid.logs.data import Trajectory
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = ["discrepancy_findings"]
+
+_STEP = 1e-5  # of a derivative [-, rad or m]
+_MOST = 3  # that are named of a result
+_CHANCE = 3e-4  # that one is named which is not there, each time that one is tried
+_LEAST = 0.1  # share of the squared residual from which one is named
+_ALIKE = 0.02  # of the squared residual, within which two explain alike: the simpler is named
+_CONFIRMED = 0.25  # of that share, that recordings kept apart must show of it
+_SURE = 5.0  # standard errors that its size is from nothing
+
+
+@dataclass(frozen=True, eq=False)
+class _Alteration:
+    """Something that may be otherwise than stated, with sizes x of which 0 is as stated.
+
+    Attributes:
+        code: Code of the finding.
+        where: Joint that it is about; empty for all of them.
+        Z: Torque that a size of 1 adds, shape (N, n, c).
+        least: Smallest size that changes a result.
+        words: Returns the finding's sentence of sizes (c,) and their standard errors (c,).
+    """
+
+    code: str
+    where: str
+    Z: Array
+    least: float
+    words: Callable[[Array, Array], str]
+
+
+def discrepancy_findings(identification: "Identification") -> list[Finding]:
+    """Return warnings of what recordings or URDF have otherwise than stated.
+
+    Args:
+        identification: What was found.
+
+    Returns:
+        Findings "position_offset", "angle_scale", "torque_scale", "time_scale", "gravity" and
+        "joint_origin", what explains most of the residual first.
+    """
+    sample = take_sample(identification)
+    if sample is None:
+        return []
+    own = list(_alterations(identification.model, identification.standard, sample))
+    return list(_found(sample, own))
+
+
+def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
+    """Yield what may be otherwise, with what it would do to the torques of the sample."""
+    n, size = len(model.joints), model.layout.n_inertial
+    bodies = np.where(np.arange(len(pi)) < size, pi, 0.0)
+    tau = _torques(model, pi, sample)
+
+    def moved(scale: Array, shift: Array) -> Array:
+        """Return what positions (1 + e scale) q + e shift would change, over e."""
+        factor = 1.0 + _STEP * scale
+        change = [
+            replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
+            for m in sample.at
+        ]
+        return (_torques(model, pi, replace(sample, at=tuple(change))) - tau)[..., None] / _STEP
+
+    for j, joint in enumerate(model.joints):
+        only, none = np.eye(n)[j], np.zeros(n)
+        unit = "m" if joint in model.layout.prismatic else "rad"
+        yield _Alteration("position_offset", joint, moved(none, only), 0.01, _zero(joint, unit))
+        yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
+        yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
+    every = moved(np.ones(n), np.zeros(n))
+    yield _Alteration("angle_scale", "", every, 0.02, _scale("every position"))
+    still = tuple(replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at)
+    inertial = _torques(model, bodies, sample) - _torques(model, bodies, replace(sample, at=still))
+    yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
+    down = np.array(model.pin_model.gravity.linear)
+    if down.any():
+        across = np.linalg.svd(down[None])[2][1:]  # two directions at right angles to gravity
+        pulls = [_torques(_pulled(model, axis), pi, sample) - tau for axis in across]
+        Z = np.linalg.norm(down) * np.stack(pulls, axis=-1) / _STEP
+        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down))
+    origins = [_origins(model, pi, sample, joint, tau) for joint in model.joints]
+    for joint, Z in zip(model.joints, origins, strict=True):
+        yield _Alteration("joint_origin", joint, Z, 0.01, _origin(joint))
+    yield _Alteration("joint_origin", "", np.concatenate(origins, axis=2), 0.01, _origin("a joint"))
+
+
+def _origins(model: RobotModel, pi: Array, sample: Sample, joint: str, tau: Array) -> Array:
+    """Return what moving a joint in the frame of the one before would change, shape (N, n, 3)."""
+    moved = [_torques(_displaced(model, joint, axis), pi, sample) for axis in np.eye(3)]
+    return (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+
+
+def _torques(model: RobotModel, pi: Array, sample: Sample) -> Array:
+    """Return the torques of the motions by standard parameters, shape (N, n)."""
+    return np.concatenate([_torque(model, pi, m) for m in sample.at])
+
+
+def _torque(model: RobotModel, pi: Array, m: Trajectory) -> Array:
+    Y = joint_torque_regressor(model, m.q, m.v, m.a, m.direction)
+    torque: Array = (Y @ pi).reshape(len(m.t), model.n_rows)
+    return torque
+
+
+def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:
+    """Return the robot with the origin of a joint moved a little along an axis of its parent."""
+    pin_model = model.pin_model.copy()
+    placement = pin_model.jointPlacements[pin_model.getJointId(joint)]
+    placement.translation = placement.translation + _STEP * axis
+    return replace(model, pin_model=pin_model)
+
+
+def _pulled(model: RobotModel, axis: Array) -> RobotModel:
+    """Return the robot with a little gravity more along an axis."""
+    pin_model = model.pin_model.copy()
+    pin_model.gravity.linear = pin_model.gravity.linear + _STEP * axis
+    return replace(model, pin_model=pin_model)
+
+
+def _found(sample: Sample, own: Sequence[_Alteration]) -> Iterator[Finding]:
+    """Yield what explains the residual, one after the other, beside what was found before."""
+    Z = np.concatenate([alteration.Z for alteration in own], axis=2)
+    ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
+    place = [list(range(end - a.Z.shape[2], end)) for a, end in zip(own, ends, strict=True)]
+    apart, whole = trials(sample, slice(None), Z)
+    chosen: list[int] = []
+    total = before = apart.left([])
+    untried = dict(zip(own, place, strict=True))
+    for _ in range(_MOST):
+        left = {one: apart.left([*chosen, *which]) for one, which in untried.items()}
+        least = min(float(x[: sample.fitted].sum()) for x in left.values())
+        bound = least + _ALIKE * total[: sample.fitted].sum()
+        alike = [one for one, x in left.items() if x[: sample.fitted].sum() <= bound]
+        best = min(alike, key=lambda one: (one.Z.shape[2], left[one][: sample.fitted].sum()))
+        gain, after = before - left[best], left[best]
+        share = float(gain[: sample.fitted].sum() / total[: sample.fitted].sum())
+        kept = gain[sample.fitted :].sum() / max(total[sample.fitted :].sum(), 1e-300)
+        is_confirmed = len(gain) == sample.fitted or kept > _CONFIRMED * share
+        by_chance = chance(before, after, sample.fitted)
+        if share < _LEAST or by_chance > _CHANCE or not is_confirmed:
+            return
+        which = untried.pop(best)
+        chosen, before = [*chosen, *which], after
+        size, error = (x[-len(which) :] for x in _sizes(whole, chosen, sample.fitted))
+        if np.linalg.norm(size) < max(best.least, _SURE * float(np.linalg.norm(error))):
+            return
+        yield _finding(best, size, error, share, [one for one in alike if one is not best])
+
+
+def _sizes(whole: Trial, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
+    """Return sizes and their standard errors, from how the scores of stretches scatter."""
+    x, S = whole.parameters(which), whole.S[which][:, which]
+    H = whole.H[:fitted, which]
+    scores = H[:, :, -1] - H[:, :, which] @ x  # (K, k)
+    inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
+    return x, np.sqrt(few * np.diag(inverse @ (scores.T @ scores) @ inverse))
+
+
+def _finding(
+    found: _Alteration, size: Array, error: Array, share: float, alike: Sequence[_Alteration]
+) -> Finding:
+    others = [f"{one.code} of {one.where}" for one in alike if one.where]
+    also = f"; {listed(others)} would explain as much" if others else ""
+    message = (
+        f"{found.words(size, error)}. This explains {100 * share:.0f} % of the squared residual, "
+        f"which other masses and friction do not{also}"
+    )
+    evidence = {
+        "size": float(size[0] if len(size) == 1 else np.linalg.norm(size)),
+        "std_error": float(np.linalg.norm(error)),
+        "share_pct": 100 * share,
+    }
+    return Finding(found.code, "warning", found.where or "all joints", message, evidence)
+
+
+def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: the zero of its position is off by {-x[0]:.3g} +- {error[0]:.2g} {unit}: "
+        f"correct q_{joint}, or the joint's origin in the URDF"
+    )
+
+
+def _scale(what: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{what} fits best times {1 + x[0]:.3f} +- {error[0]:.2g}: check the unit, the gear ratio "
+        "and the counts per turn"
+    )
+
+
+def _gain(joint: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its torque is about {1 + x[0]:.2f} (+- {error[0]:.1g}) times what those of the "
+        f"other joints imply: check its gain and gear ratio (--gain {joint}=...)"
+    )
+
+
+def _clock(x: Array, error: Array) -> str:
+    return (
+        f"inertial torques are {1 + x[0]:.3f} +- {error[0]:.2g} times what gravity implies: the "
+        f"time stamps run {np.sqrt(max(1 + x[0], 0.0)):.3f} times as fast as the clock, or gravity "
+        "is stated wrongly"
+    )
+
+
+def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
+    def words(x: Array, error: Array) -> str:
+        turned = down + np.linalg.norm(down) * x @ across
+        turned *= np.linalg.norm(down) / np.linalg.norm(turned)
+        angle, sure = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
+        shown = ", ".join(f"{value:.2f}" for value in turned)
+        return (
+            f"gravity is tilted by about {angle:.2g} +- {sure:.1g} degrees from what is stated: if "
+            f"the base is not level, state gravity = [{shown}] in the job file"
+        )
+
+    return words
+
+
+def _origin(joint: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint} seems to lie {np.linalg.norm(x):.2g} +- {np.linalg.norm(error):.1g} m from where "
+        "the URDF has it: check that the URDF is of this robot"
+    )

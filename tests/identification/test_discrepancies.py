@@ -1,0 +1,106 @@
+"""Zeros, scales, a clock and joints that are stated wrongly are named with their size."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.misfits import EFFECTS, log_with
+from helpers.paths import ROOT
+
+from robotid.identification.discrepancies import discrepancy_findings
+from robotid.identification.pipeline import identify
+from robotid.logs.data import Log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+sys.path.append(str(ROOT / "benchmarks"))
+from verdict_cases import ROBOTS, build, measured, move
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+
+
+def found(model, change, robot="ur5_robot.urdf", turn=None):
+    """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
+    arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,), turn=turn), []
+    for part in (0, 1):
+        run = move(arm.model, np.random.default_rng([3, part]), 100.0, 25.0)
+        run = replace(run, tau=arm.rigid(run) + arm.drives(run))
+        run = measured(run, "usual", np.random.default_rng([4, part]))
+        log = Log(run.t, run.q, run.tau, model.joints, run.v, path=f"run{part}.csv")
+        logs.append(change(log))
+    identification = identify(model, logs[:1], validation=logs[1:], doctor=False)
+    findings = discrepancy_findings(identification)
+    doubted = {doubt.code for doubt in identification.doubts}
+    assert {finding.code for finding in findings} <= doubted
+    return findings
+
+
+def times(log, **factors):
+    """Return the log with channels multiplied."""
+    return replace(log, **{name: factor * getattr(log, name) for name, factor in factors.items()})
+
+
+def on(model, joint, value, elsewhere):
+    return np.where(np.array(model.joints) == joint, value, elsewhere)
+
+
+def test_nothing_is_said_of_a_robot_that_only_weighs_differently(model):
+    assert found(model, lambda log: log) == []
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
+    logs = [log_with(model, 3, effect, part=part) for part in (0, 1)]
+    assert discrepancy_findings(identify(model, logs[:1], validation=logs[1:], doctor=False)) == []
+
+
+# sizes are of first order: those of large faults are off by a quarter
+@pytest.mark.parametrize(
+    ("change", "code", "where", "size", "words"),
+    [
+        (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.1, 0.0)),
+         "position_offset", "elbow_joint", -0.1, "zero of its position is off by 0.09"),
+        (lambda log, one: replace(log, q=1.1 * log.q, v=None),
+         "angle_scale", "all joints", 1 / 1.1 - 1, "every position fits best times 0.9"),
+        (lambda log, one: replace(log, q=log.q * one("elbow_joint", 1.2, 1.0), v=None),
+         "angle_scale", "elbow_joint", 1 / 1.2 - 1, "q_elbow_joint fits best times 0.8"),
+        (lambda log, one: replace(log, tau=log.tau * one("elbow_joint", 1.3, 1.0)),
+         "torque_scale", "elbow_joint", 0.3, "about 1."),
+        (lambda log, one: replace(times(log, t=1.1), v=None),
+         "time_scale", "all joints", 1.1**2 - 1, "time stamps run 1."),
+    ],
+)  # fmt: skip
+def test_what_is_stated_wrongly_is_named_with_its_size(model, change, code, where, size, words):
+    first = found(model, lambda log: change(log, lambda *args: on(model, *args)))[0]
+    assert (first.code, first.where, first.severity) == (code, where, "warning")
+    assert first.evidence["size"] == pytest.approx(size, rel=0.25)
+    assert words in first.message
+
+
+def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
+    text = example_urdf("ur5_robot.urdf").read_text()
+    start = text.index('<joint name="elbow_joint"')
+    origin = text.index("<origin", start)
+    end = text.index("/>", origin)
+    path = tmp_path / "longer.urdf"
+    was = text[origin:end]
+    xyz = was.split('xyz="')[1].split('"')[0].split()
+    longer = was.replace(" ".join(xyz), " ".join([*xyz[:2], str(float(xyz[2]) + 0.05)]))
+    path.write_text(text[:origin] + longer + text[end:])
+    first = found(model, lambda log: log, robot=path)[0]
+    assert (first.code, first.where) == ("joint_origin", "elbow_joint")
+    assert first.evidence["size"] == pytest.approx(0.05, rel=0.25)
+
+
+def test_a_base_that_is_not_level_is_named(model):
+    turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
+    first = found(model, lambda log: log, turn=turn)[0]
+    assert (first.code, first.where) == ("gravity", "all joints")
+    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.1)
+    stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
+    np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)

@@ -1,0 +1,62 @@
+"""The simulator and the faults of the table of verdicts are what they are said to be."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.parameters import pseudo_inertia
+
+sys.path.append(str(ROOT / "benchmarks"))
+from verdict_cases import CASES, ROBOTS, build, make, move
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return build(ROBOTS["ur5"], (0, 1))
+
+
+@pytest.mark.parametrize("name", ["ur5", "kinova j2s6", "tiago", "planar 2R"])
+def test_the_simulated_torque_is_linear_in_the_true_parameters(name):
+    arm = build(ROBOTS[name], (0, 2))
+    run = move(arm.model, np.random.default_rng(3), 100.0, 2.0)
+    run = replace(run, v=np.where(np.abs(run.v) < 0.02, 0.02, run.v))  # where tanh is the sign
+    W = joint_torque_regressor(arm.model, run.q, run.v, run.a)
+    expected = (W @ arm.pi).reshape(run.q.shape)
+    np.testing.assert_allclose(arm.rigid(run) + arm.drives(run), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_true_robots_are_possible_and_move_within_their_limits(name):
+    arm = build(ROBOTS[name], (0, 4), is_far=True)
+    J = pseudo_inertia(arm.pi[: arm.model.layout.n_inertial])
+    assert (np.linalg.eigvalsh(J) > 0).all()
+    run = move(arm.model, np.random.default_rng(5), 100.0, 30.0)
+    for j, joint in enumerate(arm.model.limits):
+        if joint.has_limits:
+            assert joint.lower <= run.q[:, j].min()
+            assert run.q[:, j].max() <= joint.upper
+        assert np.abs(run.v[:, j]).max() <= joint.velocity or joint.velocity <= 0
+    np.testing.assert_allclose(np.gradient(run.q, run.t, axis=0)[1:-1], run.v[1:-1], atol=0.02)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("clean")])
+def test_a_fault_changes_what_is_recorded(name, tmp_path):
+    case = CASES[name]
+    found = make(ROBOTS["ur5"], case, (0, 6), tmp_path)
+    clean = make(ROBOTS["ur5"], CASES["clean"], (0, 6), tmp_path)
+    same = [
+        kind.keys() == right.keys() and all(np.array_equal(kind[k], right[k]) for k in kind)
+        for kind, right in ((found.fitted, clean.fitted), (found.kept, clean.kept))
+    ]
+    assert not all(same) or found.urdf != clean.urdf
+
+
+def test_the_same_seed_gives_the_same_recording(tmp_path):
+    one, other = (make(ROBOTS["planar 2R"], CASES["clean"], (7, 8), tmp_path) for _ in range(2))
+    assert all(np.array_equal(one.fitted[k], other.fitted[k]) for k in one.fitted)
+    another = make(ROBOTS["planar 2R"], CASES["clean"], (8, 8), tmp_path)
+    assert not np.array_equal(one.fitted["tau_joint_1"][:9], another.fitted["tau_joint_1"][:9])
