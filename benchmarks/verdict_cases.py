@@ -611,13 +611,13 @@ CASES = {
     "gaps of 0.5 and 1 s": Case(FINE, ("gap",), record=gaps),
     # the wrong robot
     "hand of the URDF not mounted": Case(
-        FINE, ("payload", "urdf_mismatch"), world="hand"
+        FINE, ("unmounted_part", "payload", "urdf_mismatch"), world="hand"
     ),
     "1 kg in the fitted log": Case(
-        NOT_GOOD, ("payload", "urdf_mismatch"), loads=(True, False)
+        NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(True, False)
     ),
     "1 kg in the kept log": Case(
-        NOT_GOOD, ("payload", "urdf_mismatch"), loads=(False, True)
+        NOT_GOOD, ("payload", "payload_change", "urdf_mismatch"), loads=(False, True)
     ),
     "1 kg in both": Case(FINE, loads=(True, True)),
     "URDF of another size": Case(
