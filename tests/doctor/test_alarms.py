@@ -59,7 +59,7 @@ def test_torques_of_a_gravity_compensated_channel_are_named(name):
     weightless, model = robot(name, gravity=(0.0, 0.0, 0.0)), robot(name)
     findings = diagnose(model, [clean_log(weightless, 0)], [], SIGNALS)
     (found,) = [f for f in findings if f.severity == "error"]
-    assert found.code == "gravity"
+    assert found.code == "gravity_compensated"
     assert "the torques hold no gravity" in found.message
 
 
