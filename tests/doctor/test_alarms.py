@@ -45,7 +45,8 @@ def test_a_late_torque_of_a_short_log_is_found_and_what_it_takes_away_is_said(ur
     (found,) = [f for f in diagnose(ur5, [log], [], SIGNALS) if f.code == "torque_delay"]
     assert found.severity == "warning"
     assert found.evidence["delay"] == pytest.approx(0.03, abs=3 * found.evidence["std_error"])
-    assert found.evidence["gain"] > 0.5
+    # of stretches that the delay was not found in, whose friction physics leaves too
+    assert found.evidence["gain"] > 0.3
 
 
 def test_a_clean_log_of_a_light_arm_at_30_hertz_raises_no_alarm():
