@@ -25,7 +25,7 @@ _HALVINGS = 40
 _ROOM = 0.1  # share of the prior's pseudo-inertias that the first point has at least
 _INSIDE = 0.9  # share of the way to where a penalty is infinite that a step goes at most
 _NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
-_FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
+_FLOOR = 1e-6  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
 
 
@@ -213,7 +213,8 @@ class Programme:
         A, r = A.reshape(n, size, -1), r.reshape(n, size)
         rows, p = np.maximum(factors.rows, 1), A.shape[2]
         torque = np.sqrt(factors.torque_squares() / rows)
-        least = np.minimum(sigma, _FLOOR * np.where(torque > 0, torque, 1.0))
+        least = _FLOOR * np.where(torque > 0, torque, 1.0)
+        sigma = np.maximum(sigma, least)
         for _ in range(_NOISE_STEPS):
             root = (np.sqrt(share) / sigma)[:, None, None]
             stacked = np.vstack([(A * root).reshape(-1, p), np.sqrt(weight) * np.eye(p)])

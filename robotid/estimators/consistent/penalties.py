@@ -5,6 +5,7 @@ Each penalty is about |delta / sigma|^2 near the prior, so that one weight means
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -30,6 +31,7 @@ __all__ = [
 ]
 
 METRICS = ("euclidean", "entropic", "riemannian")
+_SINGULAR = 1e-12  # ratio of the axes of a body, squared, below which it is singular
 _THINNEST = 0.01  # a prior's pseudo-inertia is not thinner than that, relative to its body's size
 
 
@@ -155,13 +157,11 @@ class _Entropic(Penalty):
     held: Array
 
     def value(self, pi: Array) -> float:
-        J, P = self._rest(pi), self._rest(self.centre)
-        if np.linalg.eigvalsh(J)[:, 0].min() <= 0:
+        values = np.linalg.eigvalsh(self._ratio(pi))  # of P^-1 J
+        if (values[:, 0] <= _SINGULAR * np.maximum(values[:, 3], 1.0)).any():
             return float("inf")
-        ratio = np.linalg.solve(P, J)
-        trace = np.trace(ratio, axis1=1, axis2=2)
-        divergence = trace - np.linalg.slogdet(ratio)[1] - 4.0
-        return float(2.0 * divergence.sum() + self.precision @ self._drives(pi) ** 2)
+        divergence = (values - np.log(values) - 1.0).sum()
+        return float(2.0 * divergence + self.precision @ self._drives(pi) ** 2)
 
     def gradient(self, pi: Array) -> Array:
         J, P = self._rest(pi), self._rest(self.centre)
@@ -170,18 +170,25 @@ class _Entropic(Penalty):
         return np.concatenate([inertial, 2.0 * self.precision * self._drives(pi)])
 
     def root(self, pi: Array) -> Array:
-        S: Array = scipy.linalg.block_diag(
-            *metric_root(self._rest(pi)), np.diag(np.sqrt(self.precision))
-        )
+        L = self._prior_factor @ np.linalg.cholesky(self._ratio(pi))
+        S: Array = scipy.linalg.block_diag(*metric_root(L), np.diag(np.sqrt(self.precision)))
         return S
 
     def reach(self, pi: Array, step: Array) -> float:
-        U = np.linalg.cholesky(self._rest(pi))
-        D = pseudo_inertia(step[: len(self.held)])
-        # J + s D is positive definite while 1 + s eig(U^-1 D U^-T) > 0
-        whitened = np.linalg.solve(U, np.linalg.solve(U, D).transpose(0, 2, 1))
-        lowest = float(np.linalg.eigvalsh(whitened)[:, 0].min())
+        L = self._prior_factor @ np.linalg.cholesky(self._ratio(pi))
+        # J + s D is positive definite while 1 + s eig(L^-1 D L^-T) > 0
+        D = _whitened(pseudo_inertia(step[: len(self.held)]), L)
+        lowest = float(np.linalg.eigvalsh(D)[:, 0].min())
         return -1.0 / lowest if lowest < 0 else float("inf")
+
+    @cached_property
+    def _prior_factor(self) -> Array:
+        """The factors L of the priors P = L L^T of the bodies."""
+        return np.linalg.cholesky(self._rest(self.centre))
+
+    def _ratio(self, pi: Array) -> Array:
+        """Return L^-1 J L^-T of each body: free of units, 1 at the prior P = L L^T."""
+        return _whitened(self._rest(pi), self._prior_factor)
 
     def _rest(self, pi: Array) -> Array:
         return pseudo_inertia(pi[: len(self.held)] - self.held)
@@ -237,22 +244,20 @@ def pull_back_metric(J: Array) -> Array:
     References:
         Lee, Wensing, Park (2019), as of ``make_penalty``, (22).
     """
-    S = metric_root(J)
+    S = metric_root(np.linalg.cholesky(J))
     metric: Array = S.transpose(0, 2, 1) @ S
     return metric
 
 
-def metric_root(J: Array) -> Array:
+def metric_root(L: Array) -> Array:
     """Return upper triangles S with S^T S the metric of ``pull_back_metric``, shape (n, 10, 10).
 
     With J = L L^T, g_kl = tr(C_k C_l) of the symmetric C_k = L^-1 B_k L^-T.
 
     Args:
-        J: Pseudo-inertias, shape (n, 4, 4), positive definite.
+        L: Factors of the pseudo-inertias, shape (n, 4, 4).
     """
-    L = np.linalg.cholesky(J)[:, None]
-    half = np.linalg.solve(L, pseudo_inertia_basis()[None])
-    C = np.linalg.solve(L, half.transpose(0, 1, 3, 2))  # (n, 10, 4, 4)
+    C = _whitened(pseudo_inertia_basis()[None], L[:, None])  # (n, 10, 4, 4)
     S: Array = np.asarray(np.linalg.qr(svec(C).transpose(0, 2, 1), mode="r"))
     return S
 
@@ -268,6 +273,13 @@ def body_units(spread: Array) -> Array:
     mass, radius = by_body[:, 0], by_body[:, 1] / by_body[:, 0]
     diagonal = np.column_stack([1 / radius] * 3 + [np.ones_like(mass)])
     return np.eye(4) * (diagonal / np.sqrt(mass)[:, None])[:, None, :]
+
+
+def _whitened(S: Array, L: Array) -> Array:
+    """Return L^-1 S L^-T of symmetric matrices."""
+    half = np.linalg.solve(L, S)
+    whitened: Array = np.linalg.solve(L, half.swapaxes(-1, -2))
+    return whitened
 
 
 def _widened(J: Array, shrink: Array) -> Array:

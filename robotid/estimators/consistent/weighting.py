@@ -87,7 +87,7 @@ def contradicted_extents(fit: Consistent, stretches: Sequence[Factors]) -> tuple
     except NotConvergedError:  # bodies run away: that contradicts no extent
         return ()
     G = cone.G / fit.prior_std
-    error = np.sqrt(np.einsum("ki,ij,kj->k", G, covariance, G))
+    error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", G, covariance, G), 0.0))
     beyond = G @ solution.x + cone.h < -_BEYOND * error
     outside = [label for label, is_out in zip(cone.labels, beyond, strict=True) if is_out]
     bodies = tuple(body for body in fit.layout.bodies if f"extent {body}" in outside)
