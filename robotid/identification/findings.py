@@ -182,7 +182,7 @@ def consistency_findings(identification: Identification) -> list[Finding]:
         )
         is_stated = bool(_stated(identification).intersection(bounds))
         severity = "warning" if against and is_stated else "note"
-        message = f"the bounds {bounds} bind: {why}"
+        message = f"the bounds {listed(bounds)} bind: {why}"
         findings.append(Finding("bound_binds", severity, ", ".join(bounds), message))
     gap = min(details.get("gaps", [0.0]))
     if gap > _SAME_OPTIMUM:
@@ -288,7 +288,7 @@ def _speaks_against(identification: Identification) -> str:
     ours, wls = (identification.metrics(name).per_joint for name in ("estimate", "wls"))
     costs = [joint for joint in ours if ours[joint].rmse > _COSTS * wls[joint].rmse]
     if costs:
-        return f"the data push against them at {costs}"
+        return f"the data push against them at {listed(costs)}"
     layout = identification.model.layout
     masses = identification.standard[: layout.n_inertial : 10]
     urdf = identification.model.standard_parameters()[: layout.n_inertial : 10]

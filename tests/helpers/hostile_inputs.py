@@ -21,6 +21,7 @@ import pyarrow.parquet
 import scipy.io
 from hypothesis import strategies as st
 
+from helpers.hostile_urdfs import run_urdf, urdf_inputs
 from helpers.paths import URDF as URDF_FOLDER
 from helpers.recorders import messages_of, write_bag1, write_bag2, write_mcap
 from helpers.synthetic import exact_log, truth
@@ -711,4 +712,5 @@ KINDS = {
     "job file": (jobs, (), run_job_file),
     "flags": (lambda: command_lines, (), run_flags),
     "result.json": (results, (), run_result),
+    "URDF": (urdf_inputs, (), run_urdf),
 }

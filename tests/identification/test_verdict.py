@@ -284,7 +284,7 @@ def test_a_stated_bound_that_binds_makes_it_usable(run):
     bound = "centre_of_mass forearm_link: the data, or the masses that it leaves, speak against"
     assert bound in str(result["verdict"])
     (finding,) = [f for f in result["warnings"] if f["code"] == "bound_binds"]
-    assert "the data push against them at ['shoulder_lift_joint'," in finding["message"]
+    assert "the data push against them at shoulder_lift_joint," in finding["message"]
 
 
 def test_a_stated_bound_that_only_the_urdf_minds_is_a_note(run):

@@ -141,10 +141,12 @@ def test_the_centres_of_mass_of_a_real_arm_stay_in_its_meshes(ur5, rng):
 
 
 def test_the_box_of_a_body_holds_its_geometry_or_its_frames_and_the_urdfs_own_body(tmp_path):
-    # BOX, and the cylinder of the flange: 0.6 x 0.4 x 1.1 m, grown by 5 % of its diagonal
+    # BOX, and the cylinder of the flange: 0.6 x 0.4 x 1.1 m, grown by 5 % of its diagonal; the
+    # URDF's own body, 2 kg 0.1 m up and 1 kg in the flange, reaches further down
     grown = 0.05 * np.linalg.norm([0.6, 0.4, 1.1])
+    own = 0.4 - np.sqrt(3 * (2 * 0.3**2 + 0.015 + 1 * 0.6**2 + 0.005) / 3)  # [kg m^2] over 3 kg
     low, high = body_boxes(arm(tmp_path, BOX, CYLINDER))["one"]
-    np.testing.assert_allclose(low, np.array([-0.3, -0.2, 0.0]) - grown, atol=2e-3)
+    np.testing.assert_allclose(low, [-0.3 - grown, -0.2 - grown, own], atol=2e-3)
     np.testing.assert_allclose(high, np.array([0.3, 0.2, 1.1]) + grown, atol=3e-3)
     # frames alone: the flange is 1 m up
     low, high = body_boxes(arm(tmp_path))["one"]

@@ -75,7 +75,7 @@ def test_an_interpreter_survives_the_command_lines_that_aborted_it(tmp_path):
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path
     )
-    assert run.stdout == "[1, 1, 1, 1]\n", run.stderr
+    assert run.stdout == "[2, 2, 2, 2]\n", run.stderr
     assert run.stderr.count("wanted") == 4
 
 

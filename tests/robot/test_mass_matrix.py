@@ -85,9 +85,14 @@ def test_the_second_solver_and_active_bounds_are_reported(ur5, rng):
     assert check["torque_difference"] < 1e-4
     assert abs(check["objective_difference"]) < 1e-5
     (finding,) = consistency_findings(found)
-    # no motion shows a single mass: only the URDF minds
+    # 9 kg find no room in the forearm's box; 3 kg do, and no motion shows a single mass
+    assert (finding.code, finding.severity) == ("bound_binds", "warning")
+    assert "bounds mass forearm_link bind: the data push against them at elbow" in finding.message
+    settings = EstimatorSettings(constraints={"mass": {"forearm_link": [3.0, 20.0]}})
+    found = identify(ur5, [log], signals=EXACT, estimator=settings)
+    (finding,) = consistency_findings(found)
     assert (finding.code, finding.severity) == ("bound_binds", "note")
-    assert "['mass forearm_link'] bind: the URDF's values lie beyond them" in finding.message
+    assert "bounds mass forearm_link bind: the URDF's values lie beyond them" in finding.message
 
 
 def test_a_second_solver_that_fails_is_reported_with_its_status(ur5, rng, monkeypatch):
