@@ -37,6 +37,7 @@ QUICK = (("ur5", "tiago"), ("clean", "clean, far from the URDF", "torque 20 ms l
          "all torques reversed", "two torque columns swapped", "degrees", "1 kg in the fitted log",
          "mounted on a wall", "all torques x 0.8"))  # fmt: skip
 
+OF_URDF = ("rounded_rpy",)  # true of the URDF, whatever was recorded
 UNCHECKED = "rests on the sensors alone"
 NOTE = re.compile(r"doctor: \w+: (?P<code>\w+): ")
 
@@ -73,7 +74,7 @@ class Answer:
     @property
     def is_alarm(self):
         """Whether a clean case was not called so."""
-        return not (self.is_right and set(self.codes) <= set(CASES[self.case].allowed))
+        return not (self.is_right and set(self.codes) <= {*CASES[self.case].allowed, *OF_URDF})
 
     @property
     def in_words(self):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.doctor.hypotheses import compensated
+from robotid.doctor.hypotheses import compensated, own_share
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
 
@@ -174,12 +174,17 @@ def _is_this_robot(model: LoadModel, chi: float, theta: Array) -> bool:
 
 
 def _holds_no_gravity(probe: Probe) -> bool:
-    """Return whether the torques fit the URDF, to their size as logged, if its gravity is added."""
+    """Return whether the torques fit the URDF if its gravity is added, and not as they are.
+
+    Both are judged alike: to the size of the torques as logged, without a load on the last link.
+    """
     if not probe.gravity.any():
         return False
-    whole, share = compensated(probe)
-    model = load_model(whole, share, probe.tau.std(axis=0))
-    return _is_this_robot(model, *model.fit(np.ones(len(share)))[:2])
+    readings = [(probe, own_share(probe)), compensated(probe)]
+    models = [load_model(reading, share, probe.tau.std(axis=0)) for reading, share in readings]
+    ones = np.ones(probe.tau.shape[1])
+    logged, mended = (_is_this_robot(model, *model.fit(ones)[:2]) for model in models)
+    return mended and not logged
 
 
 def _error_of_links(theta: Array) -> float:

@@ -11,6 +11,7 @@ from robotid._typing import Array
 __all__ = ["CANDIDATES", "Candidate", "JointMotion", "couplings"]
 
 _HARMONICS = 4  # of a torque that is periodic in the position
+_RIPPLES = range(5, 33)  # times a turn that it may repeat beyond; at 1.5 rad/s more pass 8 Hz
 _STRIBECK = (0.05, 0.2)  # of the usual speed, over which friction falls from its value at rest
 _PRESLIDING = (0.03, 0.15)  # of the usual speed, over which friction changes its sign
 _WINDUP = (0.02, 0.1)  # of the usual way between two reversals, on which a torque is taken up
@@ -93,6 +94,10 @@ def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
     return np.hstack([np.cos(angle), np.sin(angle)])
 
 
+def _ripple(m: JointMotion, count: int) -> Array:
+    return np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+
+
 def _windup(m: JointMotion) -> Array:
     way = m.travelled[:, None] / (np.array(_WINDUP) * _usual(m.travelled))
     taken_up = m.direction[:, None] * np.exp(-way)
@@ -164,6 +169,14 @@ CANDIDATES = (
         "drift", "drift", _drift,
         "friction or an offset that drifts with time (a drive that warms up)",
         "Warm the robot up before recording, or cut the log with start",
+    ),
+    *(
+        Candidate(
+            f"ripple {count}", "position_periodic", partial(_ripple, count=count),
+            f"a torque that repeats {count} times a turn (teeth of a gear, poles of a motor)",
+            turns=True,
+        )
+        for count in _RIPPLES
     ),
 )  # fmt: skip
 

@@ -93,7 +93,13 @@ _WORDS |= {
 DOUBTFUL = (*_WORDS, "repeated_motion")
 _OF_RESULTS = ("total_mass",)  # errors that a result alone can show
 _NAMED = 8  # parameters that a reason names
-_HYPOTHESES = ("current_for_torque", "unexplained_torque", "urdf_mismatch")
+_HYPOTHESES = (
+    "current_for_torque",
+    "gravity",
+    "gravity_compensated",
+    "unexplained_torque",
+    "urdf_mismatch",
+)
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
 # places that are no recording
 _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
@@ -280,9 +286,10 @@ def refuted(
 ) -> list[Finding]:
     """Return findings, hypotheses that a prediction of unseen motion refutes as notes.
 
-    That masses are not the URDF's, or that no physics explains a torque, is refuted where the
-    result predicts these torques of every kept recording within 5 %; another unit of the torque
-    if gravity as identified is also within a factor of two of the URDF's there.
+    That masses or the direction of gravity are not as stated, or that no physics explains a
+    torque, is refuted where the result predicts these torques of every kept recording within 5 %;
+    another unit of the torque, or an error that it holds no gravity, if gravity as identified is
+    also within a factor of two of the URDF's there.
 
     Args:
         findings: What was found.
@@ -301,10 +308,16 @@ def refuted(
         joints = named or [*errors]
         worst = max((errors[joint] for joint in joints), default=np.inf)
         is_refuted = finding.code in _HYPOTHESES and worst < _REFUTED
-        if finding.code == "current_for_torque":
+        if finding.where == "all joints":
+            is_refuted = False  # it was found in what the prediction leaves
+        elif finding.code == "current_for_torque":
             ratios = [witness.gravity[j] for j in joints if j in witness.gravity]
             is_refuted &= all(1 / _SCALED < ratio < _SCALED for ratio in ratios)
-        if is_refuted and finding.severity == "warning":
+        elif finding.code == "gravity_compensated":
+            is_refuted &= witness.scale is not None and 1 / _SCALED < witness.factor < _SCALED
+        elif finding.severity == "error":
+            is_refuted = False
+        if is_refuted:
             but = f"; but the result predicts unseen motion within {worst:.1f} %"
             finding = replace(finding, severity="note", message=f"{finding.message}{but}")
         found.append(finding)

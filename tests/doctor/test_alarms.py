@@ -45,7 +45,8 @@ def test_a_late_torque_of_a_short_log_is_found_and_what_it_takes_away_is_said(ur
     (found,) = [f for f in diagnose(ur5, [log], [], SIGNALS) if f.code == "torque_delay"]
     assert found.severity == "warning"
     assert found.evidence["delay"] == pytest.approx(0.03, abs=3 * found.evidence["std_error"])
-    assert found.evidence["gain"] > 0.5
+    # of stretches that the delay was not found in, whose friction physics leaves too
+    assert found.evidence["gain"] > 0.3
 
 
 def test_a_clean_log_of_a_light_arm_at_30_hertz_raises_no_alarm():
@@ -59,7 +60,7 @@ def test_torques_of_a_gravity_compensated_channel_are_named(name):
     weightless, model = robot(name, gravity=(0.0, 0.0, 0.0)), robot(name)
     findings = diagnose(model, [clean_log(weightless, 0)], [], SIGNALS)
     (found,) = [f for f in findings if f.severity == "error"]
-    assert found.code == "gravity"
+    assert found.code == "gravity_compensated"
     assert "the torques hold no gravity" in found.message
 
 

@@ -35,6 +35,10 @@ def _periodic(t, q, v, load, usual):
     return 0.15 * usual * (np.cos(3 * q + 0.4) + 0.7 * np.sin(4 * q))
 
 
+def _ripple(t, q, v, load, usual):
+    return 0.15 * usual * np.cos(13 * q + 0.4)
+
+
 def _spring(t, q, v, load, usual):
     return 0.3 * usual * (q - 0.2)
 
@@ -63,6 +67,7 @@ EFFECTS = {
     "saturating": Effect("friction_shape", _saturating),
     "load": Effect("load_friction", _load),
     "periodic": Effect("position_periodic", _periodic),
+    "ripple": Effect("position_periodic", _ripple),
     "spring": Effect("spring", _spring),
     "counterbalance": Effect("spring", _counterbalance),
     "windup": Effect("backlash", _windup),

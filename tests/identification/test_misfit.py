@@ -38,7 +38,7 @@ def rmse(found, joint):
 
 @pytest.mark.parametrize(
     ("effect", "joint"),
-    [("stribeck", 2), ("saturating", 0), ("load", 1), ("periodic", 3), ("spring", 2),
+    [("stribeck", 2), ("saturating", 0), ("load", 1), ("periodic", 3), ("ripple", 2), ("spring", 2),
      ("counterbalance", 4), ("windup", 1), ("drift", 5)],
 )  # fmt: skip
 def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, effect, joint):

@@ -370,6 +370,13 @@ def test_a_prediction_of_unseen_motion_refutes_hypotheses_on_masses_and_units():
     assert refuted_code("current_for_torque", 1.0, {"a": 0.1}) == "warning"  # 1 % of what unit?
     assert refuted_code("unexplained_torque", 9.0, where="run.csv: b") == "note"
     assert refuted_code("unexplained_torque", 9.0, where="run.csv: a") == "warning"
+    assert refuted_code("gravity", 1.0) == "note"
+    assert refuted_code("gravity", 1.0, where="all joints") == "warning"  # by what was left
+    no_gravity = finding("gravity_compensated", "run.csv", "error")
+    kept = {"val.csv": Metrics({"a": joint(1.0)}, 1.0)}
+    for factor, severity in ((1.3, "note"), (0.2, "error")):
+        witness = Witness(scale=factor, factor=factor)
+        assert refuted([no_gravity], kept, witness)[0].severity == severity
     seen = [finding("repeated_motion", "val.csv")]
     assert refuted_code("urdf_mismatch", 1.0, more=seen) == "warning"
 

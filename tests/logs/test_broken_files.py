@@ -12,9 +12,10 @@ import scipy.io
 
 from robotid.exceptions import DataError
 from robotid.logs.data import Log
+from robotid.logs.measured_velocity import velocity_lag
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process, velocity_lag
+from robotid.logs.signals import process
 
 T = np.arange(20) / 100
 Q = np.sin(T)
