@@ -37,7 +37,6 @@ _ROWS = 2000  # instants that are looked at
 _WINDOWS = 8  # stretches they are in, where the log has more of them
 _BLOCKS = 8  # parts of the log that are left out in turn
 _OVERSAMPLED = 8.0  # instants per period of the filter: products of motions are faster than they
-_UNFILTERED = 10.0  # [Hz] bandwidth that is taken for a motion without a filter
 # Cut-off of the comparison over the job's, and over the rate at most: noise that is interpolated
 # between rows would be smoothed there.
 _BAND = 1.5, 0.15
@@ -141,11 +140,13 @@ def check_torque_delay(
     """
     step = float(np.median(np.diff(log.t)))
     rate = min(1 / step, signals.rate or np.inf)
-    band, wide = (
-        replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
-        for times, most in (_BAND, _WIDE)
-    )
-    misfit = _misfit(model, smooth_motion(model, log, wide), band)
+    # the comparison is filtered even if the job is not: see _BAND
+    times, most = _BAND
+    cutoff = min(times * (signals.cutoff or np.inf), most * rate)
+    times, most = _WIDE
+    wide = replace(signals, cutoff=signals.cutoff and min(times * signals.cutoff, most * rate))
+    motion = smooth_motion(model, log, wide)
+    misfit = _misfit(model, motion, replace(signals, cutoff=cutoff), 1 / cutoff)
     if misfit is None:
         return
     delay, error, gain = misfit.delay(), misfit.error(), misfit.gain()
@@ -172,12 +173,14 @@ def check_torque_delay(
     yield log_finding(name, "torque_delay", "warning" if is_sure else "note", message, **evidence)
 
 
-def _misfit(model: RobotModel, motion: Trajectory, signals: SignalSettings) -> _Misfit | None:
+def _misfit(
+    model: RobotModel, motion: Trajectory, signals: SignalSettings, period: float
+) -> _Misfit | None:
     """Return the misfit of the joints that move enough, None if they are less than half of all."""
     step = float(np.median(np.diff(motion.t)))
-    every = max(1, int(1 / (step * _OVERSAMPLED * signals.cutoff))) if signals.cutoff else 1
+    every = max(1, int(period / (step * _OVERSAMPLED)))
     windows = [
-        _window(model, motion, part, step, every, signals)
+        _window(model, motion, part, step, every, signals, period)
         for part in _stretches(model, motion, every)
     ]
     joints = range(len(model.joints))
@@ -213,11 +216,10 @@ def _units(model: RobotModel) -> Array:
 
 def _window(
     model: RobotModel, motion: Trajectory, rows: Array, step: float, every: int,
-    signals: SignalSettings,
+    signals: SignalSettings, period: float,
 ) -> _Window:  # fmt: skip
     """Return the filtered columns at every so many of contiguous rows, but for their ends."""
     t, q, v, coarse = motion.t[rows], motion.q[rows], motion.v[rows] / _units(model), rows[::every]
-    period = 1.0 / (signals.cutoff or _UNFILTERED)
     edge = max(_LONGEST, _SETTLED * period)
     inner = (motion.t[coarse] >= t[0] + edge) & (motion.t[coarse] <= t[-1] - edge)
     # friction of any odd curve of the speed, and torques periodic in the position, so that they are

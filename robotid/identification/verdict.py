@@ -65,7 +65,7 @@ _WORDS = {
     "solvers_differ": "two solvers found different parameters",
     "time_scale": "inertia and gravity contradict each other: the time stamps, or the size of "
     "gravity, may be wrong",
-    "torque_delay": "the torque is late against the position by {delay:.3f} s",
+    "torque_delay": "the torque is {delay:+.3f} s (+ late, - early) against the position",
     "torque_order": "the torque may be that of another joint",
     "torque_scale": "the torque is in another scale than those of the other joints",
     "torque_sign": "the torque may have the opposite sign",
@@ -389,9 +389,11 @@ def _unseen(
     missing = [joint for joint in names if joint not in kept and joint in fitted]
     if still and not fitted:  # measured again without the fitted recordings
         still, missing = [], still
-    reasons = [f"the joints {still} move in no recording: not evaluated"] if still else []
+    reasons = [f"the joints {listed(still)} move in no recording: not evaluated"] if still else []
     if missing and validation:
-        reasons.append(f"the joints {missing} do not move in any validation log: not evaluated")
+        reasons.append(
+            f"the joints {listed(missing)} do not move in any validation log: not evaluated"
+        )
     return reasons
 
 

@@ -59,6 +59,16 @@ def test_a_log_without_a_filter_is_judged_too(ur5):
     assert (clean.severity, spoilt.severity) == ("note", "warning")
 
 
+def test_noise_of_a_log_without_a_filter_is_no_delay(ur5):
+    # half-way between rows a spline of white noise is a quarter smaller: 10 ms here
+    log = exact_log(ur5, truth(ur5), np.random.default_rng(1), samples=600, rate=50.0)
+    log = replace(log, tau=log.tau + 0.1 * np.random.default_rng(1).standard_normal(log.tau.shape))
+    (clean,) = found(ur5, log, replace(SIGNALS, cutoff=None, trim=0.0))
+    assert clean.severity == "note"
+    assert abs(clean.evidence["delay"]) < 0.005
+    assert clean.evidence["gain"] < 0.05
+
+
 def test_joints_that_hardly_move_have_no_say(ur5):
     log = clean_log(ur5, 100, duration=20.0)
     still = np.abs(log.t - 8.5) > 0.95

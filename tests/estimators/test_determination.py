@@ -10,6 +10,7 @@ from robotid.doctor.motions import check_excitation
 from robotid.estimators.determination import base_spread, determine
 from robotid.exceptions import RankDeficientError
 from robotid.export.result import build_result
+from robotid.findings import listed
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
@@ -170,7 +171,7 @@ def test_doctor_result_report_and_refusal_say_the_same(ur5, case, request):
         assert entry["text"] in html
     assert known.rank == len(known.names) - len(known.undetermined) + len(sums)
     reasons = found.verdict.reasons
-    assert any(str(list(known.undetermined)) in reason for reason in reasons)
+    assert any(listed(known.undetermined, 8) in reason for reason in reasons)
 
     log = found.fitted[0].recording.log
     with pytest.raises(RankDeficientError) as caught:

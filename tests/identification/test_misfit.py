@@ -111,10 +111,10 @@ def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(ur5):
 
 
 def test_columns_join_the_regressor_and_base_parameters_are_refitted(ur5):
-    sample = misfit._take_sample(identified(ur5, 1, "load", 1, duration=12.0))
+    sample = misfit.take_sample(identified(ur5, 1, "load", 1, duration=12.0))
     j, b = 2, sample.W.shape[-1]
     Z = np.column_stack([sample.motions[j].q, sample.motions[j].v ** 3])
-    apart, whole = misfit._trials(sample, j, Z)
+    apart, whole = misfit.trials(sample, slice(j, j + 1), Z[:, None])
     for trial, left_out in ((whole, None), (apart, 3)):
         rows = np.arange(len(sample.r)) < sample.rows
         if left_out is not None:

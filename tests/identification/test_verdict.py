@@ -43,7 +43,7 @@ def test_not_evaluated_is_never_a_pass():
     assert "was not evaluated: no validation log given" in found.reasons[0]
     found = verdict({"a": joint(4.0)}, fitted={"a": joint(3.0), "b": joint(3.0)})
     assert found.status == "usable"
-    assert found.reasons == ("the joints ['b'] do not move in any validation log: not evaluated",)
+    assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
 
 
 def test_worse_than_a_constant_is_said_first():
@@ -116,7 +116,7 @@ def test_a_joint_that_moves_nowhere_is_not_evaluated():
         joints=("a", "b"),
     )
     assert found.status == "usable"
-    assert found.reasons == ("the joints ['b'] move in no recording: not evaluated",)
+    assert found.reasons == ("the joints b move in no recording: not evaluated",)
     assert found.joints["b"].status == "not evaluated"
     assert found.joints["b"].reasons == ("it does not move in any recording",)
 
@@ -124,7 +124,7 @@ def test_a_joint_that_moves_nowhere_is_not_evaluated():
 def test_a_result_that_is_validated_later_knows_only_what_was_kept():
     kept = {"val.csv": Metrics({"a": joint(4.0)}, 1.0)}
     found = judge(Metrics({}, 0.0), kept, undetermined=(), is_consistent=True, joints=("a", "b"))
-    assert found.reasons == ("the joints ['b'] do not move in any validation log: not evaluated",)
+    assert found.reasons == ("the joints b do not move in any validation log: not evaluated",)
 
 
 def test_a_doubt_makes_its_joint_and_the_whole_usable_at_best():
@@ -227,7 +227,7 @@ def test_what_several_logs_show_is_said_once():
 
 def test_figures_are_stated():
     (late,) = doubts_of([finding("torque_delay", "run.csv", delay=0.0562)], JOINTS)
-    assert late.message == "run.csv: the torque is late against the position by 0.056 s"
+    assert late.message == "run.csv: the torque is +0.056 s (+ late, - early) against the position"
     (costs,) = doubts_of([finding("constraint_costs", "a", error_pct=4.0, wls_error_pct=1)], JOINTS)
     assert costs.message.startswith("4.0 % of the torque is missed where it was fitted, 1.0 %")
 
