@@ -156,7 +156,8 @@ def test_the_notes_on_consistency_are_those_of_the_fit(report, identified):
     kinds = {kind: identified.sources.count(kind) for kind in ("data", "mixed", "prior", "bound")}
     assert (
         f"of 84 parameters {kinds['data']} come from the data, {kinds['mixed']} from data and "
-        f"URDF together, {kinds['prior']} from the URDF; {kinds['bound']} are at a bound of physics."
+        f"URDF together, {kinds['prior']} from the URDF; {kinds['bound']} are at a bound of "
+        "physics."
     ) in said
     prior = identified.estimate.details["prior"]
     assert f"its weight is {prior['weight']:.3g}, " in said
