@@ -147,8 +147,8 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
 
     Yields:
         Warnings "current_for_torque" per joint, or once for all joints of one factor (an error if
-        it is that of another unit), or else an error "gravity_compensated", or else a warning
-        "urdf_mismatch", or else "payload".
+        all share one of a different unit), or else an error "gravity_compensated", or else a
+        warning "urdf_mismatch", or else "payload".
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
