@@ -82,7 +82,8 @@ def test_result_json_has_the_promised_shape(identified, logs):
     assert kept["log"] == str(logs / "keep.csv")
     assert set(kept["per_joint"]["elbow_joint"]) == {
         "rmse", "unit", "relative_error_pct", "r2", "rows", "urdf_relative_error_pct",
-        "gravity_only_relative_error_pct", "better_than_constant",
+        "gravity_only_relative_error_pct", "urdf_with_drives_relative_error_pct",
+        "better_than_constant",
     }  # fmt: skip
     assert len(result["wls"]["base_values"]) == 58
     assert result["verdict"]["status"] == "good"
