@@ -58,7 +58,7 @@ _WORDS = {
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
-    "payload_change": "its last link carries another load than in the fitted logs, by {mass:+.2g} kg",
+    "payload_change": "its last link carries {mass:+.2g} kg against the fitted logs",
     "position_offset": "the zero of the position may be off",
     "position_order": "the position may be that of another joint",
     "position_sign": "the position may have the opposite sign",

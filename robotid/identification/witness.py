@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ _POSES = 300  # at which gravity is compared
 _LOADED = 0.02  # share of the largest gravity torque that a joint must hold to be compared
 _KNOWN = 0.1  # standard error of a ratio that says something
 _AGREES = 0.05  # farther from 1 than this, gravity and total mass bear no witness
+_HELD_BACK = 1.5  # a residual over that of weighted least squares beyond this is the prior's doing
 _ANOTHER = 0.35  # ... and farther than this, they speak against it
 _OFF = 0.1  # a factor of all torques at least so far from 1 is told from one of single masses,
 _CLEARLY = 4.0  # if it is so many times what it leaves unexplained of gravity
@@ -42,6 +43,8 @@ class Witness:
         masses: Total mass of the URDF, as identified, and of that payload [kg].
         is_stated: Whether a mass is stated, which is a witness by itself.
         friction: Share of each joint's torque that viscous and Coulomb friction make up [-].
+        follows: Whether the result follows the data as weighted least squares does: one that its
+            prior holds back agrees with the URDF whatever the sensors say.
     """
 
     gravity: Mapping[str, float] = field(default_factory=dict)
@@ -52,11 +55,13 @@ class Witness:
     masses: tuple[float, float, float] = (0.0, 0.0, 0.0)
     is_stated: bool = False
     friction: Mapping[str, float] = field(default_factory=dict)
+    follows: bool = True
 
     @property
     def agrees(self) -> bool:
         """Whether gravity and total mass confirm the scale, or a mass is stated."""
-        return self.is_stated or (self.scale is not None and self._off <= _AGREES)
+        is_near = self.scale is not None and self._off <= _AGREES
+        return self.is_stated or (is_near and self.follows)
 
     @property
     def is_against(self) -> bool:
@@ -130,7 +135,11 @@ def call_witness(found: Identification) -> Witness:
     is_stated = bounds.total is not None or any(np.ptp(m) == 0 for m in bounds.masses.values())
     before, after = (float(pi[:size:10].sum()) for pi in (found.prior, found.standard))
     rubbing = _friction(found)
-    plain = Witness(masses=(before, after, 0.0), is_stated=is_stated, friction=rubbing)
+    errors = [found.metrics(name).per_joint for name in ("estimate", "wls")]
+    follows = all(errors[0][j].rmse <= _HELD_BACK * free.rmse for j, free in errors[1].items())
+    plain = Witness(
+        masses=(before, after, 0.0), is_stated=is_stated, friction=rubbing, follows=follows
+    )
     q = np.vstack([e.recording.trajectory.q for e in found.fitted])
     if model.free_flyer:
         return plain
@@ -159,9 +168,10 @@ def call_witness(found: Identification) -> Witness:
     factor = float(np.sum(of_urdf * of_result) / load.sum())
     scale, payload, left = _beside_payload(of_urdf, of_result, last)
     rest = float(np.linalg.norm(of_result - factor * of_urdf) / np.linalg.norm(of_result))
-    return Witness(
-        gravity, error, scale, factor, (rest, left), (before, after, payload), is_stated, rubbing
-    )
+    return replace(
+        plain, gravity=gravity, gravity_error=error, scale=scale, factor=factor,
+        unexplained=(rest, left), masses=(before, after, payload),
+    )  # fmt: skip
 
 
 def _friction(found: Identification) -> dict[str, float]:

@@ -98,3 +98,17 @@ def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is
     (finding,) = [f for f in fit_findings(replace(found, standard=far, prior=far)) if is_forearm(f)]
     assert finding.severity == "note"
     assert "so it is in the URDF already" in finding.message
+
+
+def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
+    pi = truth(ur5)
+    size = ur5.layout.n_inertial
+    pi[:size] = 3.0 * ur5.standard_parameters()[:size]  # the sensors say three times the URDF
+    log = exact_log(ur5, pi, rng, samples=1000, noise=0.5)
+    kept = EstimatorSettings(prior_weight=1e9)
+    held = identify(ur5, [log], estimator=kept, doctor=False)
+    assert held.witness.factor == pytest.approx(1.0, abs=0.05)  # it stays at the URDF
+    assert not held.witness.follows
+    assert not held.witness.agrees
+    free = identify(ur5, [log], doctor=False)
+    assert free.witness.follows
