@@ -68,7 +68,7 @@ def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):
     assert len(best) == 5
     assert all(abs(float(value)) > 10 * float(error) for value, error in best)
     assert {"report.html", "identified.urdf"} <= {p.name for p in tmp_path.iterdir()}
-    assert set(namespace["found"].sources) <= {"data", "mixed", "prior"}
+    assert set(namespace["found"].sources) <= {"data", "mixed", "prior", "bound"}
 
 
 def test_paper(capsys):

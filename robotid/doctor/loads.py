@@ -33,6 +33,7 @@ _WORSE = 0.25  # in variances of its precision, that a torque may fit worse than
 _ALIKE = 1.6  # factors that differ by less are one: they are sought in steps of 1.26
 _GAIN = 20.0  # drop of the misfit that makes another torque scale believable
 _OTHER_SCALE = 3.0  # a torque scale farther from 1 than this is no error of masses
+_OTHER_UNIT = 30.0  # ... and one of all torques farther than this is another unit, no gain
 _SCALES = np.logspace(-3, 3, 61)
 _HEAVY = 0.08  # payload over the arm's mass that is surely more than the links' errors
 _MISMATCH = 7.5  # sum of squares of the links' errors, in standard deviations, that is too much
@@ -145,8 +146,9 @@ def check_loads(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
         name: What the log is called.
 
     Yields:
-        Warnings "current_for_torque" per joint, or once for all joints of one factor, or else an
-        error "gravity_compensated", or else a warning "urdf_mismatch", or else "payload".
+        Warnings "current_for_torque" per joint, or once for all joints of one factor (an error if
+        all share one of a different unit), or else an error "gravity_compensated", or else a
+        warning "urdf_mismatch", or else "payload".
     """
     model = load_model(probe, share)
     bodies = len(probe.model.layout.bodies)
@@ -241,8 +243,10 @@ def _scaled(probe: Probe, scale: Array, other: Array, name: str) -> Iterator[Fin
             "be currents, or have another unit or gain; give them as current_<joint> "
             + todo.format("JOINT")
         )
-        part = "" if len(other) == len(scale) else listed(joints)
-        yield log_finding(name, code, "warning", message, part, factor=factor, joints=len(other))
+        is_all = len(other) == len(scale)
+        is_unit = is_all and abs(np.log(factor)) > np.log(_OTHER_UNIT)
+        severity, part = "error" if is_unit else "warning", "" if is_all else listed(joints)
+        yield log_finding(name, code, severity, message, part, factor=factor, joints=len(other))
         return
     for joint, factor in zip(joints, factors, strict=True):
         message = (

@@ -57,10 +57,17 @@ _SHAPE = {
     "inputs": [{"role": TEXT, "path": TEXT, "sha256": (str, type(None))}],
     "outputs": {"urdf?": FILE, "sidecar?": FILE},
     "structure": {"base": NUMBER, "undetermined": [TEXT]},
+    "witness?": {
+        **{key: {...: NUMBER} for key in ("gravity", "gravity_error", "friction")},
+        **{key: [NUMBER] for key in ("unexplained", "masses")},
+        "scale": MAYBE,
+        "factor": NUMBER,
+        "is_stated": FLAG,
+    },
     "consistency": {"is_consistent": FLAG},
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
-    "drive_parameters": [_PARAMETER],
+    "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
     "verdict": {
@@ -259,10 +266,16 @@ def stated_witness(result: Mapping[str, Any]) -> Witness | None:
 
     Args:
         result: Content of a result.json.
+
+    Raises:
+        DataError: If figures of it are missing.
     """
     stated = result.get("witness")
     if stated is None:
         return None
+    for name, size in (("unexplained", 2), ("masses", 3)):
+        if len(stated[name]) != size:
+            raise DataError(f"witness.{name} has {len(stated[name])} numbers, wanted {size}")
     return Witness(**{each.name: stated[each.name] for each in dataclasses.fields(Witness)})
 
 
@@ -272,11 +285,17 @@ def stated_urdf_with_drives(result: Mapping[str, Any], model: RobotModel) -> Arr
     Args:
         result: Content of a result.json.
         model: The robot.
+
+    Raises:
+        DataError: If there are more or fewer of them than the robot has.
     """
     drives = [entry.get("with_urdf") for entry in result["drive_parameters"]]
     if None in drives:
         return None
     pi = model.standard_parameters()
+    if len(drives) != len(pi) - model.layout.n_inertial:
+        wanted = len(pi) - model.layout.n_inertial
+        raise DataError(f"drive_parameters has {len(drives)} entries, the robot {wanted}")
     pi[model.layout.n_inertial :] = drives
     return pi
 

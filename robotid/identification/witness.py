@@ -111,7 +111,8 @@ class Witness:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""
-        return asdict(self) | {"agrees": self.agrees, "message": self.message}
+        lists = {"unexplained": list(self.unexplained), "masses": list(self.masses)}
+        return asdict(self) | lists | {"agrees": self.agrees, "message": self.message}
 
 
 def call_witness(found: Identification) -> Witness:

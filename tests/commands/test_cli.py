@@ -59,6 +59,7 @@ def test_result_json_has_the_promised_shape(identified, logs):
         "base": 58,
         "rank": 58,
         "condition": pytest.approx(result["structure"]["condition"]),
+        "poorly_excited": False,
         "undetermined": [],
         "not_told_apart": [],
     }
@@ -81,7 +82,8 @@ def test_result_json_has_the_promised_shape(identified, logs):
     assert kept["log"] == str(logs / "keep.csv")
     assert set(kept["per_joint"]["elbow_joint"]) == {
         "rmse", "unit", "relative_error_pct", "r2", "rows", "urdf_relative_error_pct",
-        "gravity_only_relative_error_pct", "better_than_constant",
+        "gravity_only_relative_error_pct", "urdf_with_drives_relative_error_pct",
+        "better_than_constant",
     }  # fmt: skip
     assert len(result["wls"]["base_values"]) == 58
     assert result["verdict"]["status"] == "good"
@@ -300,8 +302,10 @@ def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys)
     pi = truth(model)
     write_log(exact_log(model, pi, rng, samples=400), tmp_path / "log.csv")
     words = ["identify", str(source), str(tmp_path / "log.csv"), "--estimator", "wls", "--json"]
-    assert main([*words, "--out", str(tmp_path / "plain")]) == 0
+    # the directions that rounding adds carry WLS away, to links that weigh less than nothing
+    assert main([*words, "--out", str(tmp_path / "plain")]) == 1
     plain = json.loads(capsys.readouterr().out)
+    assert "total_mass" in {f["code"] for f in plain["warnings"]}
     (finding,) = [f for f in plain["warnings"] if f["code"] == "rounded_rpy"]
     assert "--snap-angles" in finding["message"]
     assert main([*words, "--out", str(tmp_path / "snapped"), "--snap-angles"]) == 0

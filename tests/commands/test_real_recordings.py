@@ -14,7 +14,8 @@ from robotid.robot.parameters import pseudo_inertia
 
 JOBS = Path(__file__).parents[1] / "jobs"
 # validation error per joint [%] reached with plain numpy and weighted least squares on the same
-# splits; the measured figure may be at most 1.15 times that, for WLS and for the consistent fit
+# splits; the figure of WLS may be at most 1.15 times that; the consistent fit, whose prior may cost
+# a joint something, 1.2 times that, and no more than that in the geometric mean
 REACHED = {
     "ur10e": (6.7, 3.2, 3.2, 3.7, 5.5, 4.2),
     "tx40": (6.4, 6.0, 9.7, 8.8, 30.0, 21.0),
@@ -50,11 +51,12 @@ def errors(metrics):
 def test_a_new_motion_is_predicted_as_well_as_plain_numpy_does(run, name, estimate):
     identification, _, _ = run(name)
     (kept,) = identification.validation
-    reached = errors(kept.metrics[estimate])
-    assert (reached <= 1.15 * np.array(REACHED[name])).all(), reached
+    ratio = errors(kept.metrics[estimate]) / np.array(REACHED[name])
+    assert ratio.max() <= (1.15 if estimate == "wls" else 1.2), ratio
+    assert np.exp(np.log(ratio).mean()) <= 1.03, ratio
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", REACHED)
 def test_the_written_urdf_and_sidecar_reproduce_the_fit(run, name):
     identification, result, folder = run(name)
     outputs = result["outputs"]
@@ -84,8 +86,8 @@ def test_tx40_has_sane_masses_and_armatures(run):
     armature = [v for k, v in zip(names, identification.standard, strict=True) if "armature" in k]
     assert min(armature) >= 0
     assert len(identification.base) == 61
-    consistent, wls = identification.metrics(), identification.metrics("wls")
-    assert consistent.pooled_rmse < 1.02 * wls.pooled_rmse
+    (kept,) = identification.validation
+    assert kept.metrics["estimate"].pooled_rmse < kept.metrics["wls"].pooled_rmse
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -94,7 +96,9 @@ def test_no_stretch_kept_apart_is_taken_for_a_fitted_one(run, name):
     assert identification.refitted == ()
     codes = {warning["code"] for warning in result["warnings"]}
     assert "validation_was_fitted" not in codes
-    assert not identification.alarms
+    # TIAGo's currents make its links 3.4 times too light: said, and no URDF is written
+    assert ("total_mass" in codes) == bool(identification.alarms) == (name == "tiago")
+    assert ("urdf" in result["outputs"]) == (name != "tiago")
 
 
 def test_late_velocities_are_not_used(run):
@@ -119,4 +123,7 @@ def test_what_the_data_cannot_say_is_said(run):
     assert result["verdict"]["status"] == "poor"
     assert any("worse than a constant" in reason for reason in result["verdict"]["reasons"])
     _, result, _ = run("ur10e")
-    assert result["verdict"]["status"] == "good"
+    # it predicts to 8 % and better, but the friction of its first joint is no line
+    assert result["verdict"]["status"] == "usable"
+    assert {d["code"] for d in result["verdict"]["doubts"]} == {"friction_shape"}
+    assert {d["joint"] for d in result["verdict"]["doubts"]} == {"shoulder_pan_joint"}

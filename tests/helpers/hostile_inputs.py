@@ -90,7 +90,15 @@ def read_log_file(write, suffix, example, folder):
 def identify_from(write, suffix, example, folder):
     path, out = folder / f"in{suffix}", folder / "out"
     write(example, path)
-    obey("identify", URDF, path, "--validate", path, "--out", out, out=out)
+    words = ("identify", URDF, path, "--validate", path, "--out", out)
+    result = out / "result.json"
+    if obey(*words) == 1 and result.exists():  # judged to be wrong: said, and no URDF
+        said = json.loads(result.read_text(encoding="utf-8"))
+        assert said["verdict"]["alarms"], "refused without a word"
+        assert "urdf" not in said["outputs"]
+        assert {Path(name).name for name in files_in(out)} == {"report.html", "result.json"}
+    elif not result.exists():
+        assert not files_in(out), f"half-written: {files_in(out)}"
 
 
 # --- bytes that were spoilt ----------------------------------------------------------------------

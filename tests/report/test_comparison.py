@@ -4,6 +4,7 @@ import copy
 import json
 import math
 import re
+from html import unescape
 
 import numpy as np
 import pytest
@@ -191,7 +192,8 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
         box = html.split(f"<p>{label}: <strong>")[1].split("</div>")[0]
         assert box.startswith(f"{result['verdict']['status']}</strong>")
         assert f"({result['settings']['estimator']['name']})" in box
-        assert re.findall(r"<li>(.*?)</li>", box) == result["verdict"]["reasons"]
+        reasons = [unescape(reason) for reason in re.findall(r"<li>(.*?)</li>", box)]
+        assert reasons == result["verdict"]["reasons"]
 
 
 def test_the_least_error_of_comparable_results_is_bold(folder, tmp_path):

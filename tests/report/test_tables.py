@@ -83,7 +83,7 @@ def test_the_head_counts_parameters_samples_and_rows(report, identified):
 
 
 def relative(value, error):
-    share = 100 * error / abs(value)
+    share = 100 * error / abs(value) if np.isfinite(error) else np.nan
     return "> 999" if share >= 1000 else percent(share)
 
 
@@ -96,8 +96,12 @@ def test_drive_parameters_have_their_values_errors_units_and_sources(shown, iden
         i = layout.names.index(row[0])
         value, error = identified.standard[i], np.sqrt(identified.standard_covariance[i, i])
         unit = units[row[0].rsplit(".", 1)[1]]
-        wanted = [number(value), number(error, ".2g"), relative(value, error), unit]
-        assert row[1:] == [*wanted, identified.sources[i]]
+        said = [number(value), number(error, ".2g"), relative(value, error)]
+        if identified.sources[i] == "bound":
+            assert 0.0 <= value < 1e-6
+            said = ["0, at its bound", "–", "–"]
+        assert row[1:] == [*said, unit, identified.sources[i]]
+    assert [row[0] for row in rows if row[1] == "0, at its bound"] == ["elbow_joint.viscous"]
 
 
 def test_base_parameters_have_their_values_errors_and_expressions(shown, identified):
@@ -149,11 +153,12 @@ def test_masses_and_eigenvalues_are_those_of_each_body(shown, identified):
 
 def test_the_notes_on_consistency_are_those_of_the_fit(report, identified):
     said = text_of(section(report, "consistency"))
-    kinds = {kind: identified.sources.count(kind) for kind in ("data", "mixed", "prior")}
+    kinds = {kind: identified.sources.count(kind) for kind in ("data", "mixed", "prior", "bound")}
     assert (
         f"of 84 parameters {kinds['data']} come from the data, {kinds['mixed']} from data and "
-        f"URDF together, {kinds['prior']} from the URDF." in said
-    )
+        f"URDF together, {kinds['prior']} from the URDF; {kinds['bound']} are at a bound of "
+        "physics."
+    ) in said
     prior = identified.estimate.details["prior"]
     assert f"its weight is {prior['weight']:.3g}, " in said
     check = identified.mass_matrix
