@@ -226,7 +226,7 @@ def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
 
 
 def test_a_log_too_short_to_judge_by_is_not_judged(ur5):
-    log = log_with(ur5, 1, "spring", 2, duration=6.0)
+    log = log_with(ur5, 1, "spring", 2, duration=8.0)
     signals = SignalSettings(cutoff=2.0)
     found = identify(ur5, [log], signals=signals)
     assert find_misfits(found) == ()
