@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,9 +17,9 @@ from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import misfit_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
-from robotid.robot.geometry import body_points
+from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import pseudo_inertia_basis
+from robotid.robot.parameters import pseudo_inertia
 
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
@@ -36,7 +36,7 @@ _SAME_TORQUE = 1e-3  # two solvers that differ by more, relative to the torque, 
 _SAME_OPTIMUM = 1e-3  # the same of the objectives of log-Cholesky and cone programme
 _COSTS = 1.05  # residual over that of WLS from which bounds cost torque
 _FAR = 3.0  # a total mass so many times the URDF's, or its share, is no robot's
-_SURE = 2.0  # standard errors by which a body must leave its geometry
+_ROUNDING = 1e-6  # [m^2] by which a body that touches its box may leave it
 _NAMED = 5  # outliers that a finding names
 _WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is reported
@@ -216,25 +216,23 @@ def _total_mass(identification: Identification) -> list[Finding]:
     return [Finding("total_mass", "error", "standard_parameters", message, evidence)]
 
 
-def _is_within_error(
-    identification: Identification, body: str, points: Mapping[str, Array]
-) -> bool:
-    """Return whether two standard errors take a body's mass back into its geometry's box."""
+def _is_within_box(identification: Identification, body: str, box: Array) -> bool:
+    """Return whether a body's mass lies in the box of the fit, wider than that of the geometry."""
     i = identification.model.layout.bodies.index(body)
-    part = slice(10 * i, 10 * i + 10)
-    box = np.array([points[body].min(axis=0), points[body].max(axis=0)])
-    G = np.einsum("kij,qij->qk", pseudo_inertia_basis(), slabs(box))
-    slack = G @ identification.standard[part]
-    variance = np.einsum("qi,ij,qj->q", G, identification.standard_covariance[part, part], G)
-    return bool((slack > -_SURE * np.sqrt(np.maximum(variance, 0.0))).all())
+    (J,) = pseudo_inertia(identification.standard[10 * i : 10 * i + 10])
+    slack = np.einsum("ij,kji->k", J, slabs(box)) / J[3, 3]  # tr(J Q_k) / m
+    centre = J[:3, 3] / J[3, 3]
+    is_inside = (box[0] <= centre) & (centre <= box[1]) & (slack >= -_ROUNDING)
+    return bool(is_inside.all())
 
 
 def _impossible_shapes(identification: Identification) -> list[Finding]:
     """Return which identified bodies cannot be so in their geometry.
 
-    As notes where the URDF's cannot either, and where the body's error could take it back inside.
+    As notes where the URDF's cannot either, and within the box that a fit with extents keeps to.
     """
     model, points = identification.model, body_points(identification.model)
+    boxes = body_boxes(model)
     before = {
         (finding.code, finding.where)
         for finding in audit_bodies(model, identification.prior, points)
@@ -244,8 +242,11 @@ def _impossible_shapes(identification: Identification) -> list[Finding]:
         if (finding.code, finding.where) in before:
             message = f"{finding.message.partition(';')[0]}; so it is in the URDF already"
             finding = replace(finding, severity="note", message=message)
-        elif _is_within_error(identification, finding.where.removeprefix("link "), points):
-            message = f"as identified, {finding.message.partition(';')[0]}; by less than its error"
+        elif _is_within_box(
+            identification, body := finding.where.removeprefix("link "), boxes[body]
+        ):
+            said = finding.message.partition(";")[0]
+            message = f"as identified, {said}; it is within the margin that the fit leaves"
             finding = replace(finding, severity="note", message=message)
         else:
             said = finding.message.partition(";")[0]
