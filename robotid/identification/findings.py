@@ -123,7 +123,7 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
     if not assumed:
         return []
     message = (
-        f"the joints {assumed} are neither identified nor locked in the job: they are taken to "
+        f"neither identified nor locked in the job: {listed(assumed)}. They are taken to "
         "stand at 0; state their true positions with locked = { joint = position }"
     )
     return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]

@@ -192,7 +192,7 @@ class Constraints:
         (J,) = pseudo_inertia(values - held)
         if np.linalg.eigvalsh(J)[0] <= 0:
             raise SettingsError(
-                f"{body} is pinned, but its inertial in the URDF is not physically possible; mend "
+                f"{body} is pinned, but its inertial in the URDF is not physically possible; fix "
                 "it, or leave it out of 'pinned'"
             )
         low, high = self.mass.get(body, _OPEN)
