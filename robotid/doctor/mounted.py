@@ -20,7 +20,7 @@ _LIGHT = 0.02  # of the arm's mass, below which a part is not missed
 _NO_LOAD = 1e-6  # [kg, kg m] spread of a payload that is left out
 _SURE = 3.0  # standard errors that a change of load has at least
 _NOTHING = 0.01  # ... and share of the arm's mass
-_CHANGED = 16.0  # drop of the misfit, as of four standard errors, that makes a load believable
+_CHANGED = 25.0  # drop of the misfit, as of five standard errors, that makes a load believable
 _FITS = 0.25  # in variances of its precision, that a torque may fit worse than by itself
 
 
@@ -89,8 +89,8 @@ def check_payload_change(fitted: Sequence[Probe], kept: Probe, name: str) -> Ite
     x, error = spread * (inverse @ R[:-1, -1]), spread * np.linalg.norm(inverse, axis=1)
     mass, std_error = float(x[shared]), float(error[shared])
     arm = float(np.sum(kept.model.standard_parameters()[: kept.model.layout.n_inertial : 10]))
-    if abs(mass) < max(_SURE * std_error, _NOTHING * arm):
-        return  # where its mass lies differs, as other errors of a model do, or next to nothing
+    if not max(_SURE * std_error, _NOTHING * arm) <= abs(mass) <= arm:
+        return  # nothing but where mass lies, as other errors of a model do; or no load of this arm
     link = kept.model.layout.bodies[-1]
     message = (
         f"{link} carries {abs(mass):.2g} +- {std_error:.1g} kg {'more' if mass > 0 else 'less'} "
