@@ -17,7 +17,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, listed
-from robotid.identification.misfit import Sample, Trial, chance, take_sample, trials
+from robotid.identification.misfit import Sample, chance, take_sample, trials
 from robotid.logs.data import Trajectory
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
@@ -166,19 +166,11 @@ def _found(sample: Sample, own: Sequence[_Alteration]) -> Iterator[Finding]:
             return
         which = untried.pop(best)
         chosen, before = [*chosen, *which], after
-        size, error = (x[-len(which) :] for x in _sizes(whole, chosen, sample.fitted))
+        sizes, covariance = whole.estimate(chosen, sample.fitted)
+        size, error = (x[-len(which) :] for x in (sizes, np.sqrt(np.diag(covariance))))
         if np.linalg.norm(size) < max(best.least, _SURE * float(np.linalg.norm(error))):
             return
         yield _finding(best, size, error, share, [one for one in alike if one is not best])
-
-
-def _sizes(whole: Trial, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
-    """Return sizes and their standard errors, from how the scores of stretches scatter."""
-    x, S = whole.parameters(which), whole.S[which][:, which]
-    H = whole.H[:fitted, which]
-    scores = H[:, :, -1] - H[:, :, which] @ x  # (K, k)
-    inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
-    return x, np.sqrt(few * np.diag(inverse @ (scores.T @ scores) @ inverse))
 
 
 def _finding(

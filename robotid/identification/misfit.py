@@ -372,6 +372,23 @@ class Trial:
         theta: Array = np.linalg.solve(square, self.S[..., which, -1:])[..., 0]
         return theta
 
+    def estimate(self, which: Sequence[int], fitted: int) -> tuple[Array, Array]:
+        """Return the parameters of some columns and their covariance, shapes (k,) and (k, k).
+
+        Of a fit to all rows; from scores that scatter from stretch to stretch, as noise of any
+        colour does.
+
+        Args:
+            which: The k columns.
+            fitted: How many of the stretches are of fitted logs.
+        """
+        theta, S = self.parameters(which), self.S[which][:, which]
+        H = self.H[:fitted, which]
+        scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
+        inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
+        covariance: Array = few * (inverse @ (scores.T @ scores) @ inverse)
+        return theta, covariance
+
     def left(self, which: Sequence[int]) -> Array:
         """Return the squared residual of each stretch with some columns fitted, shape (K,).
 
@@ -510,17 +527,10 @@ def chance(before: Array, after: Array, fitted: int) -> float:
 def _size(
     sample: Sample, j: int, term: Candidate, whole: Trial, before: list[int], new: list[int]
 ) -> tuple[float, float, str]:
-    """Return the size of a term beside those found before, its standard error and unit.
-
-    The error is that of scores which scatter from stretch to stretch, as noise of any colour does.
-    """
-    which, own = [*before, *new], slice(len(before), None)
-    theta, S = whole.parameters(which), whole.S[which][:, which]
-    H = whole.H[: sample.fitted, which]
-    scores = H[:, :, -1] - H[:, :, which] @ theta  # (K, k)
-    inverse, few = np.linalg.inv(S), len(scores) / (len(scores) - 1)
-    covariance = few * (inverse @ (scores.T @ scores) @ inverse)[own, own]
-    theta, S = theta[own], S[own, own]
+    """Return the size of a term beside those found before, its standard error and unit."""
+    theta, covariance = whole.estimate([*before, *new], sample.fitted)
+    own = slice(len(before), None)
+    theta, covariance, S = theta[own], covariance[own, own], whole.S[new][:, new]
     if term.units is not None:
         error = float(np.sqrt(covariance[0, 0]))
         return float(theta[0]), error, term.units[int(sample.slides[j])]

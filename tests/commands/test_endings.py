@@ -28,7 +28,7 @@ OUTPUTS = [
 def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "fit.csv"
     model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
-    write_log(exact_log(model, truth(model), rng, samples=2000, rate=100.0, noise=0.1), path)
+    write_log(exact_log(model, truth(model), rng, samples=1000, rate=100.0, noise=0.1), path)
     return str(path)
 
 
@@ -108,7 +108,7 @@ def test_names_that_the_standard_output_cannot_show_are_shown_otherwise(log, tmp
     words = ["convert", log, str(tmp_path / "\u2713.csv")]
     run = robotid(*words, stdout=subprocess.PIPE, env=environment)
     assert (run.returncode, run.stderr) == (0, "")
-    assert run.stdout.startswith(str(here).replace("\u2713", "\\u2713") + ".csv: 2000 samples")
+    assert run.stdout.startswith(str(here).replace("\u2713", "\\u2713") + ".csv: 1000 samples")
 
 
 @pytest.mark.parametrize("command", ["doctor", "validate", "compare", "replay"])

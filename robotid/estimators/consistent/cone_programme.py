@@ -150,7 +150,7 @@ class Programme:
         return self.scale * (y @ prior.T), failures
 
     def _start(self, rows: Array, weight: float) -> ConeSolution:
-        """Return a point that no Newton step must lead away from the boundary, if there is one."""
+        """Return a first point whose bodies have room, a tenth of the prior's, if bounds allow."""
         centre = self.penalty.centre
         inside = self.cone.around(centre / self.scale, _ROOM)
         try:
