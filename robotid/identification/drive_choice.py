@@ -4,8 +4,8 @@ Terms are tried beside viscous and Coulomb friction, joint by joint, on rows spr
 logs. The family that explains most of the stretches left out is taken if it does so beyond chance,
 then the next one beside it, until nothing is left to gain. Recordings kept apart have no say in it.
 
-What a family is not linear in, its shape, is sought on a grid and then by Brent's method, with all
-linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
+What a family is not linear in, its shape, is sought on a grid; then all shapes of a joint together,
+with the linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,6 +39,7 @@ _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bo
 _SLOWEST = 0.02  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _STEP = 1e-3  # relative, of a derivative
+_STEPS = 40  # of the search for all shapes of a joint together
 _STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
 _FEWEST = 3  # stretches that show chance
 _NOTHING = 1e-300
@@ -90,6 +91,7 @@ class DriveChoice:
         terms: The terms themselves.
         tried: What was tried, step by step.
         shapes: The shapes that were found.
+        shape_covariance: Their covariance, row by row.
         sizes: Shapes of each family.
         seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
     """
@@ -99,6 +101,7 @@ class DriveChoice:
     terms: tuple[DriveTerm, ...]
     tried: tuple[Tried, ...] = ()
     shapes: tuple[FoundShape, ...] = ()
+    shape_covariance: tuple[tuple[float, ...], ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -394,93 +397,89 @@ def _found(
     tried: tuple[Tried, ...],
 ) -> DriveChoice:
     """Return the choice with its shapes refined."""
-    sizes = [list(own) for _, own in chosen]
     families = [family for family, _ in chosen]
-    shapes = []
-    for at, family in enumerate(families):
-        for k, shape in enumerate(family.shapes):
-            value = _refined(sample, drive, families, sizes, (at, k))
-            sizes[at][k] = value
-            low, high = shape.within(drive.seen)
-            margin = _EDGE * np.log(high / low)
-            is_at_bound = min(np.log(value / low), np.log(high / value)) < margin
-            shapes.append((at, k, bool(is_at_bound)))
-    terms = tuple(
-        term
-        for family, own in zip(families, sizes, strict=True)
-        for term in family.make(drive.seen, *own)
-    )
+    shapes = [(family, shape) for family in families for shape in family.shapes]
+    bounds = np.log([shape.within(drive.seen) for _, shape in shapes]).reshape(-1, 2)
+    start = np.array([size for _, own in chosen for size in own])
+    flat = _refined(sample, drive, families, start, bounds)
+    margin = _EDGE * np.ptp(bounds, axis=1)
+    is_at_bound = np.min(np.abs(np.log(flat)[:, None] - bounds), axis=1) < margin
+    covariance = _shape_covariance(sample, drive, families, flat)
+    sizes = _by_family(families, flat)
     return DriveChoice(
         joint=sample.joints[drive.j],
         families=tuple(family.name for family in families),
-        terms=terms,
+        terms=_terms(drive, families, flat),
         tried=tried,
         shapes=tuple(
             FoundShape(
-                name=f"{families[at].name}.{families[at].shapes[k].name}",
-                value=sizes[at][k],
-                std_error=_shape_error(sample, drive, families, sizes, (at, k)),
-                unit=families[at].shapes[k].units[int(drive.slides)],
-                is_at_bound=is_at_bound,
+                name=f"{family.name}.{shape.name}",
+                value=float(value),
+                std_error=float(std_error),
+                unit=shape.units[int(drive.slides)],
+                is_at_bound=bool(is_edge),
             )
-            for at, k, is_at_bound in shapes
+            for (family, shape), value, std_error, is_edge in zip(
+                shapes, flat, np.sqrt(np.diag(covariance)), is_at_bound, strict=True
+            )
         ),
-        sizes=tuple(tuple(own) for own in sizes),
+        shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
+        sizes=sizes,
         seen=drive.seen,
     )
 
 
-def _columns(drive: _Drive, families: Sequence[Family], sizes: Sequence[Sequence[float]]) -> Array:
-    parts = [
-        drive.columns(f.make(drive.seen, *own)) for f, own in zip(families, sizes, strict=True)
-    ]
-    return np.hstack(parts)
+def _by_family(families: Sequence[Family], flat: Array) -> tuple[tuple[float, ...], ...]:
+    """Return the shapes of each family, of all in a row."""
+    sizes = iter(flat.tolist())
+    return tuple(tuple(next(sizes) for _ in family.shapes) for family in families)
+
+
+def _terms(drive: _Drive, families: Sequence[Family], flat: Array) -> tuple[DriveTerm, ...]:
+    every = zip(families, _by_family(families, flat), strict=True)
+    return tuple(term for family, own in every for term in family.make(drive.seen, *own))
 
 
 def _refined(
-    sample: Sample,
-    drive: _Drive,
-    families: Sequence[Family],
-    sizes: Sequence[Sequence[float]],
-    which: tuple[int, int],
-) -> float:
-    """Return the size of one shape that leaves least of the held-out stretches, near its own."""
-    from scipy.optimize import minimize_scalar
+    sample: Sample, drive: _Drive, families: Sequence[Family], start: Array, bounds: Array
+) -> Array:
+    """Return the shapes that together leave least of the fitted rows, near where they start.
 
-    at, k = which
-    low, high = families[at].shapes[k].within(drive.seen)
-    step = np.log(high / low) / (_GRID - 1)
-    own = np.log(sizes[at][k])
+    Args:
+        sample: The rows.
+        drive: The joint's drive.
+        families: What it has.
+        start: Its k shapes on their grid.
+        bounds: Logarithms of where they are sought, shape (k, 2).
+    """
+    from scipy.optimize import minimize
 
-    def left(log_size: float) -> float:
-        tried = [list(x) for x in sizes]
-        tried[at][k] = float(np.exp(log_size))
-        Z = _columns(drive, families, tried)
-        apart, _ = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
-        return float(apart.left(list(range(Z.shape[1])))[: sample.fitted].sum())
+    if not len(start):
+        return start
 
-    bounds = (max(own - step, np.log(low)), min(own + step, np.log(high)))
-    found = minimize_scalar(left, bounds=bounds, method="bounded", options={"maxiter": 12})
-    return float(np.exp(found.x)) if found.fun <= left(own) else float(sizes[at][k])
+    def left(log_sizes: Array) -> float:
+        Z = drive.columns(_terms(drive, families, np.exp(log_sizes)))
+        _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+        return float(np.log(whole.left(list(range(Z.shape[1])))[: sample.fitted].sum() + _NOTHING))
+
+    options = {"eps": _STEP, "maxiter": _STEPS}
+    found = minimize(left, np.log(start), method="L-BFGS-B", bounds=bounds, options=options)
+    return np.exp(found.x) if found.fun <= left(np.log(start)) else start
 
 
-def _shape_error(
-    sample: Sample,
-    drive: _Drive,
-    families: Sequence[Family],
-    sizes: Sequence[Sequence[float]],
-    which: tuple[int, int],
-) -> float:
-    """Return the standard error of a shape: that of the column d(torque)/d(shape) beside all."""
-    at, k = which
-    Z = _columns(drive, families, sizes)
+def _shape_covariance(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> Array:
+    """Return the covariance of shapes: that of the columns d(torque)/d(shape) beside all."""
+    if not len(flat):
+        return np.empty((0, 0))
+    Z = drive.columns(_terms(drive, families, flat))
     _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
     theta = whole.parameters(list(range(Z.shape[1])))
-    moved = [list(x) for x in sizes]
-    h = _STEP * sizes[at][k]
-    moved[at][k] += h
-    slope = (_columns(drive, families, moved) - Z) @ theta / h
-    _, beside = trials(sample, slice(drive.j, drive.j + 1), np.column_stack([Z, slope])[:, None])
-    every = list(range(Z.shape[1] + 1))
-    _, covariance = beside.estimate(every, sample.fitted)
-    return float(np.sqrt(max(covariance[-1, -1], 0.0)))
+    slopes = np.empty((len(Z), len(flat)))
+    for k, h in enumerate(_STEP * flat):
+        moved = drive.columns(_terms(drive, families, flat + h * (np.arange(len(flat)) == k)))
+        slopes[:, k] = (moved - Z) @ theta / h
+    _, beside = trials(sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None])
+    _, covariance = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
+    return covariance[Z.shape[1] :, Z.shape[1] :]

@@ -4,7 +4,7 @@ A term that the drives have and the model lacks moves the other parameters, by -
 what it would be. That is no noise, and does not shrink with the length of the log: its square adds
 to their covariance. A shape that was found beside them has an error of its own, and so do they:
 
-    C += sum_terms (T theta) (T theta)^T + sum_shapes T var(s) T^T,  T = (W^T W + C_0^-1)^-1 W^T z
+    C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
 """
 
 from collections.abc import Iterator, Sequence
@@ -63,7 +63,10 @@ def _wider(found: "Identification", sample: Sample, moved: Sequence[Array]) -> "
 
 
 def _of_shapes(found: "Identification", sample: Sample) -> Iterator[Array]:
-    """Yield by how much an error of each shape moves base parameters over their spread, (b,)."""
+    """Yield by how much errors of shapes move base parameters over their spread, (b,) each.
+
+    Shapes of a joint err together: their covariance is C_s = L L^T, one move for each column of L.
+    """
     if not any(choice.shapes for choice in found.drives):
         return
     kept = [e for e in found.validation if not e.is_refitted]
@@ -71,14 +74,18 @@ def _of_shapes(found: "Identification", sample: Sample) -> Iterator[Array]:
     motions = [drive_motion_along(found.model, x.trajectory) for x in recordings]
     for choice in found.drives:
         j = sample.joints.index(choice.joint)
-        for k, shape in enumerate(choice.shapes):
-            slopes = [
-                _slope(found, choice, k, motion.of(j))[rows]
-                for motion, rows in zip(motions, sample.taken, strict=True)
-            ]
-            g = np.concatenate(slopes)[:, None, None]
-            _, whole = trials(sample, slice(j, j + 1), g)
-            yield -shape.std_error * whole.T[:, 0]
+        if not choice.shapes:
+            continue
+        slopes = [
+            np.column_stack(
+                [_slope(found, choice, k, motion.of(j)) for k in range(len(choice.shapes))]
+            )[rows]
+            for motion, rows in zip(motions, sample.taken, strict=True)
+        ]
+        _, whole = trials(sample, slice(j, j + 1), np.concatenate(slopes)[:, None])
+        variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
+        L = axes * np.sqrt(np.maximum(variance, 0.0))  # (k, k)
+        yield from -(whole.T[:, :-1] @ L).T
 
 
 def _slope(
