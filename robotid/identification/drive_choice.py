@@ -9,7 +9,7 @@ with the linear parameters refitted each time (Golub, Pereyra 2003, variable pro
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -36,7 +36,7 @@ _LEAST = 0.05  # of the squared residual that is left, from which a family is wo
 _SEEN = 0.003  # of the torque: a gain that is smaller is not worth a parameter
 _ALIKE = 0.02  # of the squared residual, within which two families explain alike
 _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
-_SLOWEST = 0.02  # share of the rows that are slower than what counts as seen
+_SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _STEP = 1e-3  # relative, of a derivative
 _STEPS = 40  # of the search for all shapes of a joint together
@@ -94,6 +94,9 @@ class DriveChoice:
         shape_covariance: Their covariance, row by row.
         sizes: Shapes of each family.
         seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+        doubted: Terms that held-out stretches favour, but not beyond chance: they were not taken,
+            and errors count what they would move.
+        shape_moves: By how much each shape moves standard parameters, shape (p, k).
     """
 
     joint: str
@@ -104,6 +107,8 @@ class DriveChoice:
     shape_covariance: tuple[tuple[float, ...], ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    doubted: tuple[DriveTerm, ...] = ()
+    shape_moves: Array | None = field(default=None, compare=False, repr=False)
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes larger by a share.
@@ -241,8 +246,9 @@ class _Trials:
     fitted: int
 
     @classmethod
-    def of(cls, sample: Sample, drive: _Drive, families: Sequence[Family]) -> "_Trials":
-        own = list(_candidates(drive, families))
+    def of(
+        cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]
+    ) -> "_Trials":
         terms = [family.make(drive.seen, *sizes) for family, sizes in own]
         columns = [drive.columns(those) for those in terms]
         ends = np.cumsum([x.shape[1] for x in columns]).tolist()
@@ -287,9 +293,11 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
 
 def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
     """Return the fewest families that held-out stretches ask for."""
-    every = _Trials.of(sample, drive, [f for f in FAMILIES.values() if f.is_automatic])
+    grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
+    every = _Trials.of(sample, drive, grid)
     torque = float(sample.torque[drive.j])
     chosen: list[int] = []
+    doubted: list[tuple[Family, list[float]]] = []
     before = every.left([])
     tried = [Tried((), _percent(before, torque), 1.0, True)]
     for _ in range(_FAMILIES):
@@ -303,10 +311,17 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
         names = [every.own[i][0].name for i in chosen]
         tried += list(_told(every, left, before, torque, names, best))
         if best is None:
+            nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
+            if nearest is not None and left[nearest].sum() < before.sum():
+                doubted = [every.own[nearest]]
             break
-        chosen.append(best)
-        before = left[best]
-    return _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+        # between the sizes of the grid, or the next family would make up for that
+        own = _refined(sample, drive, [every.own[i] for i in (*chosen, best)])
+        every = _Trials.of(sample, drive, [*own, *grid])
+        chosen = list(range(len(own)))
+        before = every.left(chosen)
+    choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+    return replace(choice, doubted=_terms(drive, doubted))
 
 
 def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: float) -> int | None:
@@ -369,7 +384,7 @@ def _percent(left: Array, torque: float) -> float:
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
     """Return the families asked for, with the shapes that fit best."""
     families = [FAMILIES[name] for name in names]
-    every = _Trials.of(sample, drive, families)
+    every = _Trials.of(sample, drive, list(_candidates(drive, families)))
     groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
     missing = [name for name, group in zip(names, groups, strict=True) if not group]
     if missing:
@@ -397,19 +412,18 @@ def _found(
     tried: tuple[Tried, ...],
 ) -> DriveChoice:
     """Return the choice with its shapes refined."""
-    families = [family for family, _ in chosen]
+    refined = _refined(sample, drive, chosen)
+    families = [family for family, _ in refined]
+    flat = np.array([size for _, own in refined for size in own])
     shapes = [(family, shape) for family in families for shape in family.shapes]
-    bounds = np.log([shape.within(drive.seen) for _, shape in shapes]).reshape(-1, 2)
-    start = np.array([size for _, own in chosen for size in own])
-    flat = _refined(sample, drive, families, start, bounds)
+    bounds = _log_bounds(drive, families)
     margin = _EDGE * np.ptp(bounds, axis=1)
     is_at_bound = np.min(np.abs(np.log(flat)[:, None] - bounds), axis=1) < margin
     covariance = _shape_covariance(sample, drive, families, flat)
-    sizes = _by_family(families, flat)
     return DriveChoice(
         joint=sample.joints[drive.j],
         families=tuple(family.name for family in families),
-        terms=_terms(drive, families, flat),
+        terms=_terms(drive, refined),
         tried=tried,
         shapes=tuple(
             FoundShape(
@@ -424,47 +438,52 @@ def _found(
             )
         ),
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
-        sizes=sizes,
+        sizes=tuple(tuple(own) for _, own in refined),
         seen=drive.seen,
     )
 
 
-def _by_family(families: Sequence[Family], flat: Array) -> tuple[tuple[float, ...], ...]:
-    """Return the shapes of each family, of all in a row."""
+def _terms(
+    drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> tuple[DriveTerm, ...]:
+    """Return the terms of families with their shapes."""
+    return tuple(term for family, own in chosen for term in family.make(drive.seen, *own))
+
+
+def _with_shapes(
+    families: Sequence[Family], flat: Array
+) -> list[tuple[Family, list[float]]]:
+    """Return families with their shapes, of all in a row."""
     sizes = iter(flat.tolist())
-    return tuple(tuple(next(sizes) for _ in family.shapes) for family in families)
+    return [(family, [next(sizes) for _ in family.shapes]) for family in families]
 
 
-def _terms(drive: _Drive, families: Sequence[Family], flat: Array) -> tuple[DriveTerm, ...]:
-    every = zip(families, _by_family(families, flat), strict=True)
-    return tuple(term for family, own in every for term in family.make(drive.seen, *own))
+def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
+    """Return logarithms of where each shape is sought, shape (k, 2)."""
+    bounds = [shape.within(drive.seen) for family in families for shape in family.shapes]
+    return np.log(np.reshape(bounds, (-1, 2)))
 
 
 def _refined(
-    sample: Sample, drive: _Drive, families: Sequence[Family], start: Array, bounds: Array
-) -> Array:
-    """Return the shapes that together leave least of the fitted rows, near where they start.
-
-    Args:
-        sample: The rows.
-        drive: The joint's drive.
-        families: What it has.
-        start: Its k shapes on their grid.
-        bounds: Logarithms of where they are sought, shape (k, 2).
-    """
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> list[tuple[Family, list[float]]]:
+    """Return families with the shapes that together leave least of the fitted rows, near theirs."""
     from scipy.optimize import minimize
 
-    if not len(start):
-        return start
+    families = [family for family, _ in chosen]
+    start = np.log([size for _, own in chosen for size in own])
 
     def left(log_sizes: Array) -> float:
-        Z = drive.columns(_terms(drive, families, np.exp(log_sizes)))
+        Z = drive.columns(_terms(drive, _with_shapes(families, np.exp(log_sizes))))
         _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
         return float(np.log(whole.left(list(range(Z.shape[1])))[: sample.fitted].sum() + _NOTHING))
 
-    options = {"eps": _STEP, "maxiter": _STEPS}
-    found = minimize(left, np.log(start), method="L-BFGS-B", bounds=bounds, options=options)
-    return np.exp(found.x) if found.fun <= left(np.log(start)) else start
+    best = start
+    if len(start):
+        bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
+        found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
+        best = found.x if found.fun <= left(start) else start
+    return _with_shapes(families, np.exp(best))
 
 
 def _shape_covariance(
@@ -473,12 +492,13 @@ def _shape_covariance(
     """Return the covariance of shapes: that of the columns d(torque)/d(shape) beside all."""
     if not len(flat):
         return np.empty((0, 0))
-    Z = drive.columns(_terms(drive, families, flat))
+    Z = drive.columns(_terms(drive, _with_shapes(families, flat)))
     _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
     theta = whole.parameters(list(range(Z.shape[1])))
     slopes = np.empty((len(Z), len(flat)))
     for k, h in enumerate(_STEP * flat):
-        moved = drive.columns(_terms(drive, families, flat + h * (np.arange(len(flat)) == k)))
+        larger = flat + h * (np.arange(len(flat)) == k)
+        moved = drive.columns(_terms(drive, _with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
     _, beside = trials(sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None])
     _, covariance = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
