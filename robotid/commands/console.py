@@ -224,7 +224,7 @@ def terminal_progress(
 
 
 def _print_result(result: dict[str, Any]) -> None:
-    from robotid.identification.summary import error_lines, verdict_lines
+    from robotid.identification.summary import error_lines, friction_lines, verdict_lines
 
     structure, wls = result["structure"], result["wls"]
     before, after, _ = result["witness"]["masses"]
@@ -236,6 +236,7 @@ def _print_result(result: dict[str, Any]) -> None:
     _print_lines("fitted recordings", *error_lines(result["identification"], wls["identification"]))
     for ours, theirs in zip(result["validation"], wls["validation"], strict=True):
         _print_lines(f"kept apart: {ours['log']}", *error_lines(ours, theirs))
+    _print_lines(*friction_lines(result["friction"]))
     for warning in result["warnings"]:
         _print_lines(f"{warning['code']}: {warning['message']}")
     _print_lines(*verdict_lines(result["verdict"]))

@@ -349,20 +349,12 @@ def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:
 def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
     """Return what friction a joint has, and what was tried."""
     own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
+    told = drive.to_dict()
     return {
         "terms": [*own, *drive.families],
-        "shapes": [dataclasses.asdict(shape) for shape in drive.shapes],
-        "seen": {key: list(pair) for key, pair in drive.seen.items()},
+        **told,
         "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
-        "tried": [
-            {
-                "terms": [*own, *tried.families],
-                "held_out_error_pct": _finite(tried.held_out_error_pct),
-                "chance": _finite(tried.chance),
-                "is_taken": tried.is_taken,
-            }
-            for tried in drive.tried
-        ],
+        "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in told["tried"]],
     }
 
 
