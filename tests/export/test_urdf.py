@@ -352,7 +352,7 @@ def test_a_failure_while_writing_leaves_the_folder_as_it_was(source, tmp_path, r
     write_urdf(model, pi, tmp_path / "new.urdf")
     before = listing(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(urdf, "_text", lambda value: f"{value:.4g}")  # loses digits
+        patch.setattr(urdf, "numbers_text", lambda x: " ".join(f"{v:.4g}" for v in x))
         with pytest.raises(
             ModelError, match=r"new.urdf was not written: read back, it gives anoth"
         ):
