@@ -30,6 +30,7 @@ __all__ = [
 
 #: What simulators call the frame that does not move.
 WORLD = "world"
+_NAMED = 6  # meshes left out
 _ROUNDING = 1e-12  # of the largest eigenvalue of a pseudo-inertia: a smaller one below 0 is 0
 
 
@@ -169,7 +170,8 @@ def left_out_notes(
     if unstated:
         notes.append(f"{kind} has no place for {listed(unstated)}; the sidecar of the URDF has them")
     if meshes:
-        notes.append(f"left out, for they are not found or {kind} reads no such mesh: {listed(meshes)}")
+        names = listed((Path(mesh).name for mesh in meshes), _NAMED)
+        notes.append(f"meshes left out, not found or of a kind that {kind} has not: {names}")
     return notes
 
 

@@ -25,6 +25,9 @@ __all__ = ["write_mjcf"]
 #: Attribute of a joint, or of a tendon over several, that states a term of a drive.
 _ATTRIBUTES = {"armature": "armature", "viscous": "damping", "coulomb": "frictionloss"}
 _OFFSET = "offset"  # stated by the actuator's bias
+_SEEN = {"group": "2"}  # what the viewer shows by default
+#: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.
+_SIZES = {"box": (0.5,), "sphere": (1.0,), "cylinder": (1.0, 0.5)}
 _MOST_FACES = 200_000  # of a mesh that MuJoCo reads
 _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo reads no STL written as text
 
@@ -74,8 +77,9 @@ def write_mjcf(
         bodies[link.name] = body = _add_body(bodies[link.parent], link, values)
         if model.free_flyer and link.parent == WORLD:
             body.insert(0, ET.Element("freejoint", name="root_joint"))
+        is_seen = any(tag == "visual" for tag, _ in link.shapes)
         for tag, shape in link.shapes:
-            _add_geom(body, tag, shape, files)
+            _add_geom(body, {"class": tag} | ({} if is_seen else _SEEN), shape, files)
     _add_drives(top, model, values)
     ET.indent(top)
     write_text(ET.tostring(top, encoding="unicode") + "\n", target)
@@ -97,7 +101,7 @@ def _add_defaults(top: ET.Element) -> None:
     """Add the classes of geoms: seen only, or touching the world but not the robot itself."""
     default = ET.SubElement(top, "default")
     for name, conduct in (
-        ("visual", {"group": "2", "contype": "0", "conaffinity": "0"}),
+        ("visual", _SEEN | {"contype": "0", "conaffinity": "0"}),
         ("collision", {"group": "3", "contype": "1", "conaffinity": "0"}),
     ):
         ET.SubElement(ET.SubElement(default, "default", {"class": name}), "geom", conduct)
@@ -142,12 +146,14 @@ def _drive(name: str, values: dict[str, float]) -> dict[str, str]:
     return {key: numbers_text([value]) for key, value in stated.items() if value is not None}
 
 
-def _add_geom(body: ET.Element, tag: str, shape: Shape, files: dict[tuple[str, str], str]) -> None:
-    at = {"class": tag, **_pose(shape.placement)}
+def _add_geom(
+    body: ET.Element, at: dict[str, str], shape: Shape, files: dict[tuple[str, str], str]
+) -> None:
+    at = at | _pose(shape.placement)
     if shape.kind == "mesh":
         at |= {"type": "mesh", "mesh": files[shape.file, numbers_text(shape.size)]}
-    else:  # half lengths
-        sizes = np.array(shape.size) * {"box": [0.5], "sphere": [1.0], "cylinder": [1.0, 0.5]}[shape.kind]
+    else:
+        sizes = np.array(shape.size) * _SIZES[shape.kind]
         at |= {"type": shape.kind, "size": numbers_text(sizes)}
     if shape.rgba is not None:
         at["rgba"] = numbers_text(shape.rgba)
