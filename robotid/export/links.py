@@ -168,7 +168,9 @@ def left_out_notes(
         if value != 0.0 and not (term.name in terms and (has_couplings or d < len(layout.joints)))
     ]
     if unstated:
-        notes.append(f"{kind} has no place for {listed(unstated)}; the sidecar of the URDF has them")
+        notes.append(
+            f"{kind} has no place for {listed(unstated)}; the sidecar of the URDF has them"
+        )
     if meshes:
         names = listed((Path(mesh).name for mesh in meshes), _NAMED)
         notes.append(f"meshes left out, not found or of a kind that {kind} has not: {names}")
@@ -177,9 +179,7 @@ def left_out_notes(
 
 def _inertials(model: RobotModel, pi: Array) -> dict[str, Inertial]:
     """Return the inertials of the links that have one of their own."""
-    found = {
-        link: central_inertial(values) for link, values in link_parameters(model, pi).items()
-    }
+    found = {link: central_inertial(values) for link, values in link_parameters(model, pi).items()}
     for place in link_places(model):
         stated = model.tree.inertials.get(place.link)
         if place.link in found or place.is_lumped or stated is None:

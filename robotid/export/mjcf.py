@@ -33,7 +33,7 @@ _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo reads no STL written as text
 
 
 def write_mjcf(
-    model: RobotModel, pi: Array, target: str | Path, *, near: str | Path | None = None
+    model: RobotModel, pi: Array, target: str | Path, *, original: str | Path | None = None
 ) -> tuple[str, ...]:
     """Write standard parameters as an MJCF file.
 
@@ -48,7 +48,7 @@ def write_mjcf(
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
-        near: Another URDF beside which meshes are looked for.
+        original: The URDF that the model's was made of, beside which meshes are looked for, too.
 
     Returns:
         What the file does not state, a sentence each; its head has them, too.
@@ -58,7 +58,7 @@ def write_mjcf(
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the target is a folder.
     """
-    links, meshes = simulated_links(model, pi, _is_readable, [near] if near else [])
+    links, meshes = simulated_links(model, pi, _is_readable, [original] if original else [])
     terms = (*_ATTRIBUTES, _OFFSET)
     notes = left_out_notes("MJCF", model, pi, terms, meshes, has_couplings=True)
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))
@@ -122,7 +122,7 @@ def _add_meshes(top: ET.Element, links: tuple[SimulatedLink, ...]) -> dict[tuple
 
 
 def _add_body(parent: ET.Element, link: SimulatedLink, values: dict[str, float]) -> ET.Element:
-    body = ET.SubElement(parent, "body", name=link.name, **_pose(link.placement))
+    body = ET.SubElement(parent, "body", {"name": link.name} | _pose(link.placement))
     if link.inertial is not None:
         xx, xy, xz, yy, yz, zz = link.inertial.inertia
         ET.SubElement(
@@ -166,9 +166,8 @@ def _add_drives(top: ET.Element, model: RobotModel, values: dict[str, float]) ->
         ET.SubElement(top, tag) for tag in ("tendon", "equality", "actuator")
     )
     for coupling in model.layout.couplings:
-        tendon = ET.SubElement(
-            tendons, "fixed", name=coupling.name, **_drive(coupling.name, values)
-        )
+        at = {"name": coupling.name} | _drive(coupling.name, values)
+        tendon = ET.SubElement(tendons, "fixed", at)
         for joint, ratio in coupling.ratios:
             ET.SubElement(tendon, "joint", joint=joint, coef=numbers_text([ratio]))
     for each in model.tree.movable:

@@ -31,7 +31,7 @@ _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "lengt
 
 
 def write_sdf(
-    model: RobotModel, pi: Array, target: str | Path, *, near: str | Path | None = None
+    model: RobotModel, pi: Array, target: str | Path, *, original: str | Path | None = None
 ) -> tuple[str, ...]:
     """Write standard parameters as an SDF file of one model.
 
@@ -43,7 +43,7 @@ def write_sdf(
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
-        near: Another URDF beside which meshes are looked for.
+        original: The URDF that the model's was made of, beside which meshes are looked for, too.
 
     Returns:
         What the file does not state, a sentence each; its head has them, too.
@@ -53,13 +53,15 @@ def write_sdf(
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the target is a folder.
     """
-    links, meshes = simulated_links(model, pi, _is_readable, [near] if near else [])
+    links, meshes = simulated_links(model, pi, _is_readable, [original] if original else [])
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))
     notes = left_out_notes("SDF", model, pi, (*_DYNAMICS, _ROTOR), meshes)
     if _ROTOR in model.layout.terms:
         notes.append("armature is drake:rotor_inertia: Drake reads it, Gazebo does not")
     gravity = numbers_text(model.pin_model.gravity.linear)
-    notes.append(f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with")
+    notes.append(
+        f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with"
+    )
     leaders = {
         link.joint.name: leader
         for link in links
@@ -68,7 +70,8 @@ def write_sdf(
     version = _VERSION_OF_MIMIC if leaders else _VERSION
     top = ET.Element("sdf", {"version": version, "xmlns:drake": _DRAKE})
     top.append(ET.Comment(head_comment(model, notes)))
-    robot, holders = ET.SubElement(top, "model", name=model.name), {}
+    robot = ET.SubElement(top, "model", name=model.name)
+    holders: dict[str, ET.Element] = {}  # the element that shows what a link looks like
     for link in links:
         is_fixed = link.joint is None and not (model.free_flyer and link.parent == WORLD)
         if is_fixed and link.inertial is None and link.parent in holders:

@@ -292,8 +292,7 @@ def _inertial(parameters: Array) -> list[str]:
     """Return an ``<inertial>`` about the centre of mass, line by line."""
     body = central_inertial(parameters)
     moments = " ".join(
-        f'{key}="{numbers_text([value])}"'
-        for key, value in zip(MOMENTS, body.inertia, strict=True)
+        f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, body.inertia, strict=True)
     )
     return [
         "<inertial>",
