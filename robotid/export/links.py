@@ -11,11 +11,11 @@ from robotid._typing import Array
 from robotid.exceptions import ModelError
 from robotid.export.urdf import link_parameters
 from robotid.findings import listed
-from robotid.robot.bodies import central_inertial, inertial_parameters, link_places
+from robotid.robot.bodies import inertial_parameters, link_places
 from robotid.robot.meshes import Shape, find_mesh, read_shapes
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.robot.tree import Inertial, Joint
+from robotid.robot.tree import Joint
 from robotid.versions import __version__
 
 __all__ = [
@@ -43,8 +43,8 @@ class SimulatedLink:
         parent: Link that it hangs on, or "world".
         placement: Pose in the parent's frame, of joints at 0 but for locked ones, shape (4, 4).
         joint: The joint that moves it; None if it is fixed to its parent, or floats.
-        inertial: Its mass, centre and inertia about it, in its own axes; None if it has none of
-            its own, since that of the link it is fixed to holds it.
+        inertial: Its inertial parameters, shape (10,); None if it has none of its own, as where
+            those of the link that it is fixed to hold it.
         shapes: What it looks like, "visual", and what it touches with, "collision"; meshes by the
             path of their file.
     """
@@ -53,7 +53,7 @@ class SimulatedLink:
     parent: str
     placement: Array
     joint: Joint | None
-    inertial: Inertial | None
+    inertial: Array | None
     shapes: tuple[tuple[str, Shape], ...]
 
 
@@ -177,9 +177,9 @@ def left_out_notes(
     return notes
 
 
-def _inertials(model: RobotModel, pi: Array) -> dict[str, Inertial]:
-    """Return the inertials of the links that have one of their own."""
-    found = {link: central_inertial(values) for link, values in link_parameters(model, pi).items()}
+def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
+    """Return the parameters, shape (10,), of the links that have an inertial of their own."""
+    found = link_parameters(model, pi)
     for place in link_places(model):
         stated = model.tree.inertials.get(place.link)
         if place.link in found or place.is_lumped or stated is None:
@@ -187,7 +187,7 @@ def _inertials(model: RobotModel, pi: Array) -> dict[str, Inertial]:
         values = inertial_parameters(stated)
         eigenvalues = np.linalg.eigvalsh(pseudo_inertia(values)[0])
         if eigenvalues[0] >= -_ROUNDING * abs(eigenvalues[-1]) and values[0] > 0:
-            found[place.link] = central_inertial(values)
+            found[place.link] = values
         elif place.body >= 0 and values.any():  # one that is fixed to the world changes nothing
             raise ModelError(
                 f"link {place.link!r}, behind a locked joint, has an impossible inertial, which no "

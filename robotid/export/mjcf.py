@@ -17,6 +17,7 @@ from robotid.export.links import (
     simulated_links,
 )
 from robotid.export.urdf import numbers_text
+from robotid.robot.bodies import principal_moments
 from robotid.robot.meshes import Shape
 from robotid.robot.model import RobotModel
 
@@ -124,17 +125,17 @@ def _add_meshes(top: ET.Element, links: tuple[SimulatedLink, ...]) -> dict[tuple
 def _add_body(parent: ET.Element, link: SimulatedLink, values: dict[str, float]) -> ET.Element:
     body = ET.SubElement(parent, "body", {"name": link.name} | _pose(link.placement))
     if link.inertial is not None:
-        xx, xy, xz, yy, yz, zz = link.inertial.inertia
-        ET.SubElement(
-            body, "inertial", pos=numbers_text(link.inertial.com),
-            mass=numbers_text([link.inertial.mass]),
-            fullinertia=numbers_text([xx, yy, zz, xy, xz, yz]),
-        )  # fmt: skip
+        second, axes = principal_moments(link.inertial)
+        x, y, z = np.maximum(second, 0.0)  # exactly so, for MuJoCo wants A + B >= C to the last bit
+        centre = np.eye(4)
+        centre[:3, :3], centre[:3, 3] = axes, link.inertial[1:4] / link.inertial[0]
+        mass, moments = numbers_text(link.inertial[:1]), numbers_text([y + z, z + x, x + y])
+        ET.SubElement(body, "inertial", _pose(centre) | {"mass": mass, "diaginertia": moments})
     joint = link.joint
     if joint is not None:
         kind = "slide" if joint.type == "prismatic" else "hinge"
         at = {"name": joint.name, "type": kind, "axis": numbers_text(joint.axis)}
-        if joint.has_limits and joint.type != "continuous":
+        if joint.has_limits:
             at["range"] = numbers_text([joint.lower, joint.upper])
         ET.SubElement(body, "joint", at | _drive(joint.name, values))
     return body

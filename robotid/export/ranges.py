@@ -19,7 +19,8 @@ from robotid.export.shape import NUMBER, TEXT
 from robotid.export.urdf import link_parameters
 from robotid.identification.bands import REACH
 from robotid.identification.pipeline import Identification
-from robotid.robot.parameters import pseudo_inertia, pseudo_inertia_basis
+from robotid.robot.bodies import principal_moments
+from robotid.robot.parameters import pseudo_inertia_basis
 from robotid.versions import __version__
 
 __all__ = ["RANGES", "parameter_ranges", "ranges_text", "write_ranges"]
@@ -48,7 +49,7 @@ what must be more than 0 are those of its logarithm. source says what the interv
   data   the motion;
   prior  the motion says nothing, and it is how wrong the URDF may plausibly be;
   mixed  both, or in sums with others;
-  bound  physics holds the value where it is. Without low and high no interval is known.
+  bound  physics holds the value where it is; a drive at 0 has no known interval: no low, no high.
 
 second_moments are the integrals of x^2, y^2, z^2 dm about the centre of mass along the principal
 axes, whose quaternion w x y z turns them into the link's. The principal moments of inertia are
@@ -86,8 +87,9 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
+        source = "bound" if found.at_bound[k] else sources[k]
         drives[name][layout.names[k].removeprefix(f"{name}.")] = _range(
-            found.standard[k], errors[k], sources[k], least=least
+            found.standard[k], errors[k], source, least=least
         ) | {"unit": layout.units[k]}
     return {
         "robot": found.model.name,
@@ -127,11 +129,9 @@ def ranges_text(ranges: Mapping[str, Any]) -> str:
 def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any]:
     """Return the ranges of a link of ten parameters, shape (10,), with covariance (10, 10)."""
     m, c = pi[0], pi[1:4] / pi[0]
-    H = np.column_stack([np.eye(3), -c])  # (3, 4): H J H^T is the second moment about the centre
-    moments, V = np.linalg.eigh(H @ pseudo_inertia(pi)[0] @ H.T)
-    V[:, 0] *= np.sign(np.linalg.det(V))  # right-handed
-    # J is linear in pi, and what c changes of H J H^T is of second order
-    P = V.T @ H
+    moments, V = principal_moments(pi)
+    # moments = diag(P J P^T) with J linear in pi; what c changes of it is of second order
+    P = V.T @ np.column_stack([np.eye(3), -c])  # (3, 4)
     d_moments = np.einsum("ka,iab,kb->ki", P, pseudo_inertia_basis(), P)
     d_com = (np.eye(10)[1:4] - np.outer(c, np.eye(10)[0])) / m
     d_inertia = d_moments.sum(axis=0) - d_moments
@@ -188,6 +188,6 @@ def _flow(entry: Any) -> str:  # noqa: ANN401
     if isinstance(entry, list):
         return "[" + ", ".join(map(_flow, entry)) + "]"
     if isinstance(entry, float):  # YAML 1.1 reads 1e-05 as text, and 1.0e-05 as a number
-        mantissa, e, exponent = repr(entry).partition("e")
+        mantissa, e, exponent = f"{entry:.6g}".partition("e")
         return mantissa + (".0" if e and "." not in mantissa else "") + e + exponent
     return json.dumps(entry, ensure_ascii=False)

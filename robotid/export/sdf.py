@@ -15,6 +15,7 @@ from robotid.export.links import (
     simulated_links,
 )
 from robotid.export.urdf import numbers_text
+from robotid.robot.bodies import central_inertial
 from robotid.robot.meshes import Shape
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOMENTS, Joint
@@ -56,8 +57,7 @@ def write_sdf(
     links, meshes = simulated_links(model, pi, _is_readable, [original] if original else [])
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))
     notes = left_out_notes("SDF", model, pi, (*_DYNAMICS, _ROTOR), meshes)
-    if _ROTOR in model.layout.terms:
-        notes.append("armature is drake:rotor_inertia: Drake reads it, Gazebo does not")
+    notes.append("Drake reads armature (drake:rotor_inertia), not friction; Gazebo the reverse")
     gravity = numbers_text(model.pin_model.gravity.linear)
     notes.append(
         f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with"
@@ -118,11 +118,11 @@ def _add_link(robot: ET.Element, link: SimulatedLink) -> ET.Element:
     element = ET.SubElement(robot, "link", name=link.name)
     _add_pose(element, link.placement, link.parent)
     if link.inertial is not None:
-        inertial = ET.SubElement(element, "inertial")
-        _add(inertial, "pose", *link.inertial.com, 0.0, 0.0, 0.0)
-        _add(inertial, "mass", link.inertial.mass)
+        inertial, stated = ET.SubElement(element, "inertial"), central_inertial(link.inertial)
+        _add(inertial, "pose", *stated.com, 0.0, 0.0, 0.0)
+        _add(inertial, "mass", stated.mass)
         inertia = ET.SubElement(inertial, "inertia")
-        for tag, moment in zip(MOMENTS, link.inertial.inertia, strict=True):
+        for tag, moment in zip(MOMENTS, stated.inertia, strict=True):
             _add(inertia, tag, moment)
     return element
 

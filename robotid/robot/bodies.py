@@ -10,7 +10,14 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.robot.tree import Inertial
 
-__all__ = ["LinkPlace", "central_inertial", "held_parameters", "inertial_parameters", "link_places"]
+__all__ = [
+    "LinkPlace",
+    "central_inertial",
+    "held_parameters",
+    "inertial_parameters",
+    "link_places",
+    "principal_moments",
+]
 
 
 @dataclass(frozen=True)
@@ -105,3 +112,20 @@ def central_inertial(parameters: Array) -> Inertial:
     I = about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))  # (3, 3), Steiner  # noqa: E741
     moments = tuple(I[np.triu_indices(3)].tolist())  # ixx ixy ixz iyy iyz izz
     return Inertial(m, tuple(c.tolist()), (0.0, 0.0, 0.0), moments)
+
+
+def principal_moments(parameters: Array) -> tuple[Array, Array]:
+    """Return the second moments of mass about the centre along the principal axes, and the axes.
+
+    The body is possible if none is negative. The moments of inertia are their sums by pairs.
+
+    Args:
+        parameters: Inertial parameters of a body with mass, shape (10,).
+
+    Returns:
+        Moments, shape (3,), ascending [kg m^2]; axes, right-handed, in columns, shape (3, 3).
+    """
+    H = np.column_stack([np.eye(3), -parameters[1:4] / parameters[0]])  # to the centre
+    moments, axes = np.linalg.eigh(H @ pseudo_inertia(parameters)[0] @ H.T)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return moments, axes
