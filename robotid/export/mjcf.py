@@ -29,6 +29,8 @@ _OFFSET = "offset"  # stated by the actuator's bias
 _SEEN = {"group": "2"}  # what the viewer shows by default
 #: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.
 _SIZES = {"box": (0.5,), "sphere": (1.0,), "cylinder": (1.0, 0.5)}
+#: How friction gives way: with MuJoCo's 0.9 a light joint creeps under less than its friction.
+_STIFF = {"solimpfriction": "0.999 0.999 0.001 0.5 2"}
 _MOST_FACES = 200_000  # of a mesh that MuJoCo reads
 _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo reads no STL written as text
 
@@ -99,8 +101,10 @@ def _is_readable(mesh: Path) -> bool:
 
 
 def _add_defaults(top: ET.Element) -> None:
-    """Add the classes of geoms: seen only, or touching the world but not the robot itself."""
+    """Add how friction gives way, and geoms: seen only, or touching the world, not the robot."""
     default = ET.SubElement(top, "default")
+    for tag in ("joint", "tendon"):
+        ET.SubElement(default, tag, _STIFF)
     for name, conduct in (
         ("visual", _SEEN | {"contype": "0", "conaffinity": "0"}),
         ("collision", {"group": "3", "contype": "1", "conaffinity": "0"}),

@@ -105,6 +105,16 @@ def test_inverse_dynamics_on_a_log_are_the_fits(identified, tmp_path):
     np.testing.assert_allclose(found[moves], wanted[moves], atol=1e-9 * abs(wanted).max(), rtol=0)
 
 
+def test_friction_is_coulombs_at_slow_speeds_too(identified, tmp_path):
+    model, pi = identified.model, identified.standard
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    data.qpos, data.qvel, data.qacc = 0.5, 0.005, 0.0
+    mujoco.mj_inverse(robot, data)
+    coulomb = [pi[model.layout.names.index(f"{joint}.coulomb")] for joint in model.joints]
+    np.testing.assert_allclose(-data.qfrc_constraint, coulomb, rtol=1e-12)
+
+
 def test_limits_shapes_and_meshes(tmp_path):
     box = b"\0" * 80 + (4).to_bytes(4, "little")
     corners = np.vstack([np.zeros(3), np.eye(3)]).astype("<f4")
