@@ -24,7 +24,12 @@ from robotid.robot.model import RobotModel
 __all__ = ["write_mjcf"]
 
 #: Attribute of a joint, or of a tendon over several, that states a term of a drive.
-_ATTRIBUTES = {"armature": "armature", "viscous": "damping", "coulomb": "frictionloss"}
+_ATTRIBUTES = {
+    "armature": "armature",
+    "viscous": "damping",
+    "coulomb": "frictionloss",
+    "spring": "stiffness",
+}
 _OFFSET = "offset"  # stated by the actuator's bias
 _SEEN = {"group": "2"}  # what the viewer shows by default
 #: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.

@@ -1,7 +1,6 @@
 """What MuJoCo loads moves as what was identified."""
 
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial.distance import pdist
 
 from robotid.exceptions import ModelError
 from robotid.export.mjcf import write_mjcf
-from robotid.robot.drives import DRIVE_TERMS, TERMS
+from robotid.robot.drives import Cubic, Spring
 from robotid.robot.model import RobotModel
 
 OFF = mujoco.mjtDisableBit
@@ -158,12 +157,16 @@ def test_joints_that_follow_are_held_to_their_leader(tmp_path):
     assert robot.nu == robot.nv - 1
 
 
-def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(TERMS, "cubic", replace(TERMS["viscous"], name="cubic", dynamics=None))
-    model = small(tmp_path, terms=(*DRIVE_TERMS, "cubic"))
+def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
+    model = small(tmp_path, own_terms={"j": [Cubic()], "k": [Spring(), Cubic()]})
     pi = possible_parameters(model, np.random.default_rng(0))
     pi[model.layout.names.index("j.cubic")] = 0.0  # nothing is lost of it
+    pi[model.layout.names.index("k.spring")] = stiffness = -3.0
     notes = write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    data.qpos = [0.0, 0.4]
+    mujoco.mj_forward(robot, data)
+    np.testing.assert_allclose(data.qfrc_passive, [0.0, -stiffness * 0.4])
     assert notes[0] == "MJCF has no place for k.cubic; the sidecar of the URDF has them"
     parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
     comment = ET.parse(tmp_path / "robot.xml", parser).getroot()[0].text
