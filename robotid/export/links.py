@@ -78,7 +78,7 @@ def simulated_links(
         ModelError: If a link or a drive would be physically impossible, or has the world's name.
     """
     inertials = _inertials(model, pi)
-    shapes, left_out = _shapes(model, is_readable, [model.tree.path, *near])
+    shapes, left_out = _shapes(model, is_readable, [*near, model.tree.path])
     arriving = {joint.child: joint for joint in model.tree.joints}
     if WORLD in arriving or (model.free_flyer and model.tree.root == WORLD):
         raise ModelError(

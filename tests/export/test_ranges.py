@@ -96,10 +96,13 @@ def test_sources_are_said_and_a_drive_at_its_bound_has_no_interval(identified):
     at = layout.names.index("elbow_joint.coulomb")
     standard = identified.standard.copy()
     standard[at] = 0.0
-    content = parameter_ranges(replace(identified, standard=standard))
+    unbounded = replace(identified.errors, unbounded=None)
+    held = replace(identified, standard=standard, errors=unbounded)
+    assert held.sources[at] == "prior"  # the URDF's value, 0, stands; but no interval is known
+    content = parameter_ranges(held)
     bound = {"nominal": 0.0, "source": "bound", "unit": "N m"}
     assert content["drives"]["elbow_joint"]["coulomb"] == bound
-    sources = dict(zip(layout.names, identified.sources, strict=True))
+    sources = dict(zip(layout.names, held.sources, strict=True))
     assert len(set(sources.values())) > 1
     for (owner, key, inner), figure in figures(content):
         if key in ("mass", "com"):
