@@ -7,7 +7,7 @@ from typing import Any
 
 from robotid._files import write_text
 from robotid.exceptions import DataError
-from robotid.export.links import left_out_notes
+from robotid.export.links import unstated_terms
 from robotid.export.mjcf import write_mjcf
 from robotid.export.ranges import ranges_text
 from robotid.export.result import Result, load_result
@@ -43,7 +43,7 @@ def _urdf(result: Result, target: Path) -> tuple[list[str], list[str]]:
     model, pi = result.identified
     sidecar = write_urdf(model, pi, target, dynamics=True)
     terms = [name for name, term in TERMS.items() if term.dynamics]
-    return [str(target), str(sidecar)], left_out_notes("URDF", model, pi, terms)
+    return [str(target), str(sidecar)], unstated_terms(model, pi, "URDF", terms)
 
 
 def _simulator(

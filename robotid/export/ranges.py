@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from robotid._files import write_text
 from robotid._typing import Array
-from robotid.export.links import quaternion
 from robotid.export.shape import NUMBER, TEXT
 from robotid.export.urdf import link_parameters
 from robotid.identification.bands import REACH
@@ -140,7 +140,7 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any
     errors = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, covariance, D), 0.0))
     origins = [sources[0], *(_joint_source([sources[0], sources[k]]) for k in (1, 2, 3))]
     origins += [_joint_source(sources)] * 6
-    x, y, z, w = quaternion(V)
+    x, y, z, w = Rotation.from_matrix(V).as_quat()
     mass, *rest = (
         _range(value, error, origin, is_positive=not 1 <= k <= 3)
         for k, (value, error, origin) in enumerate(zip(values, errors, origins, strict=True))

@@ -110,7 +110,7 @@ def test_sources_are_said_and_a_drive_at_its_bound_has_no_interval(identified):
         elif key in ("second_moments", "principal_moments"):
             own = {source for name, source in sources.items() if name.startswith(f"{owner}.")}
         else:
-            own = {"bound" if figure == bound else sources[f"{owner}.{key}"]}
+            own = {sources[f"{owner}.{key}"] if "low" in figure else "bound"}
         assert figure["source"] == (own.pop() if len(own) == 1 else "mixed")
     assert content["undetermined"] == list(identified.determination.undetermined)
 
