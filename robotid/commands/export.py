@@ -1,7 +1,6 @@
 """A written result in the formats of simulators."""
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from robotid.exceptions import DataError
 from robotid.export.links import unstated_terms
 from robotid.export.mjcf import write_mjcf
 from robotid.export.ranges import ranges_text
-from robotid.export.result import Result, load_result
+from robotid.export.result import load_result
 from robotid.export.sdf import write_sdf
 from robotid.export.urdf import write_urdf
 from robotid.robot.drives import TERMS
@@ -34,41 +33,24 @@ def export_result(path: str | Path, kind: str, target: str | Path) -> dict[str, 
         ModelError: If the URDF was changed, or a link of it is impossible.
         SettingsError: If the target is a folder.
     """
-    result = load_result(path)
-    files, notes = _WRITERS[kind](result, Path(target))
-    return {"result": str(path), "format": kind, "files": files, "not_stated": list(notes)}
-
-
-def _urdf(result: Result, target: Path) -> tuple[list[str], list[str]]:
+    result, goal = load_result(path), Path(target)
     model, pi = result.identified
-    sidecar = write_urdf(model, pi, target, dynamics=True)
-    terms = [name for name, term in TERMS.items() if term.dynamics]
-    return [str(target), str(sidecar)], unstated_terms(model, pi, "URDF", terms)
-
-
-def _simulator(
-    write: Callable[..., tuple[str, ...]], result: Result, target: Path
-) -> tuple[list[str], tuple[str, ...]]:
-    originals = (entry["path"] for entry in result.content["inputs"] if entry["role"] == "urdf")
-    notes = write(*result.identified, target, original=next(originals, None))
-    return [str(target)], notes
-
-
-def _ranges(result: Result, target: Path) -> tuple[list[str], list[str]]:
-    if "ranges" not in result.content:
-        reason = (
-            "it was written by an earlier version; identify again"
-            if result.has_urdf
-            else f"its parameters are wrong or impossible: {result.verdict['reasons'][0]}"
-        )
-        raise DataError(f"{result.path.name} has no ranges, for {reason}")
-    write_text(ranges_text(result.content["ranges"]), target)
-    return [str(target)], []
-
-
-_WRITERS: Mapping[str, Callable[[Result, Path], Any]] = {
-    "urdf": _urdf,
-    "mjcf": partial(_simulator, write_mjcf),
-    "sdf": partial(_simulator, write_sdf),
-    "ranges": _ranges,
-}
+    sources = (entry["path"] for entry in result.content["inputs"] if entry["role"] == "urdf")
+    files, original = [str(goal)], next(sources, None)
+    notes: Sequence[str] = ()
+    match kind:
+        case "mjcf":
+            notes = write_mjcf(model, pi, goal, original=original)
+        case "sdf":
+            notes = write_sdf(model, pi, goal, original=original)
+        case "urdf":
+            files.append(str(write_urdf(model, pi, goal, dynamics=True)))
+            terms = [name for name, term in TERMS.items() if term.dynamics]
+            notes = unstated_terms(model, pi, "URDF", terms)
+        case _:
+            if "ranges" not in result.content:
+                raise DataError(
+                    f"{result.path.name} has no ranges: an earlier version wrote it; identify again"
+                )
+            write_text(ranges_text(result.content["ranges"]), goal)
+    return {"result": str(path), "format": kind, "files": files, "not_stated": list(notes)}
