@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from robotid._files import write_text
 from robotid._typing import Array
-from robotid.export.shape import NUMBER, TEXT
 from robotid.export.urdf import link_parameters
 from robotid.identification.bands import REACH
 from robotid.identification.pipeline import Identification
@@ -23,23 +22,7 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.parameters import pseudo_inertia_basis
 from robotid.versions import __version__
 
-__all__ = ["RANGES", "parameter_ranges", "ranges_text", "write_ranges"]
-
-_RANGE = {"nominal": NUMBER, "low?": NUMBER, "high?": NUMBER, "source": TEXT}
-#: The schema of ranges in result.json.
-RANGES = {
-    "robot": TEXT,
-    "confidence": NUMBER,
-    "bodies": {
-        ...: {
-            "mass": _RANGE,
-            "principal_axes": [NUMBER],
-            **{key: {...: _RANGE} for key in ("com", "second_moments", "principal_moments")},
-        }
-    },
-    "drives": {...: {...: {**_RANGE, "unit": TEXT}}},
-    "undetermined": [TEXT],
-}
+__all__ = ["parameter_ranges", "ranges_text", "write_ranges"]
 
 _HEAD = """\
 Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.

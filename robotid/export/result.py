@@ -14,7 +14,7 @@ from robotid._files import file_sha256, read_json
 from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
-from robotid.export.ranges import RANGES, parameter_ranges
+from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified
 from robotid.identification.bands import REACH
@@ -69,7 +69,7 @@ _SHAPE = {
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
-    "ranges?": RANGES,
+    "ranges?": {"robot": TEXT},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
     "verdict": {

@@ -220,10 +220,7 @@ def build_problem(
             q, v, a, direction, memory = (
                 None if x is None else x[part]
                 for x in (
-                    trajectory.q,
-                    trajectory.v,
-                    trajectory.a,
-                    trajectory.direction,
+                    trajectory.q, trajectory.v, trajectory.a, trajectory.direction,
                     trajectory.memory,
                 )
             )

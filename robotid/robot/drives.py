@@ -670,6 +670,4 @@ def _read_field(kind: type[DriveTerm], key: str, value: object, default: object)
 
 
 def _is_number(value: object) -> bool:
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))

@@ -96,11 +96,11 @@ def test_a_result_that_must_not_be_used_is_not_exported(result, tmp_path, capsys
         code, _, err = export(tmp_path / "bad", kind, tmp_path / "a", capsys)
         assert code == 1
         assert "for its parameters are wrong or impossible" in err
-    ranges["bodies"]["link_1"]["mass"]["low"] = "much"
+    ranges["robot"] = 3
     (tmp_path / "bad" / "result.json").write_text(json.dumps(content | {"ranges": ranges}))
     code, _, err = export(tmp_path / "bad", "ranges", tmp_path / "a", capsys)
     assert code == 1
-    assert "result.json.ranges.bodies.link_1.mass.low is 'much', wanted a number" in err
+    assert "result.json.ranges.robot is 3, wanted text" in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
 
 
