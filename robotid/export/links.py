@@ -53,7 +53,8 @@ class SimulatedLink:
         name: Its name.
         parent: Link that it hangs on, or "world".
         pose: Its pose in the parent's frame, joints at 0 but for locked ones.
-        joint: The joint that moves it; None if it is fixed to its parent, or floats.
+        joint: The joint that it hangs on; None if it is the root.
+        moves: Whether that joint moves it; if not, it is fixed or locked.
         leader: Joint that this one follows, ratio, offset; None if it leads itself.
         floats: Whether it is the floating base.
         inertial: Its inertial parameters, shape (10,); None if it has none of its own, as where
@@ -66,6 +67,7 @@ class SimulatedLink:
     parent: str
     pose: Array
     joint: Joint | None
+    moves: bool
     leader: tuple[str, float, float] | None
     floats: bool
     inertial: Array | None
@@ -160,12 +162,12 @@ def _links(
         joint, parent, pose = arriving.get(name), WORLD, np.eye(7)[6]
         if joint is not None:
             parent, pose = joint.parent, _pose(joint, model.locked.get(joint.name, 0.0))
-        if joint is not None and (not joint.is_movable or joint.name in model.locked):
-            joint = None
-        leader = None if joint is None or joint.name in model.joints else _leader(model, joint)
+        moves = joint is not None and joint.is_movable and joint.name not in model.locked
+        follows = joint is not None and moves and joint.name not in model.joints
+        leader = _leader(model, joint) if joint is not None and follows else None
         floats = model.free_flyer and name == model.tree.root
         own = inertials.get(name), shapes.get(name, [])
-        links.append(SimulatedLink(name, parent, pose, joint, leader, floats, *own))
+        links.append(SimulatedLink(name, parent, pose, joint, moves, leader, floats, *own))
     return links
 
 

@@ -116,7 +116,7 @@ def _add_motion(body: ET.Element, link: SimulatedLink, values: Mapping[str, floa
         ET.SubElement(body, "inertial", _pose(pose) | {"mass": mass, "diaginertia": inertia})
     if link.floats:
         ET.SubElement(body, "freejoint", name="root_joint")
-    if (joint := link.joint) is not None:
+    if (joint := link.joint) is not None and link.moves:
         kind = "slide" if joint.type == "prismatic" else "hinge"
         at = {"name": joint.name, "type": kind, "axis": numbers_text(joint.axis)}
         if joint.has_limits:

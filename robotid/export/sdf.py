@@ -63,8 +63,8 @@ def _sdf(name: str, links: Sequence[SimulatedLink], values: Mapping[str, float])
     robot = ET.SubElement(top, "model", name=name)
     holders: dict[str, ET.Element] = {}  # the element that shows what a link looks like
     for link in links:
-        is_fixed = link.joint is None and not link.floats
-        if is_fixed and link.inertial is None and link.parent in holders:
+        is_frame = not (link.moves or link.floats) and link.inertial is None
+        if is_frame and link.parent in holders:
             frame = ET.SubElement(robot, "frame", name=link.name, attached_to=link.parent)
             _add_pose(frame, link.pose, link.parent)
             holders[link.name] = holders[link.parent]
@@ -106,11 +106,12 @@ def _add_link(robot: ET.Element, link: SimulatedLink) -> ET.Element:
 
 
 def _add_joint(robot: ET.Element, link: SimulatedLink, values: Mapping[str, float]) -> None:
-    joint = link.joint or Joint(f"{link.name}_fixed", "fixed", link.parent, link.name)
-    element = ET.SubElement(robot, "joint", name=joint.name, type=joint.type)
+    joint = link.joint or Joint(f"{WORLD}_to_{link.name}", "fixed", WORLD, link.name)
+    kind = joint.type if link.moves else "fixed"
+    element = ET.SubElement(robot, "joint", name=joint.name, type=kind)
     ET.SubElement(element, "parent").text = link.parent
     ET.SubElement(element, "child").text = link.name
-    if link.joint is None:
+    if not link.moves:
         return
     axis = ET.SubElement(element, "axis")
     _add(axis, "xyz", *joint.axis)
