@@ -156,8 +156,7 @@ class RobotModel:
             "mimic": self.mimic,
             "terms": list(self.layout.terms),
             "own_terms": {
-                name: [term.to_dict() for term in terms]
-                for name, terms in self.layout.own.items()
+                name: [term.to_dict() for term in terms] for name, terms in self.layout.own.items()
             },
         }
 
