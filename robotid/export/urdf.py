@@ -33,6 +33,7 @@ __all__ = [
     "load_identified",
     "numbers_text",
     "read_sidecar",
+    "terms_from_facts",
     "write_urdf",
 ]
 
