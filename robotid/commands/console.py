@@ -156,6 +156,7 @@ def print_content(command: str, content: dict[str, Any]) -> None:
         "doctor": _print_findings,
         "validate": _print_validation,
         "compare": _print_comparison,
+        "export": _print_export,
         "convert": _print_conversion,
     }
     prints[command](content)
@@ -334,6 +335,12 @@ def _print_findings(content: dict[str, Any]) -> None:
         for finding in content["findings"]:
             if finding["severity"] == severity:
                 print(f"{severity}: {finding['code']}: {finding['message']}")
+
+
+def _print_export(done: dict[str, Any]) -> None:
+    print(f"written: {', '.join(done['files'])}")
+    for note in done["not_stated"]:
+        print(f"  {note}")
 
 
 def _print_conversion(done: dict[str, Any]) -> None:
