@@ -291,7 +291,8 @@ def _print_comparison(content: dict[str, Any]) -> None:
     heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
     print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
     for entry in content["base_parameters"]:
-        cells = "".join(f"{value:10.4g}" for value in entry["values"])
+        values = entry["values"]
+        cells = "".join("-".rjust(10) if x is None else f"{x:10.4g}" for x in values)
         cells += "".join(cell(value, 10) for value in entry["differences"])
         print(f"  {entry['name']:{width}}{cells}")
     for key in ("settings", "versions"):
