@@ -9,9 +9,9 @@ with the linear parameters refitted each time (Golub, Pereyra 2003, variable pro
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import stdtr
@@ -109,6 +109,15 @@ class DriveChoice:
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     doubted: tuple[DriveTerm, ...] = ()
     shape_moves: Array | None = field(default=None, compare=False, repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was tried, taken and found, as plain values."""
+        return {
+            "families": list(self.families),
+            "shapes": [asdict(shape) for shape in self.shapes],
+            "seen": {key: list(pair) for key, pair in self.seen.items()},
+            "tried": [{**asdict(step), "families": list(step.families)} for step in self.tried],
+        }
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes larger by a share.
