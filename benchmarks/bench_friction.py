@@ -6,8 +6,8 @@ First: the validation error of each joint of the recordings of other laboratorie
 Coulomb friction and with ``friction = "auto"``; ratio is the one over the other. Second: simulated
 recordings of a UR10 with load friction on lift and elbow and a hook of Stribeck on the pan, noise
 of 2 % that forgets after 50 ms: how often 95 % intervals hold the truth. A parameter counts where
-the joint has no family beside that of the truth; the torque of a joint's friction, over the speeds seen and
-two loads, counts everywhere. Third: processor time on 1e5 samples of a Panda.
+the joint has no family beside that of the truth; the torque of a joint's friction, over the speeds
+seen and two loads, counts everywhere. Third: processor time on 1e5 samples of a Panda.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -37,7 +37,7 @@ PLAIN = "viscous+coulomb"
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 TRUTH = {LIFT: "load", ELBOW: "load", PAN: "stribeck"}
 SHARE, HOOK, SPEED = 0.07, 8.0, 0.15  # [-], [N m], [rad/s]
-RATE, DURATION, NOISE = 200.0, 48.0, 0.02  # [Hz], [s], of the usual torque
+RATE, DURATION, NOISE = 100.0, 48.0, 0.02  # [Hz], [s], of the usual torque
 FORGETS = 0.05  # [s]
 SAMPLES = 100_000  # of the arm that is timed
 ARM = "panda"
@@ -47,12 +47,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one recording of each kind")
     parser.add_argument("--recordings", type=int, default=100, help="simulated ones")
+    parser.add_argument("--estimator", default="wls", help="of the simulated recordings")
     options = parser.parse_args()
     if "ROBOTID_DATA" in os.environ:
-        real_recordings(["kinova_gen3"] if options.quick else sorted(p.stem for p in JOBS.iterdir()))
+        real_recordings(
+            ["kinova_gen3"] if options.quick else sorted(p.stem for p in JOBS.iterdir())
+        )
     else:
         print("no recordings: set ROBOTID_DATA\n")
-    coverage(1 if options.quick else options.recordings)
+    coverage(1 if options.quick else options.recordings, options.estimator)
     speed(5000 if options.quick else SAMPLES)
     print(f"\n{setting.machine()}")
 
@@ -110,14 +113,14 @@ def recording(truth, seed):
     return Log(t=t, q=q, v=v, a=a, tau=tau, joints=truth.joints), dict(zip(names, pi, strict=True))
 
 
-def coverage(recordings):
+def coverage(recordings, estimator):
     model, truth = robots()
     held = {AUTO: {}, PLAIN: {}}
     right, beside, named = 0, 0, 0
     for seed in range(recordings):
         log, true = recording(truth, seed)
         for friction, by_term in held.items():
-            found = identify(model, [log], friction=friction, doctor=False)
+            found = identify(model, [log], friction=friction, estimator=estimator, doctor=False)
             chosen = {choice.joint: choice.families for choice in found.drives}
             for joint in model.joints:
                 own = "with load or hook" if joint in TRUTH else "other joints"
@@ -135,7 +138,9 @@ def coverage(recordings):
             if friction == PLAIN:
                 missing = {misfit.joint for misfit in found.misfits}
                 named += len(missing & set(TRUTH))
-    print(f"\n| 95 % intervals of {recordings} simulated recordings | auto | {PLAIN} |")
+    print(
+        f"\n| 95 % intervals of {recordings} simulated recordings, {estimator} | auto | {PLAIN} |"
+    )
     print("|---|---|---|")
     for key in sorted(held[AUTO]):
         cells = [
@@ -192,7 +197,7 @@ def speed(samples):
     model = setting.robot(ARM)
     print(f"\n| {samples} samples of a {ARM}, processor time | {PLAIN} | auto | ratio |")
     print("|---|---|---|---|")
-    timed(model, 2000, 0.0)  # what is compiled is ready then
+    timed(model, samples, 0.0)  # what is compiled is ready then
     for what, share in (("no friction but that", 0.0), ("load friction in all joints", SHARE)):
         plain, auto = timed(model, samples, share)
         print(f"| {what} | {plain:.1f} s | {auto:.1f} s | {auto / plain:.1f} |", flush=True)

@@ -255,9 +255,7 @@ class _Trials:
     fitted: int
 
     @classmethod
-    def of(
-        cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]
-    ) -> "_Trials":
+    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Trials":
         terms = [family.make(drive.seen, *sizes) for family, sizes in own]
         columns = [drive.columns(those) for those in terms]
         ends = np.cumsum([x.shape[1] for x in columns]).tolist()
@@ -459,9 +457,7 @@ def _terms(
     return tuple(term for family, own in chosen for term in family.make(drive.seen, *own))
 
 
-def _with_shapes(
-    families: Sequence[Family], flat: Array
-) -> list[tuple[Family, list[float]]]:
+def _with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:
     """Return families with their shapes, of all in a row."""
     sizes = iter(flat.tolist())
     return [(family, [next(sizes) for _ in family.shapes]) for family in families]
@@ -510,5 +506,6 @@ def _shape_covariance(
         moved = drive.columns(_terms(drive, _with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
     _, beside = trials(sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None])
-    _, covariance = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
-    return covariance[Z.shape[1] :, Z.shape[1] :]
+    _, every = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
+    covariance: Array = every[Z.shape[1] :, Z.shape[1] :]
+    return covariance

@@ -2,8 +2,8 @@
 
 A term that the drives have and the model lacks moves the other parameters, by -T theta if theta is
 what it would be. That is no noise, and does not shrink with the length of the log: its square adds
-to their covariance; so does that of a term which was nearly chosen. A shape that was found beside them
-has an error of its own, and so do they:
+to their covariance; so does that of a term which was nearly chosen. A shape that was found beside
+them has an error of its own, and so do they:
 
     C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
 """

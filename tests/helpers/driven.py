@@ -1,4 +1,4 @@
-"""Logs of robots whose drives have terms of their own, and how well an identification found them."""
+"""Logs of a robot whose drives have terms of their own."""
 
 import numpy as np
 

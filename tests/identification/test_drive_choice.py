@@ -127,6 +127,7 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(plain, cases, n
     (choice,) = (choice for choice in found.drives if choice.families)
     taken = [x for x in choice.tried if x.is_taken]
     assert [x.families for x in taken] == [(), (family,)]
+    assert choice.families == (family,)
     plain_error, error = (x.held_out_error_pct for x in taken)
     assert error < 0.7 * plain_error
     assert taken[1].chance < 0.015
@@ -136,7 +137,7 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(plain, cases, n
 
 def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(plain):
     true, pi = driven(plain, {}, {})
-    for seed in range(4):
+    for seed in range(2):
         found = found_in(plain, [driven_log(true, pi, seed, reach=REACH, noise=0.02)])
         assert [c.joint for c in found.drives] == list(JOINTS)
         assert chosen(found) == {}
@@ -151,7 +152,7 @@ def test_harmonics_are_for_joints_that_turn_far_enough(plain):
     names = {family for families in chosen(found).values() for family in families}
     assert not names & {"harmonics2", "harmonics4"}
     assert not any("harmonics" in f for c in found.drives for x in c.tried for f in x.families)
-    with pytest.raises(SettingsError, match="elbow_joint has harmonics4, but .* half a turn"):
+    with pytest.raises(SettingsError, match=r"elbow_joint has harmonics4, but .* half a turn"):
         found_in(plain, [log], friction={ELBOW: "harmonics4"})
 
 
@@ -184,10 +185,9 @@ def test_validation_beyond_what_was_seen_is_named_and_has_no_say(plain, cases):
     assert said.where == ELBOW
     assert said.evidence["share_pct"] == pytest.approx(share, abs=1.0)
     assert f"have speeds beyond 0 to {top:.3g}" in said.message
-    # there the hook has faded and stays so: Coulomb and viscous friction go on
-    same = driven_log(true, pi, 9, reach=REACH)
-    assert not any(f.code == "beyond_seen" for f in found_in(
-        plain, [log], validation=[same]).findings)  # fmt: skip
+    slow = driven_log(true, pi, SEED, reach=REACH, speed=0.7)
+    again = found_in(plain, [log], validation=[slow])
+    assert not any(f.code == "beyond_seen" for f in again.findings)
 
 
 def test_a_joint_that_moves_in_one_of_several_logs_is_judged_by_that(plain, cases):
@@ -273,7 +273,8 @@ def test_logs_in_files_choose_as_in_memory(plain, cases, tmp_path, workers):
     found = conclude(recordings, EstimatorSettings("wls"))
     assert chosen(found) == chosen(held) == {ELBOW: ("presliding",)}
     ((shape,), (alike,)) = ([s for c in x.drives for s in c.shapes] for x in (found, held))
-    assert abs(shape.value - alike.value) < 2.0 * alike.std_error
+    # other rows of the log are looked at
+    assert abs(shape.value - alike.value) < 3.0 * np.hypot(alike.std_error, shape.std_error)
 
 
 def test_a_robot_with_terms_of_its_own_can_be_sent_to_workers():
@@ -298,15 +299,32 @@ def test_chance_is_students(rng):
     assert _chance(before[:2], after[:2]) == 1.0
 
 
-def test_no_friction_is_negative_nor_larger_than_the_torque(plain):
-    """A tanh below 0 that evidence asks for is none; Stribeck's hook may be."""
-    true, pi = driven(plain, {ELBOW: [Stribeck(speed=0.2)]}, {f"{ELBOW}.stribeck": -3.0,
-                      f"{ELBOW}.coulomb": 4.0})  # fmt: skip
-    true_load, pi_load = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": -0.05})
+@pytest.mark.parametrize("load", [-0.05, 0.7])
+def test_friction_that_would_be_negative_or_hold_any_load_is_none(plain, load):
+    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": load})
     found = found_in(plain, [driven_log(true, pi, SEED, reach=REACH)])
-    assert chosen(found)[ELBOW] in {("stribeck",), ("tanh",)}
-    found = found_in(plain, [driven_log(true_load, pi_load, SEED, reach=REACH)])
     assert "load" not in chosen(found).get(ELBOW, ())
+    assert ("load",) not in {x.families for x in found.drives[1].tried}
+
+
+def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
+    """Load friction lost in the noise of one joint: its Coulomb friction takes a part of it."""
+    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.03})
+    k = list(plain.layout.names).index(f"{ELBOW}.coulomb")
+    coulomb = pi[list(true.layout.names).index(f"{ELBOW}.coulomb")]
+    seen = 0
+    for seed in range(3):
+        log = driven_log(true, pi, seed, reach=REACH, noise=0.06)
+        found = found_in(plain, [log], estimator="wls")
+        (choice,) = (c for c in found.drives if c.joint == ELBOW)
+        if choice.families or [t.name for t in choice.doubted] != ["load"]:
+            continue
+        seen += 1
+        alone = found_in(plain, [log], friction="none", estimator="wls")
+        assert found.standard[k] == alone.standard[k]
+        assert found.standard_error[k] > alone.standard_error[k]
+        assert abs(found.standard[k] - coulomb) < SURE * found.standard_error[k]
+    assert seen
 
 
 def test_identify_chooses_unless_told_otherwise(plain, cases):
