@@ -15,6 +15,7 @@ from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
+from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.robot.drives import DRIVE_TERMS, TERMS, friction_models
 from robotid.robot.parameters import Coupling
 
@@ -57,6 +58,11 @@ def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]
 
 def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
     return [{"name": coupling.name, "ratios": dict(coupling.ratios)} for coupling in couplings]
+
+
+def _motors(gear: Transmission) -> list[Coupling]:
+    """Return the drives of a transmission's motors that turn with several joints."""
+    return [Coupling(motor, ratios, replaces=joint) for motor, joint, ratios in gear.shared]
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,9 @@ class Job(Settings):
         load=_load_couplings,
         dump=_dump_couplings,
     )
+    transmissions: tuple[Transmission, ...] = setting(
+        (), "motors and gears, where logs have columns of motors", at="transmission"
+    )
     columns: Mapping[str, str] = setting(
         {}, "column names in the logs that differ from the standard ones"
     )
@@ -142,6 +151,7 @@ class Job(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_transmissions(self.transmissions)
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
@@ -157,6 +167,13 @@ class Job(Settings):
         """
         from robotid.robot.model import RobotModel
 
+        motors: list[Coupling] = []
+        for gear in self.transmissions:
+            named = gear.joints if self.joints is None else self.joints
+            if gear.matrix != "urdf" and (
+                own := gear.of([joint for joint in named if joint not in self.locked])
+            ):
+                motors += _motors(own)
         return RobotModel.from_urdf(
             self.urdf,
             joints=self.joints,
@@ -165,7 +182,7 @@ class Job(Settings):
             mimic=self.mimic,
             gravity=self.gravity,
             terms=self.terms,
-            couplings=self.couplings,
+            couplings=(*self.couplings, *motors),
             snap_angles=self.snap_angles,
         )
 
@@ -201,6 +218,7 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
+            "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 
 

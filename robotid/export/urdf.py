@@ -40,7 +40,7 @@ _SHAPE = {
     "mimic": TEXT,
     "terms": [TEXT],
     "drives": {...: {...: NUMBER}},
-    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}}],
+    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": TEXT}],
     "lumped": TABLE,
 }
 _STATES = 64  # random states at which the written file must give the same torque
@@ -143,7 +143,10 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
             f"{found[:12]}..., wanted {facts['urdf_sha256'][:12]}...; restore the file, or write "
             "both again"
         )
-    couplings = [Coupling(c["name"], tuple(c["ratios"].items())) for c in facts["couplings"]]
+    couplings = [
+        Coupling(c["name"], tuple(c["ratios"].items()), c.get("replaces", ""))
+        for c in facts["couplings"]
+    ]
     drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
     model = RobotModel.from_urdf(
         path,
@@ -164,14 +167,18 @@ def _digest(content: bytes) -> str:
 def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
     """Return what a URDF has no place for: how the model is built from it, and the drives."""
     layout, first = model.layout, model.layout.n_inertial
-    values = dict(zip(layout.names, map(float, pi), strict=True))
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
+    values: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
+    for (d, term), value in zip(layout.drive_parameters, pi[first:], strict=True):
+        values[layout.drives[d].name][term.name] = float(value)
+    own = [drive.name for drive in layout.drives if drive not in layout.couplings]
     return {
         **model.options,
-        "drives": {j: {t: values[f"{j}.{t}"] for t in layout.terms} for j in layout.joints},
+        "drives": {name: values[name] for name in own},
         "couplings": [
             {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
-            | {term: values[f"{c.name}.{term}"] for term in layout.coupling_terms}
+            | ({"replaces": c.replaces} if c.replaces else {})
+            | values[c.name]
             for c in layout.couplings
         ],
         "lumped": _lumped(model, places),

@@ -39,10 +39,13 @@ class Coupling:
     Attributes:
         name: Name of the drive, used in parameter names.
         ratios: Pairs of joint name and ratio [-].
+        replaces: The joint that has this drive in the place of one of its own, with an offset
+            then; empty for a drive beside those of the joints.
     """
 
     name: str
     ratios: tuple[tuple[str, float], ...]
+    replaces: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class ParameterLayout:
     """Which standard parameters a model has, and in which order.
 
     Ten inertial parameters per body, then the drive terms joint by joint, then those of each
-    coupling (which has no offset of its own).
+    coupling (which has no offset of its own, unless it replaces the drive of a joint).
 
     Attributes:
         bodies: Names of the bodies, one per movable joint (and one for a floating base).
@@ -73,7 +76,10 @@ class ParameterLayout:
         if unknown:
             raise SettingsError(f"unknown drive terms {listed(unknown)}; known: {listed(TERMS)}")
         for coupling in self.couplings:
-            missing = [joint for joint, _ in coupling.ratios if joint not in self.joints]
+            named = [joint for joint, _ in coupling.ratios] + [coupling.replaces] * bool(
+                coupling.replaces
+            )
+            missing = [joint for joint in named if joint not in self.joints]
             if missing:
                 raise SettingsError(
                     f"coupling {coupling.name!r} names the joints {listed(missing)}, which are "
@@ -85,9 +91,10 @@ class ParameterLayout:
                         f"coupling {coupling.name!r}: the ratio of joint {joint!r} is {ratio!r}, "
                         f"wanted a number within +-{LARGEST:g} [-]"
                     )
-            if coupling.name in self.joints:
+            if sum(drive.name == coupling.name for drive in self.drives) > 1:
                 raise SettingsError(
-                    f"coupling {coupling.name!r} has the name of a joint; give it another name"
+                    f"coupling {coupling.name!r} has the name of a joint or of another drive; give "
+                    "it another name"
                 )
 
     @property
@@ -97,13 +104,18 @@ class ParameterLayout:
 
     @property
     def coupling_terms(self) -> tuple[str, ...]:
-        """Drive terms of a coupling: those of a joint without the offset."""
+        """Drive terms of a coupling beside the joints' drives: those without the offset."""
         return tuple(term for term in self.terms if TERMS[term].is_shared)
 
     @cached_property
     def drives(self) -> tuple[Coupling, ...]:
-        """The drives: one per joint, which turns with it alone, then the couplings."""
-        return (*(Coupling(joint, ((joint, 1.0),)) for joint in self.joints), *self.couplings)
+        """The drives: one per joint, which turns with it alone, then the couplings.
+
+        A coupling that replaces the drive of a joint stands in its place.
+        """
+        instead = {coupling.replaces: coupling for coupling in self.couplings}
+        own = [instead.get(joint, Coupling(joint, ((joint, 1.0),))) for joint in self.joints]
+        return (*own, *(coupling for coupling in self.couplings if not coupling.replaces))
 
     @cached_property
     def drive_ratios(self) -> Array:
@@ -133,8 +145,15 @@ class ParameterLayout:
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
         """Which of ``drives`` each drive parameter belongs to, and its term."""
-        owned = [self.terms] * len(self.joints) + [self.coupling_terms] * len(self.couplings)
+        beside = len(self.drives) - len(self.joints)
+        owned = [self.terms] * len(self.joints) + [self.coupling_terms] * beside
         return tuple((d, TERMS[term]) for d, terms in enumerate(owned) for term in terms)
+
+    @cached_property
+    def is_coupled(self) -> Array:
+        """Which drive parameters are friction or inertia of a coupling, flags, shape (k,), bool."""
+        owned = [(self.drives[d] in self.couplings, term) for d, term in self.drive_parameters]
+        return np.array([is_shared and term.is_shared for is_shared, term in owned], dtype=bool)
 
     @cached_property
     def drive_loads(self) -> Array:

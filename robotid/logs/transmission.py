@@ -1,0 +1,230 @@
+"""Motors behind gears: what motor columns of a log say of the joints."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from robotid._settings import Settings, setting
+from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
+from robotid.logs.data import repeated
+
+__all__ = ["Transmission", "check_transmissions"]
+
+_SINGULAR = 1e-9  # smallest singular value over the largest, rows over their own size
+
+
+def _load_matrix(value: Any) -> Any:  # noqa: ANN401
+    return value if isinstance(value, str) else tuple(_entry(row) for row in value)
+
+
+def _entry(row: Any) -> Any:  # noqa: ANN401
+    return tuple(row) if isinstance(row, list) else row
+
+
+def _dump_matrix(value: Any) -> Any:  # noqa: ANN401
+    return value if isinstance(value, str) else np.asarray(value).tolist()
+
+
+@dataclass(frozen=True)
+class Transmission(Settings):
+    """Motors and the joints that they drive.
+
+    With the matrix T, w = T v, q = T^-1 q_m + offset and tau = T^T (efficiency tau_m).
+    """
+
+    _table: ClassVar[str] = "transmission"
+
+    joints: tuple[str, ...] = setting(MISSING, "the joints that the motors drive, by name")
+    matrix: Any = setting(
+        MISSING,
+        "turns of each motor per turn of each joint [-, or rad/m], a row per motor; or a list of "
+        "gear ratios, if each motor drives one joint; or urdf: the joints' mechanicalReduction",
+        reads=(list, str),
+        load=_load_matrix,
+        dump=_dump_matrix,
+    )
+    motors: tuple[str, ...] = setting(
+        (), "names of as many motors, as their columns have them; those of the joints if not stated"
+    )
+    efficiency: tuple[float, ...] = setting(
+        (), "share of each motor's torque that passes its gears [-]; 1 if not stated"
+    )
+    offset: tuple[float, ...] = setting(
+        (), "positions of the joints where the motors' are 0 [rad or m]; 0 if not stated"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        count = len(self.joints)
+        if not count:
+            raise SettingsError("transmission: joints is empty, wanted the names of those driven")
+        for noun in ("joints", "motors"):
+            if twice := repeated(getattr(self, noun)):
+                raise SettingsError(
+                    f"transmission: {noun} names {listed(twice)} twice; name each once"
+                )
+        for key in ("motors", "efficiency", "offset"):
+            if (given := len(getattr(self, key))) not in (0, count):
+                raise SettingsError(
+                    f"transmission of {listed(self.joints)}: {key} has {given} entries, wanted "
+                    f"{count}, one per joint"
+                )
+        for motor, share in zip(self.names, self.efficiency, strict=False):
+            if not 0 < share <= 1:
+                raise SettingsError(
+                    f"transmission: efficiency of {motor!r} is {share:g}, wanted a share above 0 "
+                    "and at most 1"
+                )
+        if not isinstance(self.matrix, str):
+            self._check_matrix()
+        elif self.matrix != "urdf":
+            raise SettingsError(
+                f"transmission: matrix is {self.matrix!r}, wanted rows of numbers, a list of gear "
+                "ratios, or 'urdf'"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the motors."""
+        return self.motors or self.joints
+
+    @property
+    def T(self) -> Array:
+        """Speeds of the motors over those of the joints, shape (n, n) [-, or rad/m]."""
+        T = np.asarray(self.matrix, dtype=float)
+        return np.diag(T) if T.ndim == 1 else T
+
+    @property
+    def to_torque(self) -> Array:
+        """What makes joint torques of motor torques, T^T diag(efficiency), shape (n, n)."""
+        passed: Array = self.T.T * (self.efficiency or 1.0)
+        return passed
+
+    @property
+    def shared(self) -> list[tuple[str, str, tuple[tuple[str, float], ...]]]:
+        """The motors that turn with several joints.
+
+        Returns:
+            Of each its name, the joint in whose place its drive stands, and its ratios to the
+            speeds of the joints over its largest, which is its gear ratio.
+        """
+        turns = np.abs(self.T) > 0
+        alone = turns.sum(axis=1) == 1
+        taken = turns[alone].any(axis=0)  # joints with a motor of their own
+        places = [joint for joint, is_taken in zip(self.joints, taken, strict=True) if not is_taken]
+        shared = np.flatnonzero(~alone).tolist()
+        return [
+            (
+                self.names[i],
+                place,
+                tuple(
+                    (self.joints[j], float(self.T[i, j] / self.gear(i)))
+                    for j in np.flatnonzero(turns[i])
+                ),
+            )
+            for i, place in zip(shared, places, strict=True)
+        ]
+
+    def gear(self, i: int) -> float:
+        """Return the gear ratio of a motor: its largest ratio to a joint [-, or rad/m].
+
+        Args:
+            i: Number of the motor.
+        """
+        return float(self.T[i, np.argmax(np.abs(self.T[i]))])
+
+    def of(self, joints: Sequence[str]) -> "Transmission | None":
+        """Return the transmission of some of the joints; None if it drives none of them.
+
+        Args:
+            joints: The joints that are identified.
+
+        Raises:
+            SettingsError: If a motor of theirs turns with another joint, too.
+        """
+        is_kept = np.isin(self.joints, joints)
+        if is_kept.all() or not is_kept.any():
+            return self if is_kept.any() else None
+        turns = np.abs(self.T) > 0
+        mine = np.flatnonzero(turns[:, is_kept].any(axis=1))
+        kept, others = np.flatnonzero(is_kept), np.flatnonzero(turns[mine].any(axis=0) & ~is_kept)
+        if others.size:
+            raise SettingsError(
+                f"transmission: motors of {listed(self.joints[j] for j in kept)} turn with "
+                f"{listed(self.joints[j] for j in others)}, too, which is not identified; joints: "
+                f"{listed(joints)}. Name it in joints, or leave the transmission out"
+            )
+
+        def some(values: Sequence[Any], which: Array) -> tuple[Any, ...]:
+            return tuple(values[k] for k in which) if values else ()
+
+        return Transmission(
+            joints=some(self.joints, kept),
+            matrix=tuple(map(tuple, self.T[np.ix_(mine, kept)].tolist())),
+            motors=some(self.names, mine),
+            efficiency=some(self.efficiency, mine),
+            offset=some(self.offset, kept),
+        )
+
+    def stated(self, reductions: Mapping[str, float]) -> "Transmission":
+        """Return the transmission with the gear ratios that a URDF states, if it asks for them.
+
+        Args:
+            reductions: Gear ratios of the URDF's joints, by name.
+
+        Raises:
+            SettingsError: If a joint has none.
+        """
+        if self.matrix != "urdf":
+            return self
+        if missing := [joint for joint in self.joints if joint not in reductions]:
+            raise SettingsError(
+                f"transmission: matrix is 'urdf', but the URDF has no <transmission> with a "
+                f"<mechanicalReduction> of {listed(missing)} alone; it has one of "
+                f"{listed(reductions) or 'no joint'}. State the gear ratios: matrix = [...]"
+            )
+        return replace(self, matrix=tuple(reductions[joint] for joint in self.joints))
+
+    def _check_matrix(self) -> None:
+        count, shown = len(self.joints), _dump_matrix(self.matrix)
+        try:
+            T = np.asarray(self.matrix, dtype=float)
+        except (TypeError, ValueError):
+            T = np.empty(0)
+        if T.shape not in ((count,), (count, count)) or not (np.abs(T) <= 1e30).all():
+            raise SettingsError(
+                f"transmission of {listed(self.joints)}: matrix is {shown}, wanted {count} rows of "
+                f"{count} numbers, one row per motor, or {count} gear ratios"
+            )
+        size = np.linalg.norm(self.T, axis=1, keepdims=True)
+        sizes = np.linalg.svd(self.T / np.where(size > 0, size, 1.0), compute_uv=False)
+        if not sizes[-1] > _SINGULAR * sizes[0]:
+            raise SettingsError(
+                f"transmission of {listed(self.joints)}: matrix {shown} is singular, so the motors "
+                "do not tell where the joints are. Each row is a motor, as [0, 32, 32] for one "
+                "that turns 32 times with either of the last two joints; no row may be a sum of "
+                "others"
+            )
+
+
+def check_transmissions(transmissions: Sequence[Transmission]) -> None:
+    """Refuse joints and motors that are in several transmissions.
+
+    Args:
+        transmissions: The transmissions.
+
+    Raises:
+        SettingsError: If one is.
+    """
+    joints = repeated([joint for gear in transmissions for joint in gear.joints])
+    motors = repeated([motor for gear in transmissions for motor in gear.names])
+    for noun, twice in (("joints", joints), ("motors", motors)):
+        if twice:
+            raise SettingsError(
+                f"several transmissions name the {noun} {listed(twice)}; put what turns together "
+                "into one, with a row of the matrix per motor"
+            )
