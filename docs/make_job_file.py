@@ -7,6 +7,7 @@ from pathlib import Path
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
+from robotid.logs.transmission import Transmission
 from robotid.robot.drives import TERMS, friction_models
 
 PAGE = Path(__file__).with_name("job_file.md")
@@ -39,6 +40,12 @@ gains = { joint_1 = 14.87, joint_2 = 11.3 }
 name = "motor_2"
 ratios = { joint_1 = 1.0, joint_2 = 1.0 }
 
+[[transmission]]
+joints = ["joint_1", "joint_2"]
+motors = ["m1", "m2"]
+matrix = [[101.0, 0.0], [50.0, 50.0]]
+efficiency = [0.8, 0.7]
+
 [estimator]
 name = "consistent"
 robust = "tukey"
@@ -62,6 +69,7 @@ TABLES = {
     "log": LogSource,
     "units": LogUnits,
     "estimator.constraints": ConstraintSettings,
+    "[transmission]": Transmission,
     "[identification]": LogEntry,
 }
 
@@ -72,7 +80,7 @@ def page():
         key.at or field.name: (field, key)
         for field, key in keys(Job)
         if (key.at or field.name)
-        not in {*TABLES, "model", "estimator", "identification", "validation"}
+        not in {*TABLES, "model", "estimator", "transmission", "identification", "validation"}
     }
     tables = {}
     for at, (field, key) in own.items():
@@ -80,8 +88,9 @@ def page():
         tables.setdefault(table, []).append(row(name, field, key))
     parts = [START, "## Keys at the top\n", *listing(tables.pop(""))]
     for name, kind in TABLES.items():
-        title = "[[identification]]` and `[[validation]]" if name[0] == "[" else f"[{name}]"
-        parts += [f"\n## `{title}`\n", f"{kind.__doc__.splitlines()[0]}\n"]
+        title = f"[{name}]" + "` and `[[validation]]" * (kind is LogEntry)
+        about = kind.__doc__.partition("\n\nAttributes")[0].replace("\n    ", "\n")
+        parts += [f"\n## `{title}`\n", f"{about.strip()}\n"]
         parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
         if name == "signals":
             parts += ["\n## `[model]`\n", "Which drive terms are identified.\n", *drive_terms()]

@@ -18,15 +18,13 @@ _SINGULAR = 1e-9  # smallest singular value over the largest, rows over their ow
 
 
 def _load_matrix(value: Any) -> Any:  # noqa: ANN401
-    return value if isinstance(value, str) else tuple(_entry(row) for row in value)
-
-
-def _entry(row: Any) -> Any:  # noqa: ANN401
-    return tuple(row) if isinstance(row, list) else row
+    rows = (tuple(row) if isinstance(row, list) else row for row in value)
+    return value if isinstance(value, str) else tuple(rows)
 
 
 def _dump_matrix(value: Any) -> Any:  # noqa: ANN401
-    return value if isinstance(value, str) else np.asarray(value).tolist()
+    rows = (list(row) if isinstance(row, tuple) else row for row in value)
+    return value if isinstance(value, str) else list(rows)
 
 
 @dataclass(frozen=True)
