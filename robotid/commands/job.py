@@ -17,7 +17,7 @@ from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.robot.drives import DRIVE_TERMS, TERMS, friction_models
-from robotid.robot.parameters import Coupling
+from robotid.robot.parameters import DYNAMICS, Coupling
 
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
@@ -104,6 +104,14 @@ class Job(Settings):
         load=_load_terms,
         dump=_dump_terms,
     )
+    model_dynamics: str = setting(
+        "full",
+        "full; or static, for logs of poses and slow sweeps: velocities and accelerations are not "
+        "used but for the sign of friction, and gravity (masses, first moments), Coulomb friction "
+        "and offsets are identified; the rest keeps the URDF's values",
+        at="model.dynamics",
+        among=DYNAMICS,
+    )
     gains: Mapping[str, float] = setting(
         {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
     )
@@ -183,6 +191,7 @@ class Job(Settings):
             gravity=self.gravity,
             terms=self.terms,
             couplings=(*self.couplings, *motors),
+            dynamics=self.model_dynamics,
             snap_angles=self.snap_angles,
         )
 

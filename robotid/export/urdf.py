@@ -38,6 +38,7 @@ _SHAPE = {
     "gravity": [NUMBER],
     "free_flyer": FLAG,
     "mimic": TEXT,
+    "dynamics?": TEXT,
     "terms": [TEXT],
     "drives": {...: {...: NUMBER}},
     "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": TEXT}],
@@ -151,6 +152,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
     model = RobotModel.from_urdf(
         path,
         couplings=couplings,
+        dynamics=facts.get("dynamics", "full"),
         **{
             key: facts[key]
             for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")

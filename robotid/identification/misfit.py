@@ -199,12 +199,14 @@ class Sample:
 
 
 def take_sample(identification: "Identification") -> Sample | None:
-    """Return rows spread over the recordings; None if there are too few to judge by.
+    """Return rows spread over the recordings; None if there are too few, or static ones.
 
     Args:
         identification: What was found.
     """
     model, mapping = identification.model, identification.mapping
+    if model.is_static:
+        return None
     kept = [e for e in identification.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, identification.fitted, kept)
     own = sum(map(len, rows[: len(identification.fitted)]))

@@ -207,6 +207,8 @@ def build_problem(
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
     """Return the regressor at random states, shape (N n_rows, p): what any motion can excite.
 
+    Of a static model, the states have no speed but for the direction of friction.
+
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
     gravity and inertia weigh alike on a finger and on a crane.
 
@@ -230,6 +232,9 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         q = np.hstack([pose, q])
         v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
         a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
+    if model.is_static:
+        signs = friction_directions(model.layout, v, None)
+        return joint_torque_regressor(model, q, 0.0 * v, 0.0 * a, signs)
     return joint_torque_regressor(model, q, v, a)
 
 

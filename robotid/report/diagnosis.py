@@ -71,7 +71,8 @@ def drive_figures(found: Identification) -> str:
         return ""
     bars = "".join(_drive_figure(found, term) for term in layout.terms)
     curves = ""
-    if not all(term.is_inertia for _, term in layout.drive_parameters):
+    is_static = found.model.is_static  # it knows no speeds
+    if not is_static and not all(term.is_inertia for _, term in layout.drive_parameters):
         curves = (
             "<h3>Friction against speed</h3>\n<p>Torque that inertia, gravity and armature leave, "
             f"on {escape(_shown(found).recording.name)}, and the friction and offset identified. "

@@ -12,11 +12,11 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, ModelError
+from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
-from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion
 from robotid.robot.native_messages import caught_messages
-from robotid.robot.parameters import Coupling, ParameterLayout
+from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
 from robotid.robot.urdf_text import LARGEST
 
@@ -46,6 +46,8 @@ class RobotModel:
         free_flyer: Whether the base floats.
         locked: Positions of the joints held still [rad or m].
         mimic: How mimic joints are treated: "independent" or "coupled".
+        dynamics: "full", or "static": of logs of poses and slow motion, velocities and
+            accelerations are not used but for the sign of friction.
     """
 
     tree: Tree
@@ -56,6 +58,7 @@ class RobotModel:
     free_flyer: bool
     locked: Mapping[str, float]
     mimic: str
+    dynamics: str = "full"
 
     def __repr__(self) -> str:
         return (
@@ -75,6 +78,7 @@ class RobotModel:
         gravity: Sequence[float] = GRAVITY,
         terms: Sequence[str] = DRIVE_TERMS,
         couplings: Sequence[Coupling] = (),
+        dynamics: str = "full",
         snap_angles: bool = False,
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
@@ -91,6 +95,7 @@ class RobotModel:
             gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
             terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
             couplings: Drives that turn with several joints.
+            dynamics: "full"; or "static" for gravity alone, with terms that act without speed.
             snap_angles: Whether angles of joints that the file rounds, 3.1416, become the multiple
                 of pi/12 that they round; see ``exact_angle`` for which are taken as rounded.
 
@@ -105,6 +110,10 @@ class RobotModel:
         tree = tree.snapped() if snap_angles else tree
         if mimic not in ("independent", "coupled"):
             raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
+        if dynamics not in DYNAMICS:
+            raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
+        if dynamics == "static":
+            terms = _seen_at_rest(terms, gravity)
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -130,7 +139,8 @@ class RobotModel:
             prismatic=frozenset(joint.name for joint in slides),
             strokes={j.name: j.upper - j.lower for j in slides if j.has_limits},
         )
-        return cls(tree, reduced, layout, G, shift, free_flyer, MappingProxyType(positions), mimic)
+        held = MappingProxyType(positions)
+        return cls(tree, reduced, layout, G, shift, free_flyer, held, mimic, dynamics)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "locked": dict(self.locked)}
@@ -148,8 +158,14 @@ class RobotModel:
             "gravity": [float(g) for g in self.pin_model.gravity.linear],
             "free_flyer": self.free_flyer,
             "mimic": self.mimic,
+            "dynamics": self.dynamics,
             "terms": list(self.layout.terms),
         }
+
+    @property
+    def is_static(self) -> bool:
+        """Whether only what stands and slow motion show is identified."""
+        return self.dynamics == "static"
 
     @property
     def name(self) -> str:
@@ -280,6 +296,14 @@ class RobotModel:
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
         drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
         return np.hstack([inertial, drive])
+
+
+def _seen_at_rest(terms: Sequence[str], gravity: Sequence[float]) -> tuple[str, ...]:
+    """Return the terms that act at the speed 0, in the direction of friction or without one."""
+    if not np.any(_gravity(gravity)):
+        raise SettingsError("dynamics is 'static', but gravity is 0: nothing would load the joints")
+    slow = DriveMotion(np.zeros(1), np.zeros(1), np.ones(1))
+    return tuple(term for term in terms if term not in TERMS or TERMS[term].column(slow).any())
 
 
 def _inertia(values: Array) -> pin.Inertia:

@@ -13,6 +13,7 @@ from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 from robotid.robot.urdf_text import LARGEST
 
 __all__ = [
+    "DYNAMICS",
     "INERTIAL_TERMS",
     "PAPER_TERMS",
     "Coupling",
@@ -23,6 +24,8 @@ __all__ = [
     "to_paper_order",
 ]
 
+#: What of the dynamics is identified: all, or what stands and slow motion show.
+DYNAMICS = ("full", "static")
 #: Inertial parameters of one body in Pinocchio's order; inertia about the joint frame.
 INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 #: The same ten in the paper's order (9).
