@@ -93,7 +93,8 @@ def page():
         parts += [f"\n## `{title}`\n", f"{about.strip()}\n"]
         parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
         if name == "signals":
-            parts += ["\n## `[model]`\n", "Which drive terms are identified.\n", *drive_terms()]
+            words = "What is identified, and with which drive terms.\n"
+            parts += ["\n## `[model]`\n", words, *drive_terms(tables.pop("model"))]
         if name == "units":
             for other, rows in tables.items():
                 parts += [f"\n## `[{other}]`\n", *listing(rows)]
@@ -124,10 +125,10 @@ def estimators():
         yield f"| `{name}` | {default} | {', '.join(owners)} | {words} |"
 
 
-def drive_terms():
-    """Return the lines on the terms of the drives."""
+def drive_terms(rows):
+    """Return the lines on the terms of the drives, behind those of other keys."""
     models = ", ".join(friction_models())
-    rows = [f'| `friction` | `"viscous+coulomb"` | Terms of the friction: {models} |']
+    rows += [f'| `friction` | `"viscous+coulomb"` | Terms of the friction: {models} |']
     for name, term in TERMS.items():
         if not term.is_friction:
             units = ", or ".join(term.units)

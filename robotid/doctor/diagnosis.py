@@ -114,8 +114,8 @@ def _examine_log(
     """Add the findings on one log; return its smooth motion and a probe of it, if there are."""
     name = log.name
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
-    findings += [] if model.is_static else check_clock(log)  # its poses may be apart
-    findings += check_channels(log, signals)
+    if not model.is_static:  # the rows of poses may be apart
+        findings += [*check_clock(log), *check_channels(log, signals)]
     sizes = list(check_torque_channels(log))
     findings += sizes
     if model.free_flyer:

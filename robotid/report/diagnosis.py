@@ -41,6 +41,8 @@ def residual_section(found: Identification) -> str:
         found: The identification.
     """
     evaluation = _shown(found)
+    if found.model.is_static:
+        return "<p>Stands and slow stretches are no signal that has a spectrum.</p>\n"
     figures = "".join(
         _residual_figure(evaluation, row, name, unit)
         for row, (name, unit) in enumerate(
