@@ -21,7 +21,7 @@ from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
-from robotid.robot.drives import TERMS
+from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import read_tree
@@ -40,6 +40,7 @@ _SHAPE = {
     "mimic": TEXT,
     "dynamics?": TEXT,
     "terms": [TEXT],
+    "own_terms?": {...: [TABLE]},
     "drives": {...: {...: NUMBER}},
     "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": TEXT}],
     "lumped": TABLE,
@@ -152,6 +153,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
     model = RobotModel.from_urdf(
         path,
         couplings=couplings,
+        own_terms=terms_from_facts(facts.get("own_terms", {})),
         dynamics=facts.get("dynamics", "full"),
         **{
             key: facts[key]
@@ -159,7 +161,20 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
         },
     )
     values = [_drive_value(drives, name, Path(sidecar).name) for name in model.layout.drive_names]
-    return model, np.array([*model.standard_parameters()[: model.layout.n_inertial], *values])
+    pi = np.array([*model.standard_parameters()[: model.layout.n_inertial], *values])
+    return (model.with_reference(pi) if model.layout.remembering else model), pi
+
+
+def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Return the further terms of single drives, by name, of their plain values.
+
+    Args:
+        tables: Their values, as of ``RobotModel.options``.
+
+    Raises:
+        SettingsError: If there is no such term.
+    """
+    return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
 
 
 def _digest(content: bytes) -> str:

@@ -19,7 +19,7 @@ from robotid._typing import Array
 from robotid.findings import Finding, listed
 from robotid.identification.misfit import Sample, chance, take_sample, trials
 from robotid.logs.data import Trajectory
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -122,8 +122,7 @@ def _torques(model: RobotModel, pi: Array, sample: Sample) -> Array:
 
 
 def _torque(model: RobotModel, pi: Array, m: Trajectory) -> Array:
-    Y = joint_torque_regressor(model, m.q, m.v, m.a, m.direction)
-    torque: Array = (Y @ pi).reshape(len(m.t), model.n_rows)
+    torque: Array = (trajectory_regressor(model, m) @ pi).reshape(len(m.t), model.n_rows)
     return torque
 
 

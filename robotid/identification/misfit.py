@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import stdtr
@@ -25,7 +25,7 @@ from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion
 from robotid.identification.evaluation import Evaluation, Recording
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
 
@@ -215,7 +215,7 @@ def take_sample(identification: "Identification") -> Sample | None:
     if model.free_flyer or number < _FEWEST:
         return None
     parts = list(zip([*identification.fitted, *kept], rows, strict=True))
-    motion = [_at(e.recording.trajectory, k) for e, k in parts]
+    motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, m) for m in motion])  # (N, n, p)
     tau = np.concatenate([m.tau for m in motion])
     r = tau - np.concatenate([e.torques["estimate"][k] for e, k in parts])
@@ -275,18 +275,9 @@ def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def _at(motion: Trajectory, rows: Array) -> Trajectory:
-    """Return some rows of a motion."""
-    names = ["t", "q", "v", "a", "tau", "segment"]
-    names += [] if motion.direction is None else ["direction"]
-    parts: dict[str, Any] = {name: getattr(motion, name)[rows] for name in names}
-    return replace(motion, **parts)
-
-
 def _regressor(model: RobotModel, motion: Trajectory) -> Array:
     """Return the regressor of the standard parameters, shape (N, n, p)."""
-    Y = joint_torque_regressor(model, motion.q, motion.v, motion.a, motion.direction)
-    return Y.reshape(len(motion.t), model.n_rows, -1)
+    return trajectory_regressor(model, motion).reshape(len(motion.t), model.n_rows, -1)
 
 
 def _usual_size(r: Array, used: Array) -> Array:

@@ -29,6 +29,7 @@ from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
+from robotid.regressor.memory import remember
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.regressor.used_rows import base_problem, row_mask, static_rows
 from robotid.robot.model import RobotModel
@@ -136,6 +137,7 @@ class LogPiece:
                 speeds=friction_speeds(header.model.layout),
             )
             mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+        trajectory = remember(header.model, trajectory)
         return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
 
 

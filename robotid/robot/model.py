@@ -14,7 +14,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
-from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion
+from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
@@ -46,6 +46,8 @@ class RobotModel:
         free_flyer: Whether the base floats.
         locked: Positions of the joints held still [rad or m].
         mimic: How mimic joints are treated: "independent" or "coupled".
+        reference: Standard parameters by which torques that drive terms depend on are reckoned,
+            the load of a gear among them, shape (p,); None: those of the URDF.
         dynamics: "full", or "static": of logs of poses and slow motion, velocities and
             accelerations are not used but for the sign of friction.
     """
@@ -58,6 +60,7 @@ class RobotModel:
     free_flyer: bool
     locked: Mapping[str, float]
     mimic: str
+    reference: Array | None = None
     dynamics: str = "full"
 
     def __repr__(self) -> str:
@@ -78,6 +81,7 @@ class RobotModel:
         gravity: Sequence[float] = GRAVITY,
         terms: Sequence[str] = DRIVE_TERMS,
         couplings: Sequence[Coupling] = (),
+        own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
         dynamics: str = "full",
         snap_angles: bool = False,
     ) -> "RobotModel":
@@ -95,6 +99,7 @@ class RobotModel:
             gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
             terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
             couplings: Drives that turn with several joints.
+            own_terms: Further terms of single drives, by name of the joint or coupling.
             dynamics: "full"; or "static" for gravity alone, with terms that act without speed.
             snap_angles: Whether angles of joints that the file rounds, 3.1416, become the multiple
                 of pi/12 that they round; see ``exact_angle`` for which are taken as rounded.
@@ -113,7 +118,12 @@ class RobotModel:
         if dynamics not in DYNAMICS:
             raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
         if dynamics == "static":
-            terms = _seen_at_rest(terms, gravity)
+            _check_pull(gravity)
+            terms = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
+            own_terms = {
+                name: [term for term in own if _acts_at_rest(term)]
+                for name, own in own_terms.items()
+            }
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -138,9 +148,10 @@ class RobotModel:
             couplings=tuple(couplings),
             prismatic=frozenset(joint.name for joint in slides),
             strokes={j.name: j.upper - j.lower for j in slides if j.has_limits},
+            own={name: tuple(terms) for name, terms in own_terms.items() if terms},
         )
         held = MappingProxyType(positions)
-        return cls(tree, reduced, layout, G, shift, free_flyer, held, mimic, dynamics)
+        return cls(tree, reduced, layout, G, shift, free_flyer, held, mimic, dynamics=dynamics)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "locked": dict(self.locked)}
@@ -160,6 +171,9 @@ class RobotModel:
             "mimic": self.mimic,
             "dynamics": self.dynamics,
             "terms": list(self.layout.terms),
+            "own_terms": {
+                name: [term.to_dict() for term in terms] for name, terms in self.layout.own.items()
+            },
         }
 
     @property
@@ -207,6 +221,11 @@ class RobotModel:
         longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
         return longest if longest > 1e-6 else 1.0
 
+    @property
+    def carried_by(self) -> Array:
+        """Standard parameters by which the load of the drives is reckoned, shape (p,)."""
+        return self.standard_parameters() if self.reference is None else self.reference
+
     def standard_parameters(self) -> Array:
         """Return the standard parameters as the URDF states them, shape (p,), SI units.
 
@@ -214,6 +233,26 @@ class RobotModel:
         """
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
         return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
+
+    def with_terms(self, own: Mapping[str, Sequence[DriveTerm]]) -> "RobotModel":
+        """Return the same robot with other terms of single drives, and no reference.
+
+        Args:
+            own: The terms, by name of the joint or coupling.
+
+        Raises:
+            SettingsError: If a name is no drive's.
+        """
+        kept = {name: tuple(terms) for name, terms in own.items() if terms}
+        return replace(self, layout=replace(self.layout, own=kept), reference=None)
+
+    def with_reference(self, pi: Array) -> "RobotModel":
+        """Return the same robot with other parameters that drive terms depend on.
+
+        Args:
+            pi: Standard parameters, shape (p,).
+        """
+        return replace(self, reference=pi)
 
     def with_parameters(self, pi: Array) -> "RobotModel":
         """Return the same robot with other inertial parameters.
@@ -298,12 +337,16 @@ class RobotModel:
         return np.hstack([inertial, drive])
 
 
-def _seen_at_rest(terms: Sequence[str], gravity: Sequence[float]) -> tuple[str, ...]:
-    """Return the terms that act at the speed 0, in the direction of friction or without one."""
+def _acts_at_rest(term: DriveTerm) -> bool:
+    """Return whether a term acts at the speed 0, in the direction of friction or without one."""
+    still, one = np.zeros(2), np.array([0.5, 1.0])
+    slow = DriveMotion(q=one, v=still, a=still, direction=one, load=one, rate=still)
+    return bool(term.column(slow).any())
+
+
+def _check_pull(gravity: Sequence[float]) -> None:
     if not np.any(_gravity(gravity)):
         raise SettingsError("dynamics is 'static', but gravity is 0: nothing would load the joints")
-    slow = DriveMotion(np.zeros(1), np.zeros(1), np.ones(1))
-    return tuple(term for term in terms if term not in TERMS or TERMS[term].column(slow).any())
 
 
 def _inertia(values: Array) -> pin.Inertia:
