@@ -127,6 +127,15 @@ class Transmission(Settings):
             for i, place in zip(shared, places, strict=True)
         ]
 
+    @property
+    def gears(self) -> dict[str, float]:
+        """Gear ratio of each drive [-, or rad/m], by its name: a joint's, or a shared motor's."""
+        named = {motor for motor, _, _ in self.shared}
+        return {
+            motor if motor in named else self.joints[int(np.argmax(np.abs(row)))]: self.gear(i)
+            for i, (motor, row) in enumerate(zip(self.names, self.T, strict=True))
+        }
+
     def gear(self, i: int) -> float:
         """Return the gear ratio of a motor: its largest ratio to a joint [-, or rad/m].
 
