@@ -79,15 +79,11 @@ def test_currents_of_motors_take_gains_at_the_motor_and_angles_may_be_degrees(tm
         read_log(path, JOINTS, transmissions=MOTORS, units=units)
 
 
-def test_some_joints_of_a_transmission_are_read_if_their_motors_turn_with_no_other(
-    tmp_path, motion
-):
+def test_joints_of_a_transmission_are_all_read(tmp_path, motion):
     path = save(tmp_path / "run.csv", motor_side(motion))
-    both = (Transmission(joints=JOINTS, motors=("m1", "m2", "m3"), matrix=T.tolist()),)
-    log = read_log(path, ("wrist", "elbow"), transmissions=both)
-    np.testing.assert_allclose(log.q, (motion["q"] - OFFSET)[:, [2, 1]], atol=1e-12)
-    with pytest.raises(SettingsError, match=r"motors of elbow turn with wrist, too, which is not"):
-        read_log(path, ("elbow",), transmissions=both)
+    text = "transmission: wrist are not among the joints identified: shoulder, elbow. Leave them"
+    with refused(text, SettingsError):
+        read_log(path, JOINTS[:2], transmissions=MOTORS)
 
 
 def test_the_recording_of_a_real_wrist_is_the_same_from_either_side(recordings):
