@@ -159,7 +159,7 @@ class Job(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_transmissions(self.transmissions)
+        check_transmissions(self.transmissions, self.joints)
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
@@ -175,13 +175,8 @@ class Job(Settings):
         """
         from robotid.robot.model import RobotModel
 
-        motors: list[Coupling] = []
-        for gear in self.transmissions:
-            named = gear.joints if self.joints is None else self.joints
-            if gear.matrix != "urdf" and (
-                own := gear.of([joint for joint in named if joint not in self.locked])
-            ):
-                motors += _motors(own)
+        gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
+        motors = [motor for gear in gears for motor in _motors(gear)]
         return RobotModel.from_urdf(
             self.urdf,
             joints=self.joints,

@@ -21,6 +21,7 @@ from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import SOURCES, Identification
 from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
+from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -127,6 +128,7 @@ def build_result(
                 strict=True,
             )
         ],
+        "motors": _motors(identification, settings),
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
@@ -370,6 +372,25 @@ def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
         }
         for i in numbers
     ]
+
+
+def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return gear ratio and inertia at the motor, armature / ratio^2, of drives behind gears."""
+    model, gears = found.model, dict[str, float]()
+    for table in settings.get("transmission", ()):
+        gears |= Transmission.from_dict(table).stated(model.tree.reductions).gears
+    drives = [
+        (model.layout.drives[d].name, value)
+        for (d, term), value in zip(
+            model.layout.drive_parameters, found.standard[model.layout.n_inertial :], strict=True
+        )
+        if term.is_inertia
+    ]
+    return {
+        name: {"gear": gears[name], "inertia": float(value) / gears[name] ** 2}
+        for name, value in drives
+        if name in gears
+    }
 
 
 def _consistency(found: Identification) -> dict[str, Any]:

@@ -189,8 +189,8 @@ def lay_out(
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
     opened = open_table(file, source)
-    check_transmissions(transmissions)
-    gears = tuple(gear for one in transmissions if (gear := one.of(joints)) is not None)
+    check_transmissions(transmissions, joints)
+    gears = tuple(transmissions)
     finder = _Finder(
         file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, gears,
         [*opened.notes],

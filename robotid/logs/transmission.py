@@ -127,6 +127,15 @@ class Transmission(Settings):
             for i, place in zip(shared, places, strict=True)
         ]
 
+    @property
+    def gears(self) -> dict[str, float]:
+        """Gear ratio of each drive [-, or rad/m], by its name: a joint's, or a shared motor's."""
+        named = {motor for motor, _, _ in self.shared}
+        return {
+            motor if motor in named else self.joints[int(np.argmax(np.abs(row)))]: self.gear(i)
+            for i, (motor, row) in enumerate(zip(self.names, self.T, strict=True))
+        }
+
     def gear(self, i: int) -> float:
         """Return the gear ratio of a motor: its largest ratio to a joint [-, or rad/m].
 
@@ -134,39 +143,6 @@ class Transmission(Settings):
             i: Number of the motor.
         """
         return float(self.T[i, np.argmax(np.abs(self.T[i]))])
-
-    def of(self, joints: Sequence[str]) -> "Transmission | None":
-        """Return the transmission of some of the joints; None if it drives none of them.
-
-        Args:
-            joints: The joints that are identified.
-
-        Raises:
-            SettingsError: If a motor of theirs turns with another joint, too.
-        """
-        is_kept = np.isin(self.joints, joints)
-        if is_kept.all() or not is_kept.any():
-            return self if is_kept.any() else None
-        turns = np.abs(self.T) > 0
-        mine = np.flatnonzero(turns[:, is_kept].any(axis=1))
-        kept, others = np.flatnonzero(is_kept), np.flatnonzero(turns[mine].any(axis=0) & ~is_kept)
-        if others.size:
-            raise SettingsError(
-                f"transmission: motors of {listed(self.joints[j] for j in kept)} turn with "
-                f"{listed(self.joints[j] for j in others)}, too, which is not identified; joints: "
-                f"{listed(joints)}. Name it in joints, or leave the transmission out"
-            )
-
-        def some(values: Sequence[Any], which: Array) -> tuple[Any, ...]:
-            return tuple(values[k] for k in which) if values else ()
-
-        return Transmission(
-            joints=some(self.joints, kept),
-            matrix=tuple(map(tuple, self.T[np.ix_(mine, kept)].tolist())),
-            motors=some(self.names, mine),
-            efficiency=some(self.efficiency, mine),
-            offset=some(self.offset, kept),
-        )
 
     def stated(self, reductions: Mapping[str, float]) -> "Transmission":
         """Return the transmission with the gear ratios that a URDF states, if it asks for them.
@@ -209,20 +185,28 @@ class Transmission(Settings):
             )
 
 
-def check_transmissions(transmissions: Sequence[Transmission]) -> None:
-    """Refuse joints and motors that are in several transmissions.
+def check_transmissions(
+    transmissions: Sequence[Transmission], joints: Sequence[str] | None = None
+) -> None:
+    """Refuse joints and motors that are in several transmissions, and joints that are not read.
 
     Args:
         transmissions: The transmissions.
+        joints: The joints that are identified, if they are known.
 
     Raises:
-        SettingsError: If one is.
+        SettingsError: If there is one.
     """
-    joints = repeated([joint for gear in transmissions for joint in gear.joints])
-    motors = repeated([motor for gear in transmissions for motor in gear.names])
-    for noun, twice in (("joints", joints), ("motors", motors)):
-        if twice:
+    driven = [joint for gear in transmissions for joint in gear.joints]
+    motors = [motor for gear in transmissions for motor in gear.names]
+    for noun, names in (("joints", driven), ("motors", motors)):
+        if twice := repeated(names):
             raise SettingsError(
                 f"several transmissions name the {noun} {listed(twice)}; put what turns together "
                 "into one, with a row of the matrix per motor"
             )
+    if joints is not None and (others := [joint for joint in driven if joint not in joints]):
+        raise SettingsError(
+            f"transmission: {listed(others)} are not among the joints identified: "
+            f"{listed(joints)}. Leave them and their motors out, or identify them"
+        )

@@ -79,15 +79,11 @@ def test_currents_of_motors_take_gains_at_the_motor_and_angles_may_be_degrees(tm
         read_log(path, JOINTS, transmissions=MOTORS, units=units)
 
 
-def test_some_joints_of_a_transmission_are_read_if_their_motors_turn_with_no_other(
-    tmp_path, motion
-):
+def test_joints_of_a_transmission_are_all_read(tmp_path, motion):
     path = save(tmp_path / "run.csv", motor_side(motion))
-    both = (Transmission(joints=JOINTS, motors=("m1", "m2", "m3"), matrix=T.tolist()),)
-    log = read_log(path, ("wrist", "elbow"), transmissions=both)
-    np.testing.assert_allclose(log.q, (motion["q"] - OFFSET)[:, [2, 1]], atol=1e-12)
-    with pytest.raises(SettingsError, match=r"motors of elbow turn with wrist, too, which is not"):
-        read_log(path, ("elbow",), transmissions=both)
+    text = "transmission: wrist are not among the joints identified: shoulder, elbow. Leave them"
+    with refused(text, SettingsError):
+        read_log(path, JOINTS[:2], transmissions=MOTORS)
 
 
 def test_the_recording_of_a_real_wrist_is_the_same_from_either_side(recordings):
@@ -107,6 +103,7 @@ def test_motors_of_several_joints_drive_in_the_place_of_the_joints_without_their
     assert Transmission(**WRIST).shared == [
         ("m3", "wrist", (("elbow", 1.0), ("wrist", -30.0 / 32.0)))
     ]
+    assert Transmission(**WRIST).gears == {"elbow": 45.0, "m3": 32.0}
     assert Transmission(joints=JOINTS, matrix=(3.0, -4.0, 5.0)).shared == []
     crossed = Transmission(joints=("a", "b"), motors=("x", "y"), matrix=((0, 7.0), (8.0, 8.0)))
     assert crossed.shared == [("y", "a", (("a", 1.0), ("b", 1.0)))]
