@@ -28,7 +28,7 @@ from robotid.robot.tree import read_tree
 from robotid.robot.urdf_text import read_with_yourdfpy
 from robotid.versions import __version__
 
-__all__ = ["load_identified", "read_sidecar", "write_urdf"]
+__all__ = ["load_identified", "read_sidecar", "terms_from_facts", "write_urdf"]
 
 _SCHEMA_VERSION = 1
 _SHAPE = {
@@ -42,7 +42,7 @@ _SHAPE = {
     "terms": [TEXT],
     "own_terms?": {...: [TABLE]},
     "drives": {...: {...: NUMBER}},
-    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": TEXT}],
+    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
     "lumped": TABLE,
 }
 _STATES = 64  # random states at which the written file must give the same torque
@@ -146,7 +146,7 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
             "both again"
         )
     couplings = [
-        Coupling(c["name"], tuple(c["ratios"].items()), c.get("replaces", ""))
+        Coupling(c["name"], tuple(c["ratios"].items()), c.get("replaces", False))
         for c in facts["couplings"]
     ]
     drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
@@ -194,7 +194,7 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
         "drives": {name: values[name] for name in own},
         "couplings": [
             {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
-            | ({"replaces": c.replaces} if c.replaces else {})
+            | ({"replaces": True} if c.replaces else {})
             | values[c.name]
             for c in layout.couplings
         ],
@@ -316,10 +316,11 @@ def _text(value: float) -> str:
 def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
     attributes = {name: term.dynamics for name, term in TERMS.items() if term.dynamics}
     values = dict(zip(model.layout.names, pi, strict=True))
+    shared = {coupling.name for coupling in model.layout.couplings}  # they load others, too
     edits: list[Edit] = []
     for joint in document.root.find_all("joint"):
         name, found = joint.attributes.get("name", ""), joint.find_all("dynamics")
-        if name not in model.joints:
+        if name not in model.joints or name in shared:
             continue
         names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
         new = {names[key]: _text(values[key]) for key in names if key in values}

@@ -116,6 +116,13 @@ class LogPiece:
         """
         return self._kept if isinstance(self.header.source, Log) else self._read()
 
+    def take(self, rows: Rows) -> None:
+        """Keep rows that were smoothed before, of a robot with the same friction speeds."""
+        model = self.header.model
+        motion = remember(model, replace(rows.trajectory, memory=None))
+        mask = row_mask(model, motion, self.header.signals.min_velocity)
+        vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
+
     @cached_property
     def _kept(self) -> Rows:
         return self._read()
@@ -268,6 +275,20 @@ class SurveyedLog:
             Stretch(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
             for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
         )
+
+    def with_model(self, model: RobotModel) -> "SurveyedLog":
+        """Return the log of a robot whose drives have other terms or another load.
+
+        Args:
+            model: The robot, with the same bodies, joints and couplings.
+        """
+        other = replace(self, model=model, asked=self.signals)
+        if self.is_held and np.array_equal(
+            friction_speeds(model.layout), friction_speeds(self.model.layout)
+        ):
+            for piece, own in zip(other.pieces, self.pieces, strict=True):
+                piece.take(own.read())
+        return other
 
     @property
     def whole(self) -> Rows:

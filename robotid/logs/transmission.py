@@ -103,45 +103,36 @@ class Transmission(Settings):
         return passed
 
     @property
-    def shared(self) -> list[tuple[str, str, tuple[tuple[str, float], ...]]]:
-        """The motors that turn with several joints.
+    def shared(self) -> dict[str, tuple[tuple[str, float], ...]]:
+        """Ratios of the motors that turn with several joints, over their largest ones.
 
-        Returns:
-            Of each its name, the joint in whose place its drive stands, and its ratios to the
-            speeds of the joints over its largest, which is its gear ratio.
+        By the joint in whose place the motor's drive stands, in pairs of joint and ratio.
         """
         turns = np.abs(self.T) > 0
         alone = turns.sum(axis=1) == 1
         taken = turns[alone].any(axis=0)  # joints with a motor of their own
         places = [joint for joint, is_taken in zip(self.joints, taken, strict=True) if not is_taken]
         shared = np.flatnonzero(~alone).tolist()
-        return [
-            (
-                self.names[i],
-                place,
-                tuple(
-                    (self.joints[j], float(self.T[i, j] / self.gear(i)))
-                    for j in np.flatnonzero(turns[i])
-                ),
+        return {
+            place: tuple(
+                (self.joints[j], float(self.T[i, j] / self._ratio(i)))
+                for j in np.flatnonzero(turns[i])
             )
             for i, place in zip(shared, places, strict=True)
-        ]
+        }
 
     @property
     def gears(self) -> dict[str, float]:
-        """Gear ratio of each drive [-, or rad/m], by its name: a joint's, or a shared motor's."""
-        named = {motor for motor, _, _ in self.shared}
+        """Gear ratio of each joint's drive, its largest ratio [-, or rad/m], by the joint."""
+        places = iter(self.shared)
+        alone = np.count_nonzero(self.T, axis=1) == 1
         return {
-            motor if motor in named else self.joints[int(np.argmax(np.abs(row)))]: self.gear(i)
-            for i, (motor, row) in enumerate(zip(self.names, self.T, strict=True))
+            self.joints[int(np.argmax(np.abs(row)))] if is_own else next(places): self._ratio(i)
+            for i, (row, is_own) in enumerate(zip(self.T, alone, strict=True))
         }
 
-    def gear(self, i: int) -> float:
-        """Return the gear ratio of a motor: its largest ratio to a joint [-, or rad/m].
-
-        Args:
-            i: Number of the motor.
-        """
+    def _ratio(self, i: int) -> float:
+        """Return the largest ratio of a motor [-, or rad/m]."""
         return float(self.T[i, np.argmax(np.abs(self.T[i]))])
 
     def stated(self, reductions: Mapping[str, float]) -> "Transmission":

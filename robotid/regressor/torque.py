@@ -26,6 +26,7 @@ __all__ = [
     "trajectory_regressor",
 ]
 
+_DECADES = 3.0  # of speeds, at random states of a robot whose friction is a curve
 _BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
@@ -217,17 +218,9 @@ def build_problem(
     def stream() -> Iterator[Block]:
         for start in range(0, shape[0], length):
             part = slice(start, start + length)
-            q, v, a, direction, memory = (
-                None if x is None else x[part]
-                for x in (
-                    trajectory.q,
-                    trajectory.v,
-                    trajectory.a,
-                    trajectory.direction,
-                    trajectory.memory,
-                )
-            )
-            W = joint_torque_regressor(model, q, v, a, direction, memory)
+            m = trajectory
+            direction, memory = (None if x is None else x[part] for x in (m.direction, m.memory))
+            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], direction, memory)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     def mass_stream() -> Iterator[Array]:
@@ -257,6 +250,8 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     q = rng.uniform(-1, 1, (samples, n)) * reach
     unit = np.minimum(reach, 1.0)  # [rad or m]
     v = rng.uniform(-1, 1, (samples, n)) * unit * rate
+    if model.layout.own:  # terms that only slow motion shows
+        v *= 10.0 ** rng.uniform(-_DECADES, 0.0, v.shape)
     a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
     if model.free_flyer:
         linear = np.array([model.length] * 3 + [1.0] * 3)

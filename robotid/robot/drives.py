@@ -20,6 +20,7 @@ from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
 __all__ = [
+    "AUTO",
     "DRIVE_TERMS",
     "FAMILIES",
     "TERMS",
@@ -62,8 +63,9 @@ class DriveMotion:
         Args:
             drive: Which one.
         """
-        own = (getattr(self, key)[drive] for key in ("q", "v", "a", "direction", "load", "rate"))
-        return DriveMotion(*own, self.begins)
+        q, v, a = self.q[drive], self.v[drive], self.a[drive]
+        direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]
+        return DriveMotion(q, v, a, direction, load, rate, self.begins)
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,13 @@ class DriveTerm:
     """One term of a drive's torque, linear in its parameter.
 
     Attributes:
-        seen: From where to where the fit has seen what ``guards`` names.
+        seen: From where to where the fit has seen what ``guards`` names: q, or the size of v.
 
     Class attributes:
         label: Its name in parameters, as ``"elbow.viscous"``.
         units: Unit of the parameter for a drive that turns, and for one that slides.
         is_nonnegative: Whether the parameter cannot be negative by physics.
+        highest: The largest parameter that a drive which moves can have.
         is_shared: Whether a drive that turns with several joints has it too.
         is_inertia: Whether it multiplies the acceleration and so adds to the mass matrix.
         is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
@@ -93,6 +96,7 @@ class DriveTerm:
     label: ClassVar[str] = ""
     units: ClassVar[tuple[str, str]] = ("N m", "N")
     is_nonnegative: ClassVar[bool] = False
+    highest: ClassVar[float] = np.inf
     is_shared: ClassVar[bool] = True
     is_inertia: ClassVar[bool] = False
     is_friction: ClassVar[bool] = True
@@ -114,9 +118,11 @@ class DriveTerm:
         Args:
             motion: How a drive moves.
         """
-        if self.guards and self.seen != _ANYWHERE:
-            kept = np.clip(getattr(motion, self.guards), *self.seen)
-            motion = replace(motion, **{self.guards: kept})
+        low, high = self.seen
+        if self.guards == "v":  # of either sign
+            motion = replace(motion, v=np.clip(motion.v, -high, high))
+        elif self.guards == "q":
+            motion = replace(motion, q=np.clip(motion.q, low, high))
         return self._column(motion)
 
     def _column(self, motion: DriveMotion) -> Array:
@@ -209,6 +215,7 @@ class LoadFriction(DriveTerm):
     label = "load"
     units = ("N m per N m", "N per N")
     is_nonnegative = True
+    highest = 0.5  # a gear that loses more holds what it should lower
     follows_direction = True
     remembers = True
     usual = (0.04, 0.1)
@@ -247,7 +254,8 @@ class Stribeck(DriveTerm):
     guards = "v"
 
     def _column(self, motion: DriveMotion) -> Array:
-        return motion.direction * np.exp(-np.abs(motion.v) / self.speed)
+        speed = np.maximum(np.abs(motion.v), self.seen[0])  # no data say how it goes on to 0
+        return motion.direction * np.exp(-speed / self.speed)
 
 
 @dataclass(frozen=True)
@@ -257,6 +265,7 @@ class Tanh(DriveTerm):
     speed: float = 0.1
 
     label = "tanh"
+    is_nonnegative = True
     guards = "v"
 
     def _column(self, motion: DriveMotion) -> Array:
@@ -352,6 +361,7 @@ class Presliding(DriveTerm):
     displacement: float = 0.01
 
     label = "presliding"
+    is_nonnegative = True
     follows_direction = True
     remembers = True
 
@@ -375,6 +385,7 @@ class LuGre(DriveTerm):
     excess: float = 0.5
 
     label = "lugre"
+    is_nonnegative = True
     follows_direction = True
     remembers = True
 
@@ -470,7 +481,7 @@ class Counterbalance(DriveTerm):
 
 @dataclass(frozen=True)
 class Lag(DriveTerm):
-    """A torque that comes late, by a delay or an elastic gear: tau = -T d(tau)/dt to first order."""
+    """A torque that comes late, by a delay or an elastic gear: to first order -T d(tau)/dt."""
 
     label = "lag"
     units = ("s", "s")
@@ -488,6 +499,8 @@ TERMS: dict[str, DriveTerm] = {
 }
 #: Names of the terms that are identified unless told otherwise.
 DRIVE_TERMS = tuple(TERMS)
+#: What ``friction`` says to have the families of each joint chosen.
+AUTO = "auto"
 
 Seen = Mapping[str, tuple[float, float]]
 
@@ -512,13 +525,13 @@ class Shape:
         """Return the bounds in the shape's own unit.
 
         Args:
-            seen: Ranges of speed "v" and position "q" that the fit has seen.
+            seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
         """
         low, high = self.bounds
         if not self.of:
             return low, high
         first, last = seen[self.of]
-        scale = max(abs(first), abs(last)) if self.of == "v" else last - first
+        scale = last if self.of == "v" else last - first
         return low * scale, high * scale
 
 
@@ -551,8 +564,7 @@ _TABLE = 8  # entries of a tabulated spring
 
 def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
     """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
-    top = max(map(abs, seen["v"]))
-    knots = top * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
+    knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
     return tuple(Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(_pairs(knots), start=1))
 
 

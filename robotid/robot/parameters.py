@@ -42,13 +42,13 @@ class Coupling:
     Attributes:
         name: Name of the drive, used in parameter names.
         ratios: Pairs of joint name and ratio [-].
-        replaces: The joint that has this drive in the place of one of its own, with an offset
-            then; empty for a drive beside those of the joints.
+        replaces: Whether it stands in the place of the own drive of the joint whose name it has,
+            with an offset then; if not, it is beside those of the joints.
     """
 
     name: str
     ratios: tuple[tuple[str, float], ...]
-    replaces: str = ""
+    replaces: bool = False
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,8 @@ class ParameterLayout:
         if unknown:
             raise SettingsError(f"unknown drive terms {listed(unknown)}; known: {listed(TERMS)}")
         for coupling in self.couplings:
-            named = [joint for joint, _ in coupling.ratios] + [coupling.replaces] * bool(
-                coupling.replaces
-            )
+            named = [joint for joint, _ in coupling.ratios]
+            named += [coupling.name] if coupling.replaces else []
             missing = [joint for joint in named if joint not in self.joints]
             if missing:
                 raise SettingsError(
@@ -124,7 +123,7 @@ class ParameterLayout:
 
         A coupling that replaces the drive of a joint stands in its place.
         """
-        instead = {coupling.replaces: coupling for coupling in self.couplings}
+        instead = {c.name: c for c in self.couplings if c.replaces}
         own = [instead.get(joint, Coupling(joint, ((joint, 1.0),))) for joint in self.joints]
         return (*own, *(coupling for coupling in self.couplings if not coupling.replaces))
 

@@ -112,7 +112,7 @@ OPTIONS = {
     "few terms, tilted": dict(terms=["viscous"], gravity=(1.0, -2.0, -9.0)),
     "coupled": dict(couplings=[Coupling("motor", (("shoulder", 1.0), ("elbow", -0.5)))]),
     "transmission": dict(
-        couplings=[Coupling("motor", (("shoulder", 1.0), ("elbow", -0.5)), replaces="elbow")]
+        couplings=[Coupling("elbow", (("shoulder", 1.0), ("elbow", -0.5)), replaces=True)]
     ),
 }
 

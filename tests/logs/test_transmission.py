@@ -100,13 +100,12 @@ def test_the_recording_of_a_real_wrist_is_the_same_from_either_side(recordings):
 
 
 def test_motors_of_several_joints_drive_in_the_place_of_the_joints_without_their_own():
-    assert Transmission(**WRIST).shared == [
-        ("m3", "wrist", (("elbow", 1.0), ("wrist", -30.0 / 32.0)))
-    ]
-    assert Transmission(**WRIST).gears == {"elbow": 45.0, "m3": 32.0}
-    assert Transmission(joints=JOINTS, matrix=(3.0, -4.0, 5.0)).shared == []
+    assert Transmission(**WRIST).shared == {"wrist": (("elbow", 1.0), ("wrist", -30.0 / 32.0))}
+    assert Transmission(**WRIST).gears == {"elbow": 45.0, "wrist": 32.0}
+    assert Transmission(joints=JOINTS, matrix=(3.0, -4.0, 5.0)).shared == {}
     crossed = Transmission(joints=("a", "b"), motors=("x", "y"), matrix=((0, 7.0), (8.0, 8.0)))
-    assert crossed.shared == [("y", "a", (("a", 1.0), ("b", 1.0)))]
+    assert crossed.shared == {"a": (("a", 1.0), ("b", 1.0))}
+    assert crossed.gears == {"b": 7.0, "a": 8.0}
 
 
 def refused(text, kind=DataError):

@@ -97,15 +97,15 @@ def test_a_coupled_drive_loads_every_joint_it_turns_with(ur5, rng):
 def test_drives_of_a_transmission_are_what_its_motors_take(ur5, rng):
     T = np.array([[120.0, 0.0], [80.0, -60.0]])  # motor speeds w_m = T v
     wrist = dict(joints=ur5.joints[4:], motors=("m5", "m6"))
-    (shared,) = Transmission(**wrist, matrix=T.tolist()).shared
-    motor = Coupling(shared[0], shared[2], replaces=shared[1])
+    ((joint, ratios),) = Transmission(**wrist, matrix=T.tolist()).shared.items()
+    motor = Coupling(joint, ratios, replaces=True)
     model = RobotModel.from_urdf(ur5.tree.path, couplings=(motor,))
     own, gear = rng.uniform(0.1, 1.0, (2, 4)), np.array([120.0, 80.0])  # at the motors
     pi = model.standard_parameters()
     # inertia and viscous friction are seen through the square of the gear ratio
     pi[-8:] = (own * gear[:, None] ** [2, 2, 1, 1]).ravel()
     assert model.layout.names[-8:] == tuple(
-        f"{name}.{term}" for name in ("wrist_2_joint", "m6") for term in model.layout.terms
+        f"{joint}.{term}" for joint in ur5.joints[4:] for term in model.layout.terms
     )
     q, v, a = states(model, rng, samples=5)
     w, dw = v[:, 4:] @ T.T, a[:, 4:] @ T.T

@@ -15,6 +15,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor import prediction
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict
 from robotid.regressor.rows import COMPILED, TrajectoryRows
@@ -60,7 +61,7 @@ JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 MOTOR = Coupling("motor", (("elbow_joint", 1.0), ("wrist_1_joint", -0.5)))
 R = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, -0.5]])  # drives over joints
 OWN = [
-    Asymmetric(), LoadFriction(), Cubic(seen=(-3.0, 3.0)), Stribeck(speed=0.3), Tanh(speed=0.2),
+    Asymmetric(), LoadFriction(), Cubic(seen=(0.0, 3.0)), Stribeck(speed=0.3), Tanh(speed=0.2),
     Power(exponent=0.4), Ramp(low=0.1, high=0.7), Harmonic(order=2.0, is_sine=True),
     PositionCoulomb(order=2, centre=0.3), Presliding(displacement=0.05),
     LuGre(displacement=0.05, speed=0.3, excess=0.6), Spring(seen=(-1.0, 2.0)),
@@ -287,8 +288,10 @@ def test_a_guarded_term_stays_as_it_was_at_the_end_of_what_was_seen():
     v = np.array([-9.0, -1.0, 0.5, 2.0, 9.0])
     motion = DriveMotion(v, v, v, np.sign(v), v, v)
     np.testing.assert_allclose(
-        Cubic(seen=(-1.5, 2.0)).column(motion), [-(1.5**3), -1.0, 0.125, 8.0, 8.0]
+        Cubic(seen=(0.0, 1.5)).column(motion), [-(1.5**3), -1.0, 0.125, 1.5**3, 1.5**3]
     )
+    hook = Stribeck(seen=(0.8, 2.0), speed=0.5).column(motion)
+    np.testing.assert_allclose(hook, np.exp(-2 * np.array([2, 1, 0.8, 2, 2])) * np.sign(v))
     wave = Harmonic(seen=(-1.0, 2.0), order=3.0).column(motion)
     np.testing.assert_allclose(wave, np.cos(3 * np.array([-1.0, -1.0, 0.5, 2.0, 2.0])))
 
@@ -391,7 +394,7 @@ def test_a_term_that_cannot_be_read_is_refused(table, message):
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda family: family.name)
 def test_families_make_terms_of_the_range_seen(family):
-    seen = {"v": (-1.5, 2.0), "q": (-1.0, 2.0)}
+    seen = {"v": (0.1, 2.0), "q": (-1.0, 2.0)}
     sizes = [np.sqrt(np.prod(shape.within(seen))) for shape in family.shapes]
     terms = family.make(seen, *sizes)
     assert len({term.name for term in terms}) == len(terms) >= 1
@@ -400,3 +403,9 @@ def test_families_make_terms_of_the_range_seen(family):
         assert not term.guards or term.seen in (seen[term.guards], (-np.inf, np.inf))
     for shape, size in zip(family.shapes, sizes, strict=True):
         assert {getattr(term, shape.name) for term in terms} == {size}
+
+
+def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
+    own = {joint: [Stribeck(speed=0.02, seen=(0.03, 0.4))] for joint in JOINTS}
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms=own)
+    assert {f"{joint}.stribeck" for joint in JOINTS} <= set(structural_mapping(model).base_names)
