@@ -9,9 +9,9 @@ linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import stdtr
@@ -39,6 +39,8 @@ _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bo
 _SLOWEST = 0.02  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _STEP = 1e-3  # relative, of a derivative
+_STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
+_FEWEST = 3  # stretches that show chance
 _NOTHING = 1e-300
 
 
@@ -99,6 +101,15 @@ class DriveChoice:
     shapes: tuple[FoundShape, ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was tried, taken and found, as plain values."""
+        return {
+            "families": list(self.families),
+            "shapes": [asdict(shape) for shape in self.shapes],
+            "seen": {key: list(pair) for key, pair in self.seen.items()},
+            "tried": [{**asdict(step), "families": list(step.families)} for step in self.tried],
+        }
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes larger by a share.
@@ -323,7 +334,14 @@ def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: floa
 
 
 def _chance(before: Array, after: Array) -> float:
-    """Return how likely stretches gain that much, in the mean of their shares, by chance [-]."""
+    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
+
+    Stretches in which the joint stands still have no say.
+    """
+    moves = before > _STILL * before.max()
+    if moves.sum() < _FEWEST:
+        return 1.0
+    before, after = before[moves], after[moves]
     gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
     spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))

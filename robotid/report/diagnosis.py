@@ -366,15 +366,14 @@ def _plot_friction(
         # a path of dots is a tenth of the size of as many markers
         for y, colour, width, alpha, label in (
             (left, INK, 1.6, 0.4, "torque left"),
-            (friction, PREDICTED, 2.2, 1.0, "friction and offset identified"),
+            (friction, PREDICTED, 2.2, 1.0, "identified"),
         ):
             x = np.column_stack([v, v, np.full(len(v), np.nan)]).ravel()
             dots = np.column_stack([y, y, np.full(len(y), np.nan)]).ravel()
             axes.plot(x, dots, color=colour, alpha=alpha, lw=width, solid_capstyle="round")
             axes.plot([], [], "o", ms=width + 1, color=colour, alpha=alpha, label=label)
-        label = (
-            f"at a load of {curve.load:.3g} {units[1]}, 95 % band" if curve.load else "95 % band"
-        )
+        load = f" at {curve.load:.3g} {units[1]} of load" if curve.load else ""
+        label = f"steady{load}, 95 % band"
         for half in (curve.v < 0, curve.v > 0):
             low, high = (curve.torque[half] + s * REACH * curve.std[half] for s in (-1.0, 1.0))
             axes.fill_between(curve.v[half], low, high, color=RESIDUAL, alpha=0.3, lw=0.0)
