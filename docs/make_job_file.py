@@ -8,7 +8,7 @@ from robotid.commands.job import Job, LogEntry
 from robotid.identification.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
-from robotid.robot.drives import TERMS, friction_models
+from robotid.robot.drives import AUTO, FAMILIES, TERMS
 
 PAGE = Path(__file__).with_name("job_file.md")
 START = """# Job file
@@ -127,13 +127,16 @@ def estimators():
 
 def drive_terms(rows):
     """Return the lines on the terms of the drives, behind those of other keys."""
-    models = ", ".join(friction_models())
-    rows += [f'| `friction` | `"viscous+coulomb"` | Terms of the friction: {models} |']
+    names = [name for name, term in TERMS.items() if term.is_friction]
+    words = (
+        f"{AUTO}: what held-out stretches of the fitted logs ask for, joint by joint; none; or "
+        f"some of these with + between them: {', '.join([*names, *FAMILIES])}"
+    )
+    rows += [f'| `friction` | `"{AUTO}"` | {words} |']
     for name, term in TERMS.items():
         if not term.is_friction:
             units = ", or ".join(term.units)
-            default = str(term.is_default).lower()
-            rows.append(f"| `{name}` | `{default}` | Whether it is identified [{units}] |")
+            rows.append(f"| `{name}` | `true` | Whether it is identified [{units}] |")
     return listing(rows)
 
 

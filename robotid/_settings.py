@@ -271,7 +271,7 @@ def _is_table(kind: Any) -> TypeGuard[type[Settings]]:  # noqa: ANN401
 
 def _read_type(kind: Any) -> Any:  # noqa: ANN401
     """Return what a job file holds where a field is annotated so."""
-    if isinstance(kind, dict | list | tuple):
+    if isinstance(kind, dict | list | tuple | Entries):
         return kind.copy() if isinstance(kind, dict) else kind  # other fields may join the table
     if _is_table(kind):
         return kind.schema()

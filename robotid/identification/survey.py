@@ -117,7 +117,11 @@ class LogPiece:
         return self._kept if isinstance(self.header.source, Log) else self._read()
 
     def take(self, rows: Rows) -> None:
-        """Keep rows that were smoothed before, of a robot with the same friction speeds."""
+        """Keep rows that were smoothed before, of a robot with the same friction speeds.
+
+        Args:
+            rows: The rows.
+        """
         model = self.header.model
         motion = remember(model, replace(rows.trajectory, memory=None))
         mask = row_mask(model, motion, self.header.signals.min_velocity)

@@ -5,7 +5,7 @@ import pytest
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.logs.settings import LogSource
-from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.drives import AUTO, DRIVE_TERMS
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 
@@ -122,7 +122,9 @@ WRONG = {
     "true for a number": ("rate = 200.0", "rate = true", "signals.rate is True, wanted a number"),
     "cutoff true": ("cutoff = 8.0", "cutoff = true", "cutoff is true, wanted a frequency [Hz]"),
     "negative cutoff": ("cutoff = 8.0", "cutoff = -8.0", "cutoff is -8.0, wanted 0.001 to 1e6"),
-    "friction model": ('"viscous"', '"stribeck"', "friction is 'stribeck', wanted one of"),
+    "friction model": (
+        '"viscous"', '"stribek"', "friction is 'stribek', wanted auto, none, or some of viscous",
+    ),
     "estimator": ('"wls"', '"magic"', "estimator is 'magic', wanted one of"),
     "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
@@ -188,4 +190,4 @@ def test_a_missing_job_file_is_named(tmp_path):
 def test_gravity_and_drive_terms_default_to_those_of_the_model():
     job = Job(urdf=Path("robot.urdf"))
     assert job.gravity == GRAVITY
-    assert job.terms == DRIVE_TERMS
+    assert job.terms == (*DRIVE_TERMS, AUTO)
