@@ -155,10 +155,9 @@ def _probe(
     whole = joint_torque_regressor(_in_gravity(model, np.zeros(3)), q, v, a).reshape(shape)
     pulled = [_in_gravity(model, g) for g in np.eye(3)]
     G = np.array([joint_torque_regressor(m, q, still, still).reshape(shape) for m in pulled])
-    own = model.layout.n_own
     return Probe(
         model, motion, rows, q, v, a, motion.tau[rows],
-        whole[:, :, :size], G[:, :, :, :size], whole[:, :, size + own :],
+        whole[:, :, :size], G[:, :, :, :size], whole[:, :, size:][:, :, model.layout.is_coupled],
     )  # fmt: skip
 
 

@@ -46,6 +46,12 @@ time = "ms"
 name = "motor"
 ratios = { a = 1, b = -1.0 }
 
+[[transmission]]
+joints = ["a", "b"]
+motors = ["m", "n"]
+matrix = [[32, 0], [45, 45]]
+efficiency = [0.9, 1.0]
+
 [estimator]
 name = "wls"
 
@@ -80,6 +86,9 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.units.time == "ms"
     assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
+    (gear,) = job.transmissions
+    assert (gear.motors, gear.efficiency) == (("m", "n"), (0.9, 1.0))
+    assert gear.T.tolist() == [[32.0, 0.0], [45.0, 45.0]]
     assert job.estimator.name == "wls"
     assert job.dynamics is True
     (entry,) = job.identification
@@ -136,6 +145,10 @@ WRONG = {
     "gain infinite": ("a = 14.87", "a = inf", "gains.a is inf, wanted a number"),
     "ratio": ("a = 1, b", "a = true, b", "ratios.a is True, wanted a number"),
     "column": ("[signals]", "columns = { tau_a = 2 }\n[signals]", "columns.tau_a is 2, wanted"),
+    "no matrix": ("matrix = [[32, 0], [45, 45]]", "", "a [[transmission]] has no key 'matrix'"),
+    "matrix of text": ("[45, 45]]", '["a", 45]]', "matrix is [[32, 0], ['a', 45]], wanted"),
+    "singular": ("[45, 45]]", "[45, 0]]", "matrix [[32, 0], [45, 0]] is singular"),
+    "motor twice": ('["m", "n"]', '["m", "m"]', "motors names m twice"),
     "ignore": ("[output]", "[doctor]\nignore = [1]\n[output]", "ignore[0] is 1, wanted"),
     "ignore text": ("[output]", '[doctor]\nignore = "a"\n[output]', "ignore is 'a', wanted a list"),
     "rate too high": ("rate = 200.0", "rate = 1e9", "rate is 1000000000.0, wanted 0.001 to 1e6"),
