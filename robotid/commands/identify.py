@@ -32,7 +32,8 @@ def run_job(
 ) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
-    A job may want no report, and an impossible result has no URDF. Every file is made in a folder of its own first and put in place when all are complete.
+    A job may want no report, and an impossible result has no URDF. Every file is made in a folder
+    of its own first and put in place when all are complete.
 
     Args:
         job: What to do.

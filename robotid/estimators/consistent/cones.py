@@ -44,9 +44,7 @@ _SCS_STATUS = {
 }
 _FAR = 1e3  # distance from the cone beyond which a longer unit is used
 _NEAREST = 1e-6  # gap at which a point in units of its spread is right to 1e-3
-_CONTRADICTED = (
-    1e-7  # inverse distance, in the longest single step, beyond which no point lies inside
-)
+_CONTRADICTED = 1e-7  # ratio of a first step inside to all of it, below which there is no inside
 _SCS_ITERATIONS = 100  # of SCS for one of an interior-point method: each is a back-substitution
 
 
