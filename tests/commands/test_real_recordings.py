@@ -28,7 +28,7 @@ ALL = [*REACHED, "tiago"]
 
 @pytest.fixture(scope="module")
 def run(recordings, tmp_path_factory):
-    """Run a job once and keep what it found and where it wrote; with a report of the one with gaps."""
+    """Run a job once, with a report where there are gaps; keep what it found and where it wrote."""
     done = {}
 
     def runner(name):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from robotid._typing import Array
 from robotid.exceptions import MissingDependencyError, NotConvergedError
@@ -332,6 +331,8 @@ def _step_inside(G: Array, slack: Array, point: Array) -> Array | str:
         Lawson, Hanson (1974), Solving least squares problems, chapter 23: the shortest vector
         under inequalities is the residual of a problem of nonnegative least squares.
     """
+    from scipy.optimize import nnls
+
     reach = -slack.min()
     if reach <= 0:
         return point
@@ -339,7 +340,7 @@ def _step_inside(G: Array, slack: Array, point: Array) -> Array | str:
     goal = np.zeros(len(E))
     goal[-1] = 1.0
     try:
-        multipliers, distance = scipy.optimize.nnls(E, goal)
+        multipliers, distance = nnls(E, goal)
     except RuntimeError:  # it says so of its iterations
         return "MaxIterations"
     if distance < _CONTRADICTED:
