@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.estimation import EXACT, NOISE
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import Cone, nearest, svec, unsvec
 from robotid.exceptions import NotConvergedError, SettingsError
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import SettingsError
-from robotid.identification import pipeline
 from robotid.identification.pipeline import conclude
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import LOSSES, loss_slope, loss_weight
@@ -19,10 +19,6 @@ from robotid.regressor.used_rows import base_problem
 
 NOISE = np.array([6.0, 6.0, 3.0, 0.9, 0.9, 0.3])
 ROWS = {"wrist_2_joint": 584, "elbow_joint": 1148, "shoulder_pan_joint": 1287, "wrist_1_joint": 900}
-
-
-def identify(model, logs, **settings):
-    return pipeline.identify(model, logs, doctor=False, **settings)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
@@ -12,7 +13,6 @@ from robotid.commands.job import LogEntry, job_from_settings, read_job
 from robotid.estimators.consistent.cones import SOLVERS
 from robotid.estimators.consistent.penalties import METRICS
 from robotid.exceptions import SettingsError
-from robotid.identification import pipeline
 from robotid.identification.robust import LOSSES
 from robotid.identification.settings import ESTIMATORS, EstimatorSettings, RecursiveSettings
 from robotid.logs.read import write_log
@@ -21,10 +21,6 @@ from robotid.logs.settings import SignalSettings
 JOBS = Path(__file__).parents[1] / "jobs"
 RECURSIVE = [name for name, kind in ESTIMATORS.items() if issubclass(kind, RecursiveSettings)]
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
-
-
-def identify(model, logs, **settings):
-    return pipeline.identify(model, logs, doctor=False, **settings)
 
 
 def relative_errors(found, name):
