@@ -9,7 +9,10 @@ if TYPE_CHECKING:
     from robotid.doctor.diagnosis import check_logs
     from robotid.doctor.urdf import inspect_urdf
     from robotid.exceptions import RobotIdError
+    from robotid.export.mjcf import write_mjcf
+    from robotid.export.ranges import write_ranges
     from robotid.export.result import load_result
+    from robotid.export.sdf import write_sdf
     from robotid.export.urdf import write_urdf
     from robotid.identification.pipeline import Identification, identify
     from robotid.identification.settings import EstimatorSettings
@@ -45,7 +48,10 @@ __all__ = [
     "replay",
     "run_job",
     "write_log",
+    "write_mjcf",
+    "write_ranges",
     "write_report",
+    "write_sdf",
     "write_urdf",
 ]
 
@@ -55,7 +61,10 @@ _HOMES = {
     "doctor.diagnosis": ["check_logs"],
     "doctor.urdf": ["inspect_urdf"],
     "exceptions": ["RobotIdError"],
+    "export.mjcf": ["write_mjcf"],
+    "export.ranges": ["write_ranges"],
     "export.result": ["load_result"],
+    "export.sdf": ["write_sdf"],
     "export.urdf": ["write_urdf"],
     "identification.pipeline": ["Identification", "identify"],
     "identification.settings": ["EstimatorSettings"],

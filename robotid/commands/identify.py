@@ -65,7 +65,9 @@ def run_job(
             outputs["report"] = "report.html"
             identification = replace(identification, report=str(target / "report.html"))
         if identification.has_urdf:
-            write_urdf(model, identification.standard, partial / name, dynamics=job.dynamics)
+            write_urdf(
+                identification.model, identification.standard, partial / name, dynamics=job.dynamics
+            )
             outputs |= {"urdf": name, "sidecar": sidecar}
         result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
@@ -107,4 +109,5 @@ def _identify(
             job.rows_in_memory,
         )
     with chosen:
-        return conclude(recordings, job.estimator, found, job.ignore), checkpoint
+        concluded = conclude(recordings, job.estimator, found, job.ignore, friction=job.friction)
+        return concluded, checkpoint

@@ -125,7 +125,7 @@ class Probe:
         still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
         layout = self.model.layout
-        coupled = layout.n_inertial + len(self.model.joints) * len(layout.terms)
+        coupled = layout.n_inertial + layout.n_own
         return np.hstack([own, self.regressors.whole[:, j, coupled:]])
 
     def at(self, rows: Array) -> "Probe":
