@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, WLS
 from robotid.exceptions import DataError
-from robotid.identification.pipeline import identify
 from robotid.identification.standard_errors import (
     measured_errors,
     quantile,
