@@ -19,6 +19,7 @@ from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors
 
 __all__ = [
+    "FEWEST_STRETCHES",
     "Redraws",
     "Scatter",
     "StandardErrors",
@@ -28,7 +29,8 @@ __all__ = [
     "with_wls_errors",
 ]
 
-_FEWEST = 12  # fewer stretches do not show how much their scores scatter
+#: Fewer stretches do not show how much their scores scatter.
+FEWEST_STRETCHES = 12
 _OWN = 0.95  # leverage above which a stretch fits a direction alone, and shows no scatter in it
 _LEAST_SOLVED = 0.8  # share of the redrawn fits below which they tell nothing
 
@@ -146,7 +148,7 @@ def measured_errors(
     b = len(factors.names)
     if not (estimate.details.get("active") and redraws is not None and redraws.draws > 0):
         redraws = None  # no bound binds, or it is left out
-    if len(stretches) < _FEWEST:
+    if len(stretches) < FEWEST_STRETCHES:
         method = (
             f"the filter's band: {share:.3g} of the rows count as independent, since the logs have "
             f"only {len(stretches)} stretches longer than the filter's memory"
@@ -225,10 +227,10 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
         Bell, McCaffrey (2002), as above; Liang, Zeger (1986), Longitudinal data analysis using
         generalized linear models.
     """
-    if len(stretches) < _FEWEST:
+    if len(stretches) < FEWEST_STRETCHES:
         raise DataError(
             f"{len(stretches)} stretches do not show how much their scores scatter; wanted at "
-            f"least {_FEWEST}: fit longer logs"
+            f"least {FEWEST_STRETCHES}: fit longer logs"
         )
     c = len(theta)
     weighted = np.array([stretch.weighted(sigma) for stretch in stretches])

@@ -1,0 +1,203 @@
+"""Two runs of one robot that differ by what loads only one of them, or by gains nobody knows.
+
+Reference run   k_j i_j = W_j beta
+Loaded run      k_j i_j = W_j (beta + c + D x)
+
+with what is known of the difference in c, and what is not in x. W D needs no rows of its own: a
+body that is added has the columns of the link that it hangs on. A current i_j of unknown gain k_j
+is the only thing with noise, so it stands alone, i_j = W_j (...) / k_j: bilinear, solved by
+Gauss-Newton, whose step is one more column -W_j beta per gain. All of it runs on triangular
+factors, and all errors come from one covariance, that of the gains included.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from robotid._typing import Array
+from robotid.estimators import WLS
+from robotid.exceptions import NotConvergedError
+from robotid.identification.standard_errors import FEWEST_STRETCHES, scatter
+from robotid.regressor.factors import Factors, merge, triangle_of
+
+__all__ = ["Compared", "TwoRuns"]
+
+_STEPS = 50
+_SETTLED = 1e-9  # relative change of the gains
+_LONGEST = 1.0  # step of the logarithm of a gain
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What two runs tell.
+
+    Attributes:
+        theta: beta and x, shape (b + d,), SI units.
+        gain: Gain k of each joint's signal, shape (n,) [N m/A]; 1 of a torque.
+        covariance: Covariance of beta, x and the logarithms of the u unknown gains,
+            shape (b + d + u, b + d + u).
+        freedom: Degrees of freedom of their standard errors, shape (b + d + u,).
+        sigma: Noise level per joint, shape (n,) [N m or N].
+        unexplained: Share of each joint's torque that is left, shape (n,) [-].
+    """
+
+    theta: Array
+    gain: Array
+    covariance: Array
+    freedom: Array
+    sigma: Array
+    unexplained: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TwoRuns:
+    """Factors of two runs and what is known of their difference.
+
+    Attributes:
+        reference: Factors of the stretches of the reference run, of b base parameters.
+        loaded: Those of the loaded run.
+        D: Columns of the difference in base parameters, shape (b, d).
+        names: Names of the d unknowns.
+        known: Known part c of the difference, shape (b,).
+        mean: Plausible value of beta and x before the data, shape (b + d,).
+        precision: Its inverse covariance, shape (b + d, b + d), positive definite.
+        share: Share of the rows that count as independent [-].
+        unknown: Joints whose gain is unknown, shape (u,), int.
+    """
+
+    reference: tuple[Factors, ...]
+    loaded: tuple[Factors, ...]
+    D: Array
+    names: tuple[str, ...]
+    known: Array
+    mean: Array
+    precision: Array
+    share: float
+    unknown: Array
+
+    def compare(self) -> Compared:
+        """Fit both runs at once, and the unknown gains with them.
+
+        Standard errors come from the scatter of the stretches' scores; of fewer than 12 stretches,
+        rows count as independent by ``share``.
+
+        Raises:
+            NotConvergedError: If the gains do not settle.
+
+        References:
+            Gautier, Briot (2014), Global identification of joint drive gains and dynamic parameters
+            of robots, Journal of Dynamic Systems, Measurement, and Control 136, section 3, whose
+            total least squares this replaces.
+        """
+        size, u = len(self.mean), len(self.unknown)
+        gain = self._first_gains()
+        theta, *_ = self._solve(self._stretches(gain, None))
+        for _ in range(_STEPS if u else 1):
+            stretches = self._stretches(gain, theta if u else None)
+            solution, sigma, bread = self._solve(stretches)
+            theta, step = solution[:size], np.clip(solution[size:], -_LONGEST, _LONGEST)
+            gain[self.unknown] *= np.exp(step)
+            if not u or np.abs(step).max() < _SETTLED:
+                break
+        else:
+            raise NotConvergedError(
+                f"the gains still change by {np.abs(step).max():.1e} after {_STEPS} steps; record "
+                "richer motions of both runs, or state some of the gains",
+                "max_iterations",
+            )
+        covariance, freedom = self._errors(stretches, solution, sigma, bread)
+        whole = merge(stretches)
+        torque = np.sqrt(np.maximum(merge(self._stretches(gain, None)).torque_squares(), 1e-300))
+        unexplained = np.sqrt(whole.residual_squares(solution)) / torque
+        return Compared(theta, gain, covariance, freedom, sigma, unexplained)
+
+    def _first_gains(self) -> Array:
+        """Return gains to start from, shape (n,): k_j i_j - W_j (beta + D x) = W_j c by its least
+        squares, which noise of the currents pulls towards 0 a little."""
+        gain = np.ones(len(self.reference[0].rows))
+        if not len(self.unknown):
+            return gain
+        whole = merge(self._stretches(gain, None, is_start=True))
+        noise = [abs(R[-1, -1]) for R in merge([*self.reference, *self.loaded]).triangles]
+        sigma = np.sqrt(np.square(noise) / np.maximum(whole.rows, 1)) + 1e-300
+        solution = self._minimum(whole, sigma)[0]
+        gain[self.unknown] = solution[len(self.mean) :]
+        return gain
+
+    def _stretches(
+        self, gain: Array, at: Array | None, *, is_start: bool = False
+    ) -> tuple[Factors, ...]:
+        """Return the factors of all stretches with the columns of beta, x and the gains.
+
+        Args:
+            gain: Gains, shape (n,).
+            at: Parameters beta and x that the gains' columns -W (beta + c + D x) are taken at;
+                None for no such columns.
+            is_start: Whether the gains' columns are -i instead.
+        """
+        b, d = self.D.shape
+        D = {False: np.zeros((b, d)), True: self.D}
+        out = []
+        for is_loaded, run in ((False, self.reference), (True, self.loaded)):
+            S = np.hstack([np.eye(b), D[is_loaded]])
+            c = self.known if is_loaded else np.zeros(b)
+            out += [self._extended(factors, S, c, gain, at, is_start) for factors in run]
+        return tuple(out)
+
+    def _extended(
+        self, factors: Factors, S: Array, c: Array, gain: Array, at: Array | None, is_start: bool
+    ) -> Factors:
+        size, has_gains = S.shape[1], at is not None or is_start
+        gains = self.unknown.tolist() if has_gains else []
+        names = (*factors.names, *self.names, *(f"{j}.gain" for j in gains))
+        triangles, columns = [], []
+        for j, (R, own) in enumerate(zip(factors.triangles, factors.columns, strict=True)):
+            kept = np.flatnonzero(S[own].any(axis=0))
+            known = R[:, :-1] @ c[own]
+            torque = gain[j] * R[:, -1]
+            parts = [R[:, :-1] @ S[np.ix_(own, kept)]]
+            if j in gains:
+                k = size + gains.index(j)
+                column = -torque if at is None else -(R[:, :-1] @ (S[own] @ at)) - known
+                parts.append(column[:, None])
+                torque = np.zeros_like(torque) if at is None else torque
+                columns.append(np.append(kept, k))
+            else:
+                columns.append(kept)
+            triangles.append(triangle_of(np.column_stack([*parts, torque - known])))
+        return Factors(tuple(triangles), tuple(columns), factors.rows, names)
+
+    def _solve(self, stretches: Sequence[Factors]) -> tuple[Array, Array, Array]:
+        """Return parameters, noise levels of the joints, and covariance of independent rows."""
+        whole = merge(stretches)
+        prior = np.append(self.mean, np.zeros(len(whole.names) - len(self.mean)))
+        sigma = WLS(prior=prior).fit(whole).sigma
+        theta, inverse = self._minimum(whole, sigma / np.sqrt(self.share))
+        return theta, sigma, inverse
+
+    def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
+        """Return the minimum with the prior beside the rows, and the inverse information."""
+        rows, size = whole.weighted(sigma), len(self.mean)
+        root = np.zeros((size, rows.shape[1]))
+        root[:, :size] = scipy.linalg.cholesky(self.precision)
+        root[:, -1] = root[:, :size] @ self.mean
+        stacked = np.vstack([rows, root])
+        scale = np.linalg.norm(stacked[:, :-1], axis=0)
+        scale[scale == 0] = 1.0
+        R = triangle_of(np.column_stack([stacked[:, :-1] / scale, stacked[:, -1]]))
+        inverse = np.linalg.inv(R[:-1, :-1]) / scale[:, None]
+        return inverse @ R[:-1, -1], inverse @ inverse.T
+
+    def _errors(
+        self, stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Array
+    ) -> tuple[Array, Array]:
+        """Return covariance and degrees of freedom; the prior adds its own uncertainty."""
+        if len(stretches) < FEWEST_STRETCHES:
+            return bread, np.full(len(theta), np.inf)
+        found = scatter(stretches, theta, sigma, self.share * bread)
+        meat = self.share**2 * found.meat
+        size = len(self.mean)
+        meat[:size, :size] += self.precision
+        return bread @ meat @ bread, replace(found, bread=self.share * bread).freedom()
