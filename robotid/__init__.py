@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from robotid.exceptions import RobotIdError
     from robotid.export.result import load_result
     from robotid.export.urdf import write_urdf
+    from robotid.identification.payload_fit import PayloadFit, identify_payload
     from robotid.identification.pipeline import Identification, identify
     from robotid.identification.settings import EstimatorSettings
     from robotid.logs.data import Log, Trajectory
@@ -31,6 +32,7 @@ __all__ = [
     "LogSource",
     "LogUnits",
     "OnlineIdentifier",
+    "PayloadFit",
     "RobotIdError",
     "RobotModel",
     "SignalSettings",
@@ -38,6 +40,7 @@ __all__ = [
     "__version__",
     "check_logs",
     "identify",
+    "identify_payload",
     "inspect_urdf",
     "load_result",
     "read_job",
@@ -57,6 +60,7 @@ _HOMES = {
     "exceptions": ["RobotIdError"],
     "export.result": ["load_result"],
     "export.urdf": ["write_urdf"],
+    "identification.payload_fit": ["PayloadFit", "identify_payload"],
     "identification.pipeline": ["Identification", "identify"],
     "identification.settings": ["EstimatorSettings"],
     "logs.data": ["Log", "Trajectory"],

@@ -22,10 +22,7 @@ from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
-    INERTIAL_TERMS,
     ParameterLayout,
-    inertial_from_pseudo_inertia,
-    pseudo_inertia,
 )
 from robotid.robot.prior import prior_spread
 
@@ -75,7 +72,9 @@ class Payload:
     @property
     def inertia_at_link(self) -> Array:
         """Inertia about the origin of the link's frame, shape (3, 3) [kg m^2]."""
-        return self.inertia + self.mass * (self.com @ self.com * np.eye(3) - np.outer(self.com, self.com))
+        c = self.com
+        inertia: Array = self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+        return inertia
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values; what is not determined is None."""
@@ -148,7 +147,10 @@ class PayloadFit:
         }
         if self.gains:
             rows = zip(self.names, self.base.tolist(), self.base_error.tolist(), strict=True)
-            content["gains"] = {j: {"gain": g.value, "std_error": g.std_error, "interval": list(g.interval)} for j, g in self.gains.items()}
+            content["gains"] = {
+                j: {"gain": g.value, "std_error": g.std_error, "interval": list(g.interval)}
+                for j, g in self.gains.items()
+            }
             content["base_parameters"] = [
                 {"name": name, "value": value, "std_error": error} for name, value, error in rows
             ]
@@ -195,6 +197,7 @@ def identify_payload(
         Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
         for some in (logs, reference)
     )
+    links = links or model.layout.bodies[-1:]
     return fit_payloads(
         loaded, without, links=links, masses=masses or {}, unknown_gains=unknown_gains
     )
@@ -204,7 +207,7 @@ def fit_payloads(
     loaded: Recordings,
     reference: Recordings,
     *,
-    links: Sequence[str] = (),
+    links: Sequence[str],
     masses: Mapping[str, float],
     unknown_gains: Sequence[str] = (),
 ) -> PayloadFit:
@@ -221,12 +224,13 @@ def fit_payloads(
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
     model = loaded.model
-    links = tuple(links) or model.layout.bodies[-1:]
     columns = _payload_columns(model, loaded.mapping.K, links)
     _check_known(model, links, masses, unknown_gains)
-    runs = _two_runs(loaded, reference, links, columns, masses, unknown_gains)
+    known = np.full(10 * len(links), np.nan)
+    known[[10 * links.index(link) for link in masses]] = list(masses.values())
+    runs = _two_runs(loaded, reference, columns, known, unknown_gains)
     found = runs.compare()
-    x, C, freedom = _payload_parameters(runs, found, links, masses)
+    x, C, freedom = _payload_parameters(found, known)
     for k, link in enumerate(links):
         _check_mass(model, link, x[10 * k], np.sqrt(C[10 * k, 10 * k]), link in masses)
     possible = _possible(model, links, x, C, masses)
@@ -297,11 +301,11 @@ def _check_known(
 def _two_runs(
     loaded: Recordings,
     reference: Recordings,
-    links: Sequence[str],
     columns: Array,
-    masses: Mapping[str, float],
+    known: Array,
     unknown_gains: Sequence[str],
 ) -> TwoRuns:
+    """Return the problem of two runs; parameters of payloads that are not known are NaN."""
     model, K, layout = loaded.model, loaded.mapping.K, loaded.model.layout
     first, second = reference.reduce(), loaded.reduce()
     whole = join([*first, *second])
@@ -310,40 +314,29 @@ def _two_runs(
     changing = [i for i, (_, term) in enumerate(layout.drive_parameters) if not term.is_inertia]
     drives = np.array(changing, dtype=int) + layout.n_inertial
     mass, radius = _size(model)
-    own = _WIDE * mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6] * len(links))
-    stated = [10 * k for k, link in enumerate(links) if link in masses]
-    free = np.delete(np.arange(10 * len(links)), stated)
-    names = [f"{layout.names[i]} change" for i in drives]
-    names += [f"payload {links[i // 10]}.{INERTIAL_TERMS[i % 10]}" for i in free]
-    KS = K * spread
-    about_urdf = np.linalg.inv(KS @ KS.T)
+    size = mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6] * (len(known) // 10))
+    free = np.isnan(known)
+    about_urdf = np.linalg.inv(K * spread**2 @ K.T)
+    change = np.append(spread[drives], _WIDE * size[free])
     return TwoRuns(
         tuple(reduction.factors for reduction in first),
         tuple(reduction.factors for reduction in second),
         np.hstack([K[:, drives], columns[:, free]]),
-        tuple(names),
-        sum((masses[links[i // 10]] * columns[:, i] for i in stated), start=np.zeros(len(K))),
-        np.concatenate([K @ model.standard_parameters(), np.zeros(len(drives) + len(free))]),
-        scipy.linalg.block_diag(
-            0.5 * (about_urdf + about_urdf.T), np.diag(np.append(spread[drives], own[free]) ** -2.0)
-        ),
+        columns @ np.nan_to_num(known),
+        np.append(K @ model.standard_parameters(), np.zeros(len(change))),
+        scipy.linalg.block_diag(0.5 * (about_urdf + about_urdf.T), np.diag(change**-2.0)),
         min(loaded.share, reference.share),
         np.array([model.joints.index(joint) for joint in unknown_gains], dtype=int),
     )
 
 
-def _payload_parameters(
-    runs: TwoRuns, found: Compared, links: Sequence[str], masses: Mapping[str, float]
-) -> tuple[Array, Array, Array]:
+def _payload_parameters(found: Compared, known: Array) -> tuple[Array, Array, Array]:
     """Return all ten parameters of each payload, their covariance and degrees of freedom."""
-    count = 10 * len(links)
-    stated = [10 * k for k, link in enumerate(links) if link in masses]
-    free = np.delete(np.arange(count), stated)
-    at = np.arange(len(found.theta) - len(free), len(found.theta))
-    x, C, freedom = np.zeros(count), np.zeros((count, count)), np.full(count, np.inf)
+    x, C = np.nan_to_num(known), np.zeros((len(known), len(known)))
+    freedom, free = np.full(len(known), np.inf), np.flatnonzero(np.isnan(known))
+    at = slice(len(found.theta) - len(free), len(found.theta))
     x[free], freedom[free] = found.theta[at], found.freedom[at]
-    x[stated] = [masses[links[i // 10]] for i in stated]
-    C[np.ix_(free, free)] = found.covariance[np.ix_(at, at)]
+    C[np.ix_(free, free)] = found.covariance[at, at]
     return x, C, freedom
 
 
@@ -369,11 +362,11 @@ def _possible(
     model: RobotModel, links: Sequence[str], x: Array, C: Array, masses: Mapping[str, float]
 ) -> Array:
     """Return the physically possible parameters nearest to x in the metric of its covariance."""
-    _, radius = _size(model)
-    mass = np.maximum(np.abs(x[::10]), _NOTHING * _size(model)[0])
+    arm, radius = _size(model)
+    mass = np.maximum(np.abs(x[::10]), _NOTHING * arm)
     unit = np.array([1.0, *[radius] * 3, *[radius**2] * 6])
     scale = (mass[:, None] * unit).reshape(-1)
-    ball = (mass[:, None] * np.array([1.0, 0, 0, 0, *radius**2 * np.array([1.0, 0, 1, 0, 0, 1])]))
+    ball = mass[:, None] * np.array([1.0, 0, 0, 0, *radius**2 * np.array([1.0, 0, 1, 0, 0, 1])])
     stated = {link: (masses[link], masses[link]) for link in links if link in masses}
     count = len(x)
     fit = Consistent(
@@ -401,22 +394,22 @@ def _payload(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -
     mass, error, reach = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
     com, com_error = shown[:3], errors[:3]
     inertia, inertia_error = _matrix(shown[3:]), _matrix(errors[3:])
+    moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
     reasons = {}
-    if error > 0 and mass < _SURE * error:
-        words = f"nothing hangs on {link} that is told from 0 kg"
-        reasons = dict.fromkeys(("com", "inertia"), words)
-    elif com_error.max() > _COM * model.length:
+    if com_error.max() > _COM * model.length:
         reasons["com"] = (
             f"its standard error would be {com_error.max():.2g} m; record poses of {link} about "
             "all axes"
         )
-    moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
     if largest > _INERTIA * moment:
-        reasons.setdefault("inertia", (
+        reasons["inertia"] = (
             f"the motion turns {link} too little: an inertia about the centre of mass of about "
             f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast turns "
             "of the joints next to it, about all axes"
-        ))
+        )
+    if error > 0 and mass < _SURE * error:
+        words = f"nothing hangs on {link} that can be told from 0 kg"
+        reasons = dict.fromkeys(("com", "inertia"), words)
     return Payload(
         link,
         mass,

@@ -59,7 +59,6 @@ class TwoRuns:
         reference: Factors of the stretches of the reference run, of b base parameters.
         loaded: Those of the loaded run.
         D: Columns of the difference in base parameters, shape (b, d).
-        names: Names of the d unknowns.
         known: Known part c of the difference, shape (b,).
         mean: Plausible value of beta and x before the data, shape (b + d,).
         precision: Its inverse covariance, shape (b + d, b + d), positive definite.
@@ -70,7 +69,6 @@ class TwoRuns:
     reference: tuple[Factors, ...]
     loaded: tuple[Factors, ...]
     D: Array
-    names: tuple[str, ...]
     known: Array
     mean: Array
     precision: Array
@@ -108,14 +106,16 @@ class TwoRuns:
                 "max_iterations",
             )
         covariance, freedom = self._errors(stretches, solution, sigma, bread)
-        whole = merge(stretches)
-        torque = np.sqrt(np.maximum(merge(self._stretches(gain, None)).torque_squares(), 1e-300))
-        unexplained = np.sqrt(whole.residual_squares(solution)) / torque
+        logged = np.sqrt(merge([*self.reference, *self.loaded]).torque_squares())
+        torque = np.maximum(np.abs(gain) * logged, 1e-300)
+        unexplained = np.sqrt(merge(stretches).residual_squares(solution)) / torque
         return Compared(theta, gain, covariance, freedom, sigma, unexplained)
 
     def _first_gains(self) -> Array:
-        """Return gains to start from, shape (n,): k_j i_j - W_j (beta + D x) = W_j c by its least
-        squares, which noise of the currents pulls towards 0 a little."""
+        """Return gains to start from, shape (n,): least squares of k i - W (beta + D x) = W c.
+
+        Noise of the currents pulls them towards 0 a little.
+        """
         gain = np.ones(len(self.reference[0].rows))
         if not len(self.unknown):
             return gain
@@ -151,7 +151,11 @@ class TwoRuns:
     ) -> Factors:
         size, has_gains = S.shape[1], at is not None or is_start
         gains = self.unknown.tolist() if has_gains else []
-        names = (*factors.names, *self.names, *(f"{j}.gain" for j in gains))
+        names = (
+            *factors.names,
+            *map(str, range(S.shape[1] - len(S))),
+            *(f"gain {j}" for j in gains),
+        )
         triangles, columns = [], []
         for j, (R, own) in enumerate(zip(factors.triangles, factors.columns, strict=True)):
             kept = np.flatnonzero(S[own].any(axis=0))
