@@ -5,16 +5,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators import Consistent, Constraints, Estimate
+from robotid.estimators.stretches import quantile
+from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.identification.recordings import Recordings
-from robotid.identification.standard_errors import quantile
 from robotid.identification.survey import hold_log
-from robotid.identification.two_runs import Compared, TwoRuns
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
@@ -24,11 +23,10 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
     ParameterLayout,
 )
-from robotid.robot.prior import prior_spread
+from robotid.robot.prior import payload_spread, prior_spread
 
 __all__ = ["Gain", "Payload", "PayloadFit", "fit_payloads", "identify_payload"]
 
-_WIDE = 10.0  # plausible spreads about the URDF's values within which all is sought
 _SURE = 3.0  # standard errors that a mass has at least
 _MASS = 0.3  # largest standard error of a mass that counts as determined, of that mass,
 _NOTHING = 0.01  # ... or of this share of the robot's
@@ -228,7 +226,19 @@ def fit_payloads(
     _check_known(model, links, masses, unknown_gains)
     known = np.full(10 * len(links), np.nan)
     known[[10 * links.index(link) for link in masses]] = list(masses.values())
-    runs = _two_runs(loaded, reference, columns, known, unknown_gains)
+    first, second = reference.reduce(), loaded.reduce()
+    whole = join([*first, *second])
+    runs = payload_runs(
+        first,
+        second,
+        model.layout,
+        loaded.mapping.K,
+        model.standard_parameters(),
+        prior_spread(model, whole.squares, whole.samples),
+        (columns, known, np.tile(payload_spread(model), len(links))),
+        share=min(loaded.share, reference.share),
+        unknown=[model.joints.index(joint) for joint in unknown_gains],
+    )
     found = runs.compare()
     x, C, freedom = _payload_parameters(found, known)
     for k, link in enumerate(links):
@@ -298,38 +308,6 @@ def _check_known(
         )
 
 
-def _two_runs(
-    loaded: Recordings,
-    reference: Recordings,
-    columns: Array,
-    known: Array,
-    unknown_gains: Sequence[str],
-) -> TwoRuns:
-    """Return the problem of two runs; parameters of payloads that are not known are NaN."""
-    model, K, layout = loaded.model, loaded.mapping.K, loaded.model.layout
-    first, second = reference.reduce(), loaded.reduce()
-    whole = join([*first, *second])
-    spread = _WIDE * prior_spread(model, whole.squares, whole.samples)
-    # friction and offsets change with load and temperature, inertias do not
-    changing = [i for i, (_, term) in enumerate(layout.drive_parameters) if not term.is_inertia]
-    drives = np.array(changing, dtype=int) + layout.n_inertial
-    mass, radius = _size(model)
-    size = mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6] * (len(known) // 10))
-    free = np.isnan(known)
-    about_urdf = np.linalg.inv(K * spread**2 @ K.T)
-    change = np.append(spread[drives], _WIDE * size[free])
-    return TwoRuns(
-        tuple(reduction.factors for reduction in first),
-        tuple(reduction.factors for reduction in second),
-        np.hstack([K[:, drives], columns[:, free]]),
-        columns @ np.nan_to_num(known),
-        np.append(K @ model.standard_parameters(), np.zeros(len(change))),
-        scipy.linalg.block_diag(0.5 * (about_urdf + about_urdf.T), np.diag(change**-2.0)),
-        min(loaded.share, reference.share),
-        np.array([model.joints.index(joint) for joint in unknown_gains], dtype=int),
-    )
-
-
 def _payload_parameters(found: Compared, known: Array) -> tuple[Array, Array, Array]:
     """Return all ten parameters of each payload, their covariance and degrees of freedom."""
     x, C = np.nan_to_num(known), np.zeros((len(known), len(known)))
@@ -344,7 +322,7 @@ def _check_mass(model: RobotModel, link: str, mass: float, error: float, is_know
     """Refuse a mass that the motion does not show, and runs that are the wrong way round."""
     if is_known:
         return
-    arm = _size(model)[0]
+    arm = payload_spread(model)[0]
     if error > _MASS * max(abs(mass), _NOTHING * arm):
         raise DataError(
             f"the motion does not show the mass of what hangs on {link}: {mass:.3g} +- "
@@ -362,8 +340,8 @@ def _possible(
     model: RobotModel, links: Sequence[str], x: Array, C: Array, masses: Mapping[str, float]
 ) -> Array:
     """Return the physically possible parameters nearest to x in the metric of its covariance."""
-    arm, radius = _size(model)
-    mass = np.maximum(np.abs(x[::10]), _NOTHING * arm)
+    mass = np.maximum(np.abs(x[::10]), _NOTHING * payload_spread(model)[0])
+    radius = model.length
     unit = np.array([1.0, *[radius] * 3, *[radius**2] * 6])
     scale = (mass[:, None] * unit).reshape(-1)
     ball = mass[:, None] * np.array([1.0, 0, 0, 0, *radius**2 * np.array([1.0, 0, 1, 0, 0, 1])])
@@ -447,9 +425,3 @@ def _gains(model: RobotModel, runs: TwoRuns, found: Compared) -> dict[str, Gain]
         ends = sorted((value * np.exp([-reach[k], reach[k]])).tolist())
         gains[model.joints[j]] = Gain(value, abs(value) * float(error[k]), (ends[0], ends[1]))
     return gains
-
-
-def _size(model: RobotModel) -> tuple[float, float]:
-    """Return the robot's mass [kg] and its longest link [m]."""
-    masses = model.standard_parameters()[: model.layout.n_inertial : 10]
-    return max(float(np.abs(masses).sum()), 1e-3), model.length

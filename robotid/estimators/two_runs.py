@@ -12,18 +12,21 @@ factors, and all errors come from one covariance, that of the gains included.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
-from robotid.estimators import WLS
+from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
 from robotid.exceptions import NotConvergedError
-from robotid.identification.standard_errors import FEWEST_STRETCHES, scatter
-from robotid.regressor.factors import Factors, merge, triangle_of
+from robotid.regressor.factors import Factors, Reduction, merge, triangle_of
+from robotid.robot.parameters import ParameterLayout
 
-__all__ = ["Compared", "TwoRuns"]
+__all__ = ["Compared", "TwoRuns", "payload_runs"]
 
+_WIDE = 10.0  # plausible spreads about the URDF's values within which all is sought
+_FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
 _STEPS = 50
 _SETTLED = 1e-9  # relative change of the gains
 _LONGEST = 1.0  # step of the logarithm of a gain
@@ -39,7 +42,6 @@ class Compared:
         covariance: Covariance of beta, x and the logarithms of the u unknown gains,
             shape (b + d + u, b + d + u).
         freedom: Degrees of freedom of their standard errors, shape (b + d + u,).
-        sigma: Noise level per joint, shape (n,) [N m or N].
         unexplained: Share of each joint's torque that is left, shape (n,) [-].
     """
 
@@ -47,7 +49,6 @@ class Compared:
     gain: Array
     covariance: Array
     freedom: Array
-    sigma: Array
     unexplained: Array
 
 
@@ -91,10 +92,10 @@ class TwoRuns:
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
-        theta, *_ = self._solve(self._stretches(gain, None))
+        theta = self._minimum(merge(self._stretches(gain, None)), self._level(gain))[0]
         for _ in range(_STEPS if u else 1):
             stretches = self._stretches(gain, theta if u else None)
-            solution, sigma, bread = self._solve(stretches)
+            solution, bread = self._minimum(merge(stretches), self._level(gain))
             theta, step = solution[:size], np.clip(solution[size:], -_LONGEST, _LONGEST)
             gain[self.unknown] *= np.exp(step)
             if not u or np.abs(step).max() < _SETTLED:
@@ -105,11 +106,50 @@ class TwoRuns:
                 "richer motions of both runs, or state some of the gains",
                 "max_iterations",
             )
+        sigma = np.abs(gain) * self._noise
         covariance, freedom = self._errors(stretches, solution, sigma, bread)
         logged = np.sqrt(merge([*self.reference, *self.loaded]).torque_squares())
         torque = np.maximum(np.abs(gain) * logged, 1e-300)
         unexplained = np.sqrt(merge(stretches).residual_squares(solution)) / torque
-        return Compared(theta, gain, covariance, freedom, sigma, unexplained)
+        return Compared(theta, gain, covariance, freedom, unexplained)
+
+    def held_together(self, theta: Array) -> Array:
+        """Return what the runs leave together over what each joint leaves by itself, shape (n,).
+
+        Args:
+            theta: beta and x, shape (b + d,), of runs without unknown gains.
+
+        Returns:
+            Ratios of sums of squares, at least 1: far more where the runs differ by something else.
+        """
+        b = len(self.known)
+        beta, other = theta[:b], theta[:b] + self.known + self.D @ theta[b:]
+        together = merge(self.reference).residual_squares(beta)
+        together += merge(self.loaded).residual_squares(other)
+        ratio: Array = together / np.maximum(self._own_squares, 1e-300)
+        return ratio
+
+    def _level(self, gain: Array) -> Array:
+        """Return noise levels that make all rows count as independent, shape (n,) [N m or N]."""
+        level: Array = np.abs(gain) * self._noise / np.sqrt(self.share)
+        return level
+
+    @cached_property
+    def _own_squares(self) -> Array:
+        """Squares that the parameters of each joint's own, in each run, would leave, shape (n,)."""
+        runs = (merge(self.reference), merge(self.loaded))
+        own: Array = np.sum([[R[-1, -1] ** 2 for R in run.triangles] for run in runs], axis=0)
+        return own
+
+    @cached_property
+    def _noise(self) -> Array:
+        """Noise of each joint's signal, shape (n,), never quite zero."""
+        whole = merge([*self.reference, *self.loaded])
+        spent = 2 * np.array([len(own) for own in whole.columns])
+        freedom = np.maximum(whole.rows - spent, np.maximum(0.1 * whole.rows, 1.0))
+        least = _FLOOR * np.sqrt(whole.torque_squares() / np.maximum(whole.rows, 1))
+        noise: Array = np.maximum(np.sqrt(self._own_squares / freedom), least)
+        return np.where(noise > 0, noise, 1.0)
 
     def _first_gains(self) -> Array:
         """Return gains to start from, shape (n,): least squares of k i - W (beta + D x) = W c.
@@ -120,9 +160,7 @@ class TwoRuns:
         if not len(self.unknown):
             return gain
         whole = merge(self._stretches(gain, None, is_start=True))
-        noise = [abs(R[-1, -1]) for R in merge([*self.reference, *self.loaded]).triangles]
-        sigma = np.sqrt(np.square(noise) / np.maximum(whole.rows, 1)) + 1e-300
-        solution = self._minimum(whole, sigma)[0]
+        solution = self._minimum(whole, self._noise)[0]
         gain[self.unknown] = solution[len(self.mean) :]
         return gain
 
@@ -173,14 +211,6 @@ class TwoRuns:
             triangles.append(triangle_of(np.column_stack([*parts, torque - known])))
         return Factors(tuple(triangles), tuple(columns), factors.rows, names)
 
-    def _solve(self, stretches: Sequence[Factors]) -> tuple[Array, Array, Array]:
-        """Return parameters, noise levels of the joints, and covariance of independent rows."""
-        whole = merge(stretches)
-        prior = np.append(self.mean, np.zeros(len(whole.names) - len(self.mean)))
-        sigma = WLS(prior=prior).fit(whole).sigma
-        theta, inverse = self._minimum(whole, sigma / np.sqrt(self.share))
-        return theta, sigma, inverse
-
     def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
         """Return the minimum with the prior beside the rows, and the inverse information."""
         rows, size = whole.weighted(sigma), len(self.mean)
@@ -205,3 +235,51 @@ class TwoRuns:
         size = len(self.mean)
         meat[:size, :size] += self.precision
         return bread @ meat @ bread, replace(found, bread=self.share * bread).freedom()
+
+
+def payload_runs(
+    reference: Sequence[Reduction],
+    loaded: Sequence[Reduction],
+    layout: ParameterLayout,
+    K: Array,
+    urdf: Array,
+    spread: Array,
+    payloads: tuple[Array, Array, Array],
+    *,
+    share: float,
+    unknown: Sequence[int] = (),
+) -> TwoRuns:
+    """Return two runs of which the loaded one carries payloads.
+
+    They share the robot's inertias, not friction and offsets of the drives, which change with load
+    and temperature.
+
+    Args:
+        reference: The stretches of the run without payloads.
+        loaded: Those of the run with them.
+        layout: The robot's standard parameters.
+        K: Map to the base parameters, shape (b, p).
+        urdf: Standard parameters of the URDF, shape (p,).
+        spread: How far they may plausibly be wrong, shape (p,).
+        payloads: What the parameters of the payloads add to the base parameters, shape (b, c);
+            the parameters that are known, NaN where not, shape (c,); and how large each may be,
+            shape (c,).
+        share: Share of the rows that count as independent [-].
+        unknown: Joints whose torque is a current of unknown gain.
+    """
+    columns, known, size = payloads
+    changing = [not term.is_inertia for _, term in layout.drive_parameters]
+    drives = layout.n_inertial + np.flatnonzero(changing)
+    free = np.isnan(known)
+    about_urdf = np.linalg.inv(K * (_WIDE * spread) ** 2 @ K.T)
+    change = _WIDE * np.append(spread[drives], size[free])
+    return TwoRuns(
+        tuple(reduction.factors for reduction in reference),
+        tuple(reduction.factors for reduction in loaded),
+        np.hstack([K[:, drives], columns[:, free]]),
+        columns @ np.nan_to_num(known),
+        np.append(K @ urdf, np.zeros(len(change))),
+        scipy.linalg.block_diag(0.5 * (about_urdf + about_urdf.T), np.diag(change**-2.0)),
+        share,
+        np.array(unknown, dtype=int),
+    )
