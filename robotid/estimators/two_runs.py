@@ -19,7 +19,7 @@ import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
-from robotid.exceptions import NotConvergedError
+from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, Reduction, merge, triangle_of
 from robotid.robot.parameters import ParameterLayout
 
@@ -27,6 +27,8 @@ __all__ = ["Compared", "TwoRuns", "payload_runs"]
 
 _WIDE = 10.0  # plausible spreads about the URDF's values within which all is sought
 _FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
+_LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
+_SINGULAR = 1e-12  # pivots of unit columns below this tell nothing
 _STEPS = 50
 _SETTLED = 1e-9  # relative change of the gains
 _LONGEST = 1.0  # step of the logarithm of a gain
@@ -92,26 +94,24 @@ class TwoRuns:
         """
         size, u = len(self.mean), len(self.unknown)
         gain = self._first_gains()
-        theta = self._minimum(merge(self._stretches(gain, None)), self._level(gain))[0]
+        theta = self._minimum(self._both(gain), self._level(gain))[0]
         for _ in range(_STEPS if u else 1):
-            stretches = self._stretches(gain, theta if u else None)
-            solution, bread = self._minimum(merge(stretches), self._level(gain))
+            at = theta if u else None
+            solution, bread = self._minimum(self._both(gain, at), self._level(gain))
             theta, step = solution[:size], np.clip(solution[size:], -_LONGEST, _LONGEST)
-            gain[self.unknown] *= np.exp(step)
             if not u or np.abs(step).max() < _SETTLED:
                 break
+            gain[self.unknown] *= np.exp(step)
         else:
             raise NotConvergedError(
                 f"the gains still change by {np.abs(step).max():.1e} after {_STEPS} steps; record "
                 "richer motions of both runs, or state some of the gains",
                 "max_iterations",
             )
-        sigma = np.abs(gain) * self._noise
-        covariance, freedom = self._errors(stretches, solution, sigma, bread)
-        logged = np.sqrt(merge([*self.reference, *self.loaded]).torque_squares())
-        torque = np.maximum(np.abs(gain) * logged, 1e-300)
-        unexplained = np.sqrt(merge(stretches).residual_squares(solution)) / torque
-        return Compared(theta, gain, covariance, freedom, unexplained)
+        covariance, freedom = self._errors(gain, at, solution, bread)
+        squares = self._both(gain, at).residual_squares(solution)
+        torque = np.maximum(np.abs(gain) * np.sqrt(self._logged.torque_squares()), 1e-300)
+        return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
 
     def held_together(self, theta: Array) -> Array:
         """Return what the runs leave together over what each joint leaves by itself, shape (n,).
@@ -124,8 +124,8 @@ class TwoRuns:
         """
         b = len(self.known)
         beta, other = theta[:b], theta[:b] + self.known + self.D @ theta[b:]
-        together = merge(self.reference).residual_squares(beta)
-        together += merge(self.loaded).residual_squares(other)
+        without, loaded = self._whole
+        together = without.residual_squares(beta) + loaded.residual_squares(other)
         ratio: Array = together / np.maximum(self._own_squares, 1e-300)
         return ratio
 
@@ -135,19 +135,30 @@ class TwoRuns:
         return level
 
     @cached_property
+    def _whole(self) -> tuple[Factors, Factors]:
+        """Factors of all of the reference, and of all of the loaded run."""
+        return merge(self.reference), merge(self.loaded)
+
+    @cached_property
+    def _logged(self) -> Factors:
+        """Factors of all rows as if the runs were one."""
+        return merge(self._whole)
+
+    @cached_property
     def _own_squares(self) -> Array:
         """Squares that the parameters of each joint's own, in each run, would leave, shape (n,)."""
-        runs = (merge(self.reference), merge(self.loaded))
-        own: Array = np.sum([[R[-1, -1] ** 2 for R in run.triangles] for run in runs], axis=0)
+        own: Array = np.sum(
+            [[R[-1, -1] ** 2 for R in run.triangles] for run in self._whole], axis=0
+        )
         return own
 
     @cached_property
     def _noise(self) -> Array:
         """Noise of each joint's signal, shape (n,), never quite zero."""
-        whole = merge([*self.reference, *self.loaded])
-        spent = 2 * np.array([len(own) for own in whole.columns])
-        freedom = np.maximum(whole.rows - spent, np.maximum(0.1 * whole.rows, 1.0))
-        least = _FLOOR * np.sqrt(whole.torque_squares() / np.maximum(whole.rows, 1))
+        rows = np.maximum(self._logged.rows, 1)
+        spent = len(self._whole) * np.array([len(own) for own in self._logged.columns])
+        freedom = np.maximum(rows - spent, _LEAST_FREEDOM * rows)
+        least = _FLOOR * np.sqrt(self._logged.torque_squares() / rows)
         noise: Array = np.maximum(np.sqrt(self._own_squares / freedom), least)
         return np.where(noise > 0, noise, 1.0)
 
@@ -156,60 +167,47 @@ class TwoRuns:
 
         Noise of the currents pulls them towards 0 a little.
         """
-        gain = np.ones(len(self.reference[0].rows))
-        if not len(self.unknown):
-            return gain
-        whole = merge(self._stretches(gain, None, is_start=True))
-        solution = self._minimum(whole, self._noise)[0]
-        gain[self.unknown] = solution[len(self.mean) :]
+        gain = np.ones(len(self._logged.rows))
+        if len(self.unknown):
+            solution = self._minimum(self._both(gain, is_start=True), self._noise)[0]
+            gain[self.unknown] = solution[len(self.mean) :]
         return gain
 
-    def _stretches(
-        self, gain: Array, at: Array | None, *, is_start: bool = False
-    ) -> tuple[Factors, ...]:
-        """Return the factors of all stretches with the columns of beta, x and the gains.
-
-        Args:
-            gain: Gains, shape (n,).
-            at: Parameters beta and x that the gains' columns -W (beta + c + D x) are taken at;
-                None for no such columns.
-            is_start: Whether the gains' columns are -i instead.
-        """
-        b, d = self.D.shape
-        D = {False: np.zeros((b, d)), True: self.D}
-        out = []
-        for is_loaded, run in ((False, self.reference), (True, self.loaded)):
-            S = np.hstack([np.eye(b), D[is_loaded]])
-            c = self.known if is_loaded else np.zeros(b)
-            out += [self._extended(factors, S, c, gain, at, is_start) for factors in run]
-        return tuple(out)
+    def _both(self, gain: Array, at: Array | None = None, *, is_start: bool = False) -> Factors:
+        """Return the factors of both runs with the columns of ``_extended``."""
+        runs = enumerate(self._whole)
+        return merge([self._extended(run, loaded, gain, at, is_start) for loaded, run in runs])
 
     def _extended(
-        self, factors: Factors, S: Array, c: Array, gain: Array, at: Array | None, is_start: bool
+        self, run: Factors, loaded: int, gain: Array, at: Array | None, is_start: bool = False
     ) -> Factors:
-        size, has_gains = S.shape[1], at is not None or is_start
-        gains = self.unknown.tolist() if has_gains else []
-        names = (
-            *factors.names,
-            *map(str, range(S.shape[1] - len(S))),
-            *(f"gain {j}" for j in gains),
-        )
+        """Return factors with the columns of beta, x and the unknown gains.
+
+        Args:
+            run: Factors of rows of one run, base parameters.
+            loaded: 1 of the loaded run, 0 of the reference.
+            gain: Gains, shape (n,).
+            at: Parameters beta and x that the gains' columns -W (beta + c + D x) are taken at,
+                shape (b + d,); None for no such columns.
+            is_start: Whether the gains' columns are -i instead.
+        """
+        S, c = np.hstack([np.eye(len(self.known)), loaded * self.D]), loaded * self.known
+        unknown = self.unknown.tolist() if at is not None or is_start else []
+        added = range(S.shape[1] - len(S) + len(unknown))
         triangles, columns = [], []
-        for j, (R, own) in enumerate(zip(factors.triangles, factors.columns, strict=True)):
+        for j, (R, own) in enumerate(zip(run.triangles, run.columns, strict=True)):
             kept = np.flatnonzero(S[own].any(axis=0))
-            known = R[:, :-1] @ c[own]
-            torque = gain[j] * R[:, -1]
-            parts = [R[:, :-1] @ S[np.ix_(own, kept)]]
-            if j in gains:
-                k = size + gains.index(j)
-                column = -torque if at is None else -(R[:, :-1] @ (S[own] @ at)) - known
-                parts.append(column[:, None])
-                torque = np.zeros_like(torque) if at is None else torque
-                columns.append(np.append(kept, k))
-            else:
-                columns.append(kept)
-            triangles.append(triangle_of(np.column_stack([*parts, torque - known])))
-        return Factors(tuple(triangles), tuple(columns), factors.rows, names)
+            W, known, torque = R[:, :-1] @ S[own], R[:, :-1] @ c[own], gain[j] * R[:, -1]
+            rows = W[:, kept]
+            if j in unknown:
+                kept = np.append(kept, S.shape[1] + unknown.index(j))
+                column = -torque if at is None else -(W @ at + known)
+                rows = np.column_stack([rows, column])
+                torque = 0.0 * torque if at is None else torque
+            triangles.append(triangle_of(np.column_stack([rows, torque - known])))
+            columns.append(kept)
+        names = (*run.names, *map(str, added))
+        return Factors(tuple(triangles), tuple(columns), run.rows, names)
 
     def _minimum(self, whole: Factors, sigma: Array) -> tuple[Array, Array]:
         """Return the minimum with the prior beside the rows, and the inverse information."""
@@ -221,20 +219,27 @@ class TwoRuns:
         scale = np.linalg.norm(stacked[:, :-1], axis=0)
         scale[scale == 0] = 1.0
         R = triangle_of(np.column_stack([stacked[:, :-1] / scale, stacked[:, -1]]))
+        if np.abs(np.diag(R)[:-1]).min() < _SINGULAR:
+            raise DataError(
+                "the runs do not tell every unknown gain: a joint's current is 0 or constant, or "
+                "nothing ties it to a joint of known gain or to the known mass; state its gain"
+            )
         inverse = np.linalg.inv(R[:-1, :-1]) / scale[:, None]
         return inverse @ R[:-1, -1], inverse @ inverse.T
 
     def _errors(
-        self, stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Array
+        self, gain: Array, at: Array | None, solution: Array, bread: Array
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom; the prior adds its own uncertainty."""
-        if len(stretches) < FEWEST_STRETCHES:
-            return bread, np.full(len(theta), np.inf)
-        found = scatter(stretches, theta, sigma, self.share * bread)
-        meat = self.share**2 * found.meat
-        size = len(self.mean)
+        if len(self.reference) + len(self.loaded) < FEWEST_STRETCHES:
+            return bread, np.full(len(solution), np.inf)
+        runs = enumerate((self.reference, self.loaded))
+        stretches = [self._extended(f, loaded, gain, at) for loaded, run in runs for f in run]
+        sigma, apart = np.abs(gain) * self._noise, self.share * bread
+        found = scatter(stretches, solution, sigma, apart)
+        meat, size = self.share**2 * found.meat, len(self.mean)
         meat[:size, :size] += self.precision
-        return bread @ meat @ bread, replace(found, bread=self.share * bread).freedom()
+        return bread @ meat @ bread, replace(found, bread=apart).freedom()
 
 
 def payload_runs(
