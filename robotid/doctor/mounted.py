@@ -10,7 +10,7 @@ import scipy.special
 from robotid._typing import Array
 from robotid.doctor.loads import LoadModel, load_model
 from robotid.doctor.sample import Probe
-from robotid.estimators.two_runs import payload_runs
+from robotid.estimators.two_runs import TwoRuns, payload_runs
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping
@@ -117,7 +117,8 @@ def check_payload_change(
     reach = -float(scipy.special.stdtrit(found.freedom[-10], _CHANCE)) * error
     if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:
         return
-    if runs.held_together(found.theta).max() > _TOGETHER:
+    left = runs.held_together(found.theta)
+    if left.max() > _TOGETHER or left.mean() > _left_by_scale(runs, found.theta).mean():
         return  # the logs differ by something else
     link = layout.bodies[-1]
     message = (
@@ -127,6 +128,15 @@ def check_payload_change(
     )
     evidence = {"mass": mass, "std_error": error}
     yield log_finding(name, "payload_change", "warning", message, link, **evidence)
+
+
+def _left_by_scale(runs: TwoRuns, theta: Array) -> Array:
+    """Return what a factor of all torques leaves in place of a load, as ``held_together``."""
+    beta, precision = theta[: len(runs.known)], runs.precision[:-9, :-9].copy()
+    precision[-1, -1] = 1.0
+    D = np.column_stack([runs.D[:, :-10], beta])
+    scaled = replace(runs, D=D, mean=runs.mean[:-9], precision=precision)
+    return scaled.held_together(scaled.compare().theta)
 
 
 def _stretches(
