@@ -10,7 +10,7 @@ import scipy.special
 from robotid._typing import Array
 from robotid.doctor.loads import LoadModel, load_model
 from robotid.doctor.sample import Probe
-from robotid.estimators.two_runs import TwoRuns, payload_runs
+from robotid.estimators.two_runs import payload_runs
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping
@@ -28,7 +28,8 @@ _LIGHT = 0.02  # of the arm's mass, below which a part is not missed
 _NO_LOAD = 1e-6  # [kg, kg m] spread of a payload that is left out
 _CHANCE = 3e-7  # that a log without another load seems to have one, as of five standard errors
 _NOTHING = 0.01  # share of the arm's mass that a change of load has at least
-_TOGETHER = 4.0  # squares that two runs of one robot leave together over those of each joint's own
+_TOGETHER = 3.0  # share of squares more that two runs of one robot may leave than each by itself,
+_CLEARLY = 1.5  # ... and how many times more they leave if torques have other scales, not a load
 _ROWS = 2000  # of a motion: more say nothing new behind the filter
 _STRETCH = 0.4  # [s] longer than the correlation of noise
 _STRETCHES = 24
@@ -117,8 +118,11 @@ def check_payload_change(
     reach = -float(scipy.special.stdtrit(found.freedom[-10], _CHANCE)) * error
     if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:
         return
-    left = runs.held_together(found.theta)
-    if left.max() > _TOGETHER or left.mean() > _left_by_scale(runs, found.theta).mean():
+    left, by_scales = (
+        runs.held_together(found.theta) - 1.0,
+        runs.held_by_scales(runs.D.shape[1] - 10) - 1.0,
+    )
+    if left.max() > _TOGETHER or _CLEARLY * left.mean() > by_scales.mean():
         return  # the logs differ by something else
     link = layout.bodies[-1]
     message = (
@@ -128,15 +132,6 @@ def check_payload_change(
     )
     evidence = {"mass": mass, "std_error": error}
     yield log_finding(name, "payload_change", "warning", message, link, **evidence)
-
-
-def _left_by_scale(runs: TwoRuns, theta: Array) -> Array:
-    """Return what a factor of all torques leaves in place of a load, as ``held_together``."""
-    beta, precision = theta[: len(runs.known)], runs.precision[:-9, :-9].copy()
-    precision[-1, -1] = 1.0
-    D = np.column_stack([runs.D[:, :-10], beta])
-    scaled = replace(runs, D=D, mean=runs.mean[:-9], precision=precision)
-    return scaled.held_together(scaled.compare().theta)
 
 
 def _stretches(

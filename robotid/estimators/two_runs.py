@@ -123,11 +123,34 @@ class TwoRuns:
             Ratios of sums of squares, at least 1: far more where the runs differ by something else.
         """
         b = len(self.known)
-        beta, other = theta[:b], theta[:b] + self.known + self.D @ theta[b:]
         without, loaded = self._whole
-        together = without.residual_squares(beta) + loaded.residual_squares(other)
+        other = theta[:b] + self.known + self.D @ theta[b:]
+        together = without.residual_squares(theta[:b]) + loaded.residual_squares(other)
         ratio: Array = together / np.maximum(self._own_squares, 1e-300)
         return ratio
+
+    def held_by_scales(self, kept: int) -> Array:
+        """Return the same if not x, but another scale of torques makes the loaded run another one.
+
+        Args:
+            kept: Number of the first unknowns of x that may differ nevertheless.
+
+        Returns:
+            The ratios with one scale of all torques, or with one of each, whichever are less.
+        """
+        (without, loaded), size = self._whole, len(self.known)
+        one = np.ones(len(without.rows))
+        beta = self._minimum(self._extended(without, 0, one, None), self._level(one))[0][:size]
+        explained = np.column_stack([self.D[:, :kept], beta])
+        end = size + kept
+        unsure = scipy.linalg.block_diag(self.precision[:end, :end], 1.0)
+        scaled = replace(self, D=explained, mean=np.append(self.mean[:end], 0.0), precision=unsure)
+        left = without.residual_squares(beta)
+        for j, (R, own) in enumerate(zip(loaded.triangles, loaded.columns, strict=True)):
+            A = R[:, :-1] @ explained[own]
+            left[j] += np.sum((R[:, -1] - A @ np.linalg.lstsq(A, R[:, -1], rcond=None)[0]) ** 2)
+        of_each: Array = left / np.maximum(self._own_squares, 1e-300)
+        return min(scaled.held_together(scaled.compare().theta), of_each, key=np.mean)
 
     def _level(self, gain: Array) -> Array:
         """Return noise levels that make all rows count as independent, shape (n,) [N m or N]."""
