@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from robotid.exceptions import RobotIdError
     from robotid.export.result import load_result
     from robotid.export.urdf import write_urdf
-    from robotid.identification.payload_fit import PayloadFit, identify_payload
+    from robotid.identification.payload_fit import identify_payload
     from robotid.identification.pipeline import Identification, identify
     from robotid.identification.settings import EstimatorSettings
     from robotid.logs.data import Log, Trajectory
@@ -32,7 +32,6 @@ __all__ = [
     "LogSource",
     "LogUnits",
     "OnlineIdentifier",
-    "PayloadFit",
     "RobotIdError",
     "RobotModel",
     "SignalSettings",
@@ -60,7 +59,7 @@ _HOMES = {
     "exceptions": ["RobotIdError"],
     "export.result": ["load_result"],
     "export.urdf": ["write_urdf"],
-    "identification.payload_fit": ["PayloadFit", "identify_payload"],
+    "identification.payload_fit": ["identify_payload"],
     "identification.pipeline": ["Identification", "identify"],
     "identification.settings": ["EstimatorSettings"],
     "logs.data": ["Log", "Trajectory"],

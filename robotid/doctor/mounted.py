@@ -28,8 +28,7 @@ _LIGHT = 0.02  # of the arm's mass, below which a part is not missed
 _NO_LOAD = 1e-6  # [kg, kg m] spread of a payload that is left out
 _CHANCE = 3e-7  # that a log without another load seems to have one, as of five standard errors
 _NOTHING = 0.01  # share of the arm's mass that a change of load has at least
-_TOGETHER = 3.0  # share of squares more that two runs of one robot may leave than each by itself,
-_CLEARLY = 1.5  # ... and how many times more they leave if torques have other scales, not a load
+_CLEARLY = 1.5  # how many times more the logs leave if torques have other scales, not a load
 _ROWS = 2000  # of a motion: more say nothing new behind the filter
 _STRETCH = 0.4  # [s] longer than the correlation of noise
 _STRETCHES = 24
@@ -118,11 +117,9 @@ def check_payload_change(
     reach = -float(scipy.special.stdtrit(found.freedom[-10], _CHANCE)) * error
     if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:
         return
-    left, by_scales = (
-        runs.held_together(found.theta) - 1.0,
-        runs.held_by_scales(runs.D.shape[1] - 10) - 1.0,
-    )
-    if left.max() > _TOGETHER or _CLEARLY * left.mean() > by_scales.mean():
+    left = runs.held_together(found.theta) - 1.0
+    by_scales = runs.held_by_scales(runs.D.shape[1] - 10) - 1.0
+    if _CLEARLY * left.mean() > by_scales.mean():
         return  # the logs differ by something else
     link = layout.bodies[-1]
     message = (

@@ -26,7 +26,7 @@ from robotid.robot.parameters import ParameterLayout
 __all__ = ["Compared", "TwoRuns", "payload_runs"]
 
 _WIDE = 10.0  # plausible spreads about the URDF's values within which all is sought
-_FLOOR = 1e-9  # smallest noise level, as a share of the torque: noise-free data have none
+_FLOOR = 1e-7  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
 _SINGULAR = 1e-12  # pivots of unit columns below this tell nothing
 _STEPS = 50
@@ -242,7 +242,7 @@ class TwoRuns:
         scale = np.linalg.norm(stacked[:, :-1], axis=0)
         scale[scale == 0] = 1.0
         R = triangle_of(np.column_stack([stacked[:, :-1] / scale, stacked[:, -1]]))
-        if np.abs(np.diag(R)[:-1]).min() < _SINGULAR:
+        if len(self.unknown) and np.abs(np.diag(R)[:-1]).min() < _SINGULAR:
             raise DataError(
                 "the runs do not tell every unknown gain: a joint's current is 0 or constant, or "
                 "nothing ties it to a joint of known gain or to the known mass; state its gain"
@@ -299,7 +299,10 @@ def payload_runs(
     changing = [not term.is_inertia for _, term in layout.drive_parameters]
     drives = layout.n_inertial + np.flatnonzero(changing)
     free = np.isnan(known)
-    about_urdf = np.linalg.inv(K * (_WIDE * spread) ** 2 @ K.T)
+    KS = K * (_WIDE * spread)
+    sizes = np.linalg.norm(KS, axis=1)
+    alike = KS / sizes[:, None]  # base parameters in units of their spread
+    about_urdf = np.linalg.inv(alike @ alike.T) / np.outer(sizes, sizes)
     change = _WIDE * np.append(spread[drives], size[free])
     return TwoRuns(
         tuple(reduction.factors for reduction in reference),
