@@ -103,4 +103,5 @@ def _identify(
             job.rows_in_memory,
         )
     with chosen:
-        return conclude(recordings, job.estimator, found, job.ignore), checkpoint
+        concluded = conclude(recordings, job.estimator, found, job.ignore, friction=job.friction)
+        return concluded, checkpoint

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 from robotid._files import missing_file
 from robotid._settings import Entries, Range, Settings, check_keys, setting
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
-from robotid.robot.drives import DRIVE_TERMS, TERMS, friction_models
+from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, DriveTerm, term_from_dict
 from robotid.robot.parameters import Coupling
 
 if TYPE_CHECKING:
@@ -27,25 +28,52 @@ _MODEL_KEYS: Mapping[str, tuple[type, ...]] = {
     "friction" if term.is_friction else name: (str,) if term.is_friction else (bool,)
     for name, term in TERMS.items()
 }
+_PLAIN = tuple(name for name, term in TERMS.items() if term.is_friction)
 _LONGEST_PATH = 4096  # characters
 _FILE: Mapping[str, Any] = {"reads": (str,), "load": Path, "dump": lambda path: str(path.resolve())}
 
 
 def _load_terms(table: Mapping[str, Any]) -> tuple[str, ...]:
-    friction, models = table.get("friction", "viscous+coulomb"), friction_models()
-    if friction not in models:
-        raise SettingsError(f"friction is {friction!r}, wanted one of {list(models)}")
-    return tuple(
-        name
-        for name, term in TERMS.items()
-        if (name in models[friction] if term.is_friction else table.get(name, term.is_default))
-    )
+    friction = table.get("friction", AUTO)
+    names = {"none": [], AUTO: [*_PLAIN, AUTO]}.get(friction, friction.split("+"))
+    known = [*_PLAIN, *FAMILIES]
+    if friction != AUTO:
+        for name in names:
+            if name not in known:
+                raise SettingsError(
+                    f"friction is {friction!r}, wanted auto, none, or some of {listed(known)} with "
+                    "+ between them"
+                )
+    switched = [name for name in TERMS if name not in _PLAIN and table.get(name, True)]
+    common = [name for name in TERMS if name in (*names, *switched)]
+    return (*common, *(name for name in names if name not in TERMS))
 
 
 def _dump_terms(terms: Sequence[str]) -> dict[str, str | bool]:
-    chosen = tuple(term for term in terms if TERMS[term].is_friction)
-    friction = next(name for name, model in friction_models().items() if model == chosen)
-    return {key: friction if key == "friction" else key in terms for key in _MODEL_KEYS}
+    friction = [term for term in terms if term in _PLAIN or term not in TERMS]
+    named = AUTO if AUTO in friction else "+".join(friction) or "none"
+    return {key: named if key == "friction" else key in terms for key in _MODEL_KEYS}
+
+
+def _load_drives(table: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str | DriveTerm, ...]]:
+    for joint, entries in table.items():
+        for entry in entries:
+            if isinstance(entry, str) and entry not in FAMILIES:
+                raise SettingsError(
+                    f"drives.{joint} has {entry!r}, wanted some of {listed(FAMILIES)}, or a table "
+                    "of a term with its shape"
+                )
+    return {
+        joint: tuple(e if isinstance(e, str) else term_from_dict(e) for e in entries)
+        for joint, entries in table.items()
+    }
+
+
+def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, list[Any]]:
+    return {
+        joint: [e if isinstance(e, str) else e.to_dict() for e in entries]
+        for joint, entries in drives.items()
+    }
 
 
 def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]:
@@ -91,12 +119,20 @@ class Job(Settings):
     )
     signals: SignalSettings = setting(SignalSettings(), "how logs become trajectories")
     terms: tuple[str, ...] = setting(
-        DRIVE_TERMS,
+        (*DRIVE_TERMS, AUTO),
         "drive terms to identify",
         at="model",
         reads=_MODEL_KEYS,
         load=_load_terms,
         dump=_dump_terms,
+    )
+    drives: Mapping[str, tuple[str | DriveTerm, ...]] = setting(
+        {},
+        "further friction of single joints, by joint: names as of friction, whose shape is found, "
+        "or a term with its shape, as { term = 'Harmonic', order = 101.0 }",
+        reads=Entries(dict, (list,)),
+        load=_load_drives,
+        dump=_dump_drives,
     )
     gains: Mapping[str, float] = setting(
         {}, "torque per current of joints logged as current [N m/A or N/A]", at="torque.gains"
@@ -164,10 +200,24 @@ class Job(Settings):
             free_flyer=self.free_flyer,
             mimic=self.mimic,
             gravity=self.gravity,
-            terms=self.terms,
+            terms=[term for term in self.terms if term in TERMS],
             couplings=self.couplings,
+            own_terms={
+                joint: [entry for entry in entries if isinstance(entry, DriveTerm)]
+                for joint, entries in self.drives.items()
+            },
             snap_angles=self.snap_angles,
         )
+
+    @property
+    def friction(self) -> dict[str, str]:
+        """Friction beside viscous and Coulomb's, by joint, "*" for all others: names, or "auto"."""
+        everywhere = "+".join(term for term in self.terms if term not in TERMS)
+        stated = {
+            joint: "+".join(entry for entry in entries if isinstance(entry, str))
+            for joint, entries in self.drives.items()
+        }
+        return {"*": everywhere, **stated}
 
     def read(self, entry: LogEntry, model: "RobotModel") -> Log:
         """Return one log of the job, of the model's joints in its order.

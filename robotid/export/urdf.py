@@ -21,7 +21,7 @@ from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, held_parameters, link_places
-from robotid.robot.drives import TERMS
+from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import read_tree
@@ -39,6 +39,7 @@ _SHAPE = {
     "free_flyer": FLAG,
     "mimic": TEXT,
     "terms": [TEXT],
+    "own_terms?": {...: [TABLE]},
     "drives": {...: {...: NUMBER}},
     "couplings": [{"name": TEXT, "ratios": {...: NUMBER}}],
     "lumped": TABLE,
@@ -148,13 +149,27 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
     model = RobotModel.from_urdf(
         path,
         couplings=couplings,
+        own_terms=terms_from_facts(facts.get("own_terms", {})),
         **{
             key: facts[key]
             for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")
         },
     )
     values = [_drive_value(drives, name, Path(sidecar).name) for name in model.layout.drive_names]
-    return model, np.array([*model.standard_parameters()[: model.layout.n_inertial], *values])
+    pi = np.array([*model.standard_parameters()[: model.layout.n_inertial], *values])
+    return (model.with_reference(pi) if model.layout.remembering else model), pi
+
+
+def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Return the further terms of single drives, by name, of their plain values.
+
+    Args:
+        tables: Their values, as of ``RobotModel.options``.
+
+    Raises:
+        SettingsError: If there is no such term.
+    """
+    return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
 
 
 def _digest(content: bytes) -> str:
@@ -164,14 +179,16 @@ def _digest(content: bytes) -> str:
 def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[str, Any]:
     """Return what a URDF has no place for: how the model is built from it, and the drives."""
     layout, first = model.layout, model.layout.n_inertial
-    values = dict(zip(layout.names, map(float, pi), strict=True))
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
+    drives: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
+    for (d, term), value in zip(layout.drive_parameters, pi[first:], strict=True):
+        drives[layout.drives[d].name][term.name] = float(value)
     return {
         **model.options,
-        "drives": {j: {t: values[f"{j}.{t}"] for t in layout.terms} for j in layout.joints},
+        "drives": {joint: drives[joint] for joint in layout.joints},
         "couplings": [
             {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
-            | {term: values[f"{c.name}.{term}"] for term in layout.coupling_terms}
+            | drives[c.name]
             for c in layout.couplings
         ],
         "lumped": _lumped(model, places),

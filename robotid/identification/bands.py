@@ -7,7 +7,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.model import RobotModel
 
 __all__ = ["REACH", "TorqueBand", "torque_band"]
@@ -64,9 +64,7 @@ def torque_band(
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
-    q, v, a = (getattr(trajectory, key)[samples] for key in ("q", "v", "a"))
-    direction = None if trajectory.direction is None else trajectory.direction[samples]
-    W = joint_torque_regressor(model, q, v, a, direction)[:, mapping.independent]
+    W = trajectory_regressor(model, trajectory.at(samples))[:, mapping.independent]
     variance = np.einsum("ij,ij->i", W @ covariance, W)
     std = np.sqrt(np.maximum(variance, 0.0)).reshape(len(samples), -1)
     return TorqueBand(samples, std, np.asarray(noise))

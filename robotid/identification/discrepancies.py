@@ -17,9 +17,9 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, listed
-from robotid.identification.misfit import Sample, chance, take_sample, trials
+from robotid.identification.misfit import Sample, chance, trials
 from robotid.logs.data import Trajectory
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -55,17 +55,17 @@ class _Alteration:
     words: Callable[[Array, Array], str]
 
 
-def discrepancy_findings(identification: "Identification") -> list[Finding]:
+def discrepancy_findings(identification: "Identification", sample: Sample | None) -> list[Finding]:
     """Return warnings of what recordings or URDF have otherwise than stated.
 
     Args:
         identification: What was found.
+        sample: Rows of its recordings; None if they are too few to judge by.
 
     Returns:
         Findings "position_offset", "angle_scale", "torque_scale", "time_scale", "gravity" and
         "joint_origin", what explains most of the residual first.
     """
-    sample = take_sample(identification)
     if sample is None:
         return []
     own = list(_alterations(identification.model, identification.standard, sample))
@@ -122,8 +122,7 @@ def _torques(model: RobotModel, pi: Array, sample: Sample) -> Array:
 
 
 def _torque(model: RobotModel, pi: Array, m: Trajectory) -> Array:
-    Y = joint_torque_regressor(model, m.q, m.v, m.a, m.direction)
-    torque: Array = (Y @ pi).reshape(len(m.t), model.n_rows)
+    torque: Array = (trajectory_regressor(model, m) @ pi).reshape(len(m.t), model.n_rows)
     return torque
 
 

@@ -282,7 +282,7 @@ def _predict_all(
     torques = predict(model, [*parameters.values()], trajectory, compiled=compiled)
     inertial = np.where(np.arange(len(prior)) < model.layout.n_inertial, prior, 0.0)
     still = np.zeros_like(trajectory.v)
-    at_rest = replace(trajectory, v=still, a=still, direction=None)
+    at_rest = replace(trajectory, v=still, a=still, direction=None)  # no drive has a say in it
     torques += predict(model, [inertial], at_rest, compiled=compiled)
     return dict(zip((*parameters, "gravity_only"), torques, strict=True))
 
@@ -317,7 +317,7 @@ def _joined(motions: Sequence[Trajectory]) -> Trajectory:
         number = int(segments[-1][-1]) + 1
     joined: dict[str, Any] = {
         key: np.concatenate([getattr(motion, key) for motion in motions])
-        for key in ("t", "q", "v", "a", "tau", "direction")
+        for key in ("t", "q", "v", "a", "tau", "direction", "memory")
         if len(motions) > 1 and getattr(motions[0], key) is not None
     }
     return replace(motions[0], **joined, segment=np.concatenate(segments))

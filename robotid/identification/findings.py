@@ -14,7 +14,7 @@ from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
 from robotid.identification.discrepancies import discrepancy_findings
-from robotid.identification.misfit import misfit_findings
+from robotid.identification.misfit import Sample, misfit_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
 from robotid.robot.geometry import body_boxes, body_points
@@ -41,14 +41,16 @@ _NAMED = 5  # outliers that a finding names
 _WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is reported
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
+_BEYOND = 0.02  # share of a recording's rows beyond what friction was fitted to, that is told
 _LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
 
 
-def fit_findings(identification: Identification) -> list[Finding]:
+def fit_findings(identification: Identification, sample: Sample | None) -> list[Finding]:
     """Return what a user should know of a fit: what it leaves open, outliers, costs of physics.
 
     Args:
         identification: What was found.
+        sample: Rows of its recordings; None if they are too few to judge by.
     """
     findings = []
     known = identification.determination
@@ -66,7 +68,8 @@ def fit_findings(identification: Identification) -> list[Finding]:
     findings += _impossible_shapes(identification)
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
-    findings += discrepancy_findings(identification)
+    findings += _drive_findings(identification)
+    findings += discrepancy_findings(identification, sample)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "
@@ -86,6 +89,39 @@ def fit_findings(identification: Identification) -> list[Finding]:
             errors = {"error_pct": measured, "wls_error_pct": free}
             evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
             findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
+    return findings
+
+
+def _drive_findings(identification: Identification) -> list[Finding]:
+    """Return notes on shapes of friction at their bounds, and on motion beyond what was seen."""
+    findings, model = [], identification.model
+    for choice in identification.drives:
+        for shape in choice.shapes:
+            if shape.is_at_bound:
+                message = (
+                    f"{choice.joint}: {shape.name} is {shape.value:.3g} {shape.unit}, at the end "
+                    "of the range that it was sought in: the motion does not show where the curve "
+                    "bends; record slower and faster motion of this joint to tell"
+                )
+                findings.append(Finding("shape_at_bound", "note", choice.joint, message))
+        guards = {term.guards for term in choice.terms if term.guards}
+        j = model.joints.index(choice.joint)
+        for evaluation in identification.validation:
+            motion, mask = evaluation.recording.trajectory, evaluation.recording.mask
+            for key in sorted(guards):
+                x, (low, high) = getattr(motion, key)[mask[:, j], j], choice.seen[key]
+                x, low = (np.abs(x), 0.0) if key == "v" else (x, low)
+                share = float(np.mean((x < low) | (x > high))) if len(x) else 0.0
+                if share > _BEYOND:
+                    what = {"q": "positions", "v": "speeds"}[key]
+                    message = (
+                        f"{choice.joint}: {100 * share:.0f} % of the rows of "
+                        f"{evaluation.recording.name} have {what} beyond {low:.3g} to {high:.3g}, "
+                        f"which the fit has seen; {listed(choice.families)} stays there as it was "
+                        "at the end of that range"
+                    )
+                    evidence = {"share_pct": 100 * share}
+                    findings.append(Finding("beyond_seen", "note", choice.joint, message, evidence))
     return findings
 
 

@@ -11,10 +11,10 @@ before the data. What a term explains of the stretches left out, it explains bey
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import stdtr
@@ -25,7 +25,7 @@ from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion
 from robotid.identification.evaluation import Evaluation, Recording
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
 from robotid.robot.model import RobotModel
 
@@ -83,6 +83,7 @@ class Misfit:
         std_error: Standard error of the size.
         unit: Unit of the size.
         error: Residual that base parameters leave without the term, over the torque [-].
+        shift: By how much it would move base parameters over their spread, shape (b,).
     """
 
     joint: str
@@ -94,6 +95,7 @@ class Misfit:
     std_error: float
     unit: str
     error: float
+    shift: Array
 
     @property
     def matters(self) -> bool:
@@ -110,16 +112,15 @@ def misfit_findings(identification: "Identification") -> list[Finding]:
     Args:
         identification: What was found.
     """
-    return [_finding(misfit) for misfit in find_misfits(identification)]
+    return [_finding(misfit, identification.on_misfit) for misfit in identification.misfits]
 
 
-def find_misfits(identification: "Identification") -> tuple[Misfit, ...]:
+def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
     """Return the terms that would explain a part of what the fit leaves, the largest first.
 
     Args:
-        identification: What was found.
+        sample: Rows of the recordings; None if they are too few to judge by.
     """
-    sample = take_sample(identification)
     if sample is None:
         return ()
     found = [misfit for j in range(len(sample.joints)) for misfit in _of_joint(sample, j)]
@@ -172,6 +173,7 @@ class Sample:
         slides: Which of them slide, shape (n,), bool.
         motions: How each joint moves in the N rows.
         at: The motions of the recordings, those rows alone.
+        taken: Which rows of the recordings these are, of fitted ones and then of those kept.
         weight: What torques of the rows are multiplied by, shape (N, n) [1/(N m), 1/N].
         torque: Sum of the squared torques of fitted rows, likewise weighted, shape (n,).
         stretches: Which rows each of the K stretches has, those of the logs kept apart last.
@@ -179,6 +181,7 @@ class Sample:
         rows: How many of the rows are.
         W: Regressor of the base parameters over their spread before the data, shape (N, n, b).
         r: Residual of the estimate, shape (N, n).
+        U: Factor of the covariance of base parameters before the data, C = U^T U, shape (b, b).
         A: W^T W of each stretch, all joints together, shape (K, b, b).
         B: W^T r likewise, shape (K, b).
     """
@@ -187,6 +190,7 @@ class Sample:
     slides: Array
     motions: tuple[JointMotion, ...]
     at: tuple[Trajectory, ...]
+    taken: tuple[Array, ...]
     weight: Array
     torque: Array
     stretches: tuple[slice, ...]
@@ -194,15 +198,38 @@ class Sample:
     rows: int
     W: Array
     r: Array
+    U: Array
     A: Array
     B: Array
 
+    @cached_property
+    def is_fitted(self) -> Array:
+        """Which of the stretches are of fitted logs, shape (K,), bool."""
+        return np.arange(len(self.stretches)) < self.fitted
 
-def take_sample(identification: "Identification") -> Sample | None:
+    @cached_property
+    def apart(self) -> tuple[Array, Array]:
+        """What row k of stretches is fitted to that judges it not, (K, K), and its inverses."""
+        used = (self.is_fitted & ~np.eye(len(self.stretches), dtype=bool)).astype(float)
+        return used, self._inverse(used)
+
+    @cached_property
+    def whole(self) -> tuple[Array, Array]:
+        """All stretches of fitted logs, shape (K,), and the inverse (A + 1)^-1 of their sum."""
+        used = self.is_fitted.astype(float)
+        return used, self._inverse(used)
+
+    def _inverse(self, used: Array) -> Array:
+        A: Array = np.tensordot(used, self.A, axes=1)
+        return np.asarray(np.linalg.inv(A + np.eye(A.shape[-1])))
+
+
+def take_sample(identification: "Identification", *, is_steady: bool = True) -> Sample | None:
     """Return rows spread over the recordings; None if there are too few to judge by.
 
     Args:
         identification: What was found.
+        is_steady: Whether rows near reversals are left out, where a drive that sticks is smeared.
     """
     model, mapping = identification.model, identification.mapping
     kept = [e for e in identification.validation if not e.is_refitted]
@@ -213,12 +240,13 @@ def take_sample(identification: "Identification") -> Sample | None:
     if model.free_flyer or number < _FEWEST:
         return None
     parts = list(zip([*identification.fitted, *kept], rows, strict=True))
-    motion = [_at(e.recording.trajectory, k) for e, k in parts]
+    motion = [e.recording.trajectory.at(k) for e, k in parts]
     Y = np.concatenate([_regressor(model, m) for m in motion])  # (N, n, p)
     tau = np.concatenate([m.tau for m in motion])
     r = tau - np.concatenate([e.torques["estimate"][k] for e, k in parts])
     used = np.concatenate([e.recording.mask[k] for e, k in parts])
-    used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
+    if is_steady:
+        used &= np.concatenate([_is_steady(e.recording)[k] for e, k in parts])
     used = used & (np.abs(r) <= _OUTLIER * _usual_size(r[:own], used[:own]))
     squares = np.sum(r[:own] ** 2, axis=0, where=used[:own])
     scale = np.sqrt(squares / np.maximum(used[:own].sum(axis=0), 1))
@@ -235,6 +263,7 @@ def take_sample(identification: "Identification") -> Sample | None:
         slides=np.isin(model.joints, list(model.layout.prismatic)),
         motions=_joint_motions([e.recording.trajectory for e, _ in parts], rows, load, model),
         at=tuple(motion),
+        taken=tuple(rows),
         weight=weight,
         torque=np.sum((weight * tau)[:own] ** 2, axis=0),
         stretches=stretches,
@@ -242,6 +271,7 @@ def take_sample(identification: "Identification") -> Sample | None:
         rows=own,
         W=W,
         r=r,
+        U=U,
         A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
         B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
     )
@@ -273,18 +303,9 @@ def _stretches(fitted: int, kept: int, independent: float) -> tuple[slice, ...]:
     return tuple(slice(*pair) for pair in pairwise(edges))
 
 
-def _at(motion: Trajectory, rows: Array) -> Trajectory:
-    """Return some rows of a motion."""
-    names = ["t", "q", "v", "a", "tau", "segment"]
-    names += [] if motion.direction is None else ["direction"]
-    parts: dict[str, Any] = {name: getattr(motion, name)[rows] for name in names}
-    return replace(motion, **parts)
-
-
 def _regressor(model: RobotModel, motion: Trajectory) -> Array:
     """Return the regressor of the standard parameters, shape (N, n, p)."""
-    Y = joint_torque_regressor(model, motion.q, motion.v, motion.a, motion.direction)
-    return Y.reshape(len(motion.t), model.n_rows, -1)
+    return trajectory_regressor(model, motion).reshape(len(motion.t), model.n_rows, -1)
 
 
 def _usual_size(r: Array, used: Array) -> Array:
@@ -357,10 +378,12 @@ class Trial:
     Attributes:
         S: [Z r]^T M [Z r] of the rows fitted, shape (..., c + 1, c + 1).
         H: What [Z r] leaves of each stretch after the regressor's fit, shape (K, c + 1, c + 1).
+        T: What of base parameters, over their spread, imitates [Z r], shape (..., b, c + 1).
     """
 
     S: Array
     H: Array
+    T: Array
 
     def parameters(self, which: Sequence[int]) -> Array:
         """Return the parameters of some columns, shape (..., k).
@@ -419,15 +442,13 @@ def trials(sample: Sample, joints: slice, Z: Array) -> tuple[Trial, Trial]:
         sample.W[k, joints].reshape(len(x), -1)
         for k, x in zip(sample.stretches, every_X, strict=True)
     ]
-    A = sample.A
     D = np.array([x.T @ x for x in every_X])  # (K, c + 1, c + 1)
     B = np.array([w.T @ x for w, x in zip(every_W, every_X, strict=True)])  # (K, b, c + 1)
     B[:, :, -1] = sample.B  # other joints know of the base parameters, too
-    is_fitted = np.arange(len(D)) < sample.fitted
 
-    def trial(used: Array) -> Trial:
-        D_fit, B_fit, A_fit = (np.tensordot(used, x, axes=1) for x in (D, B, A))
-        T = np.linalg.solve(A_fit + np.eye(A.shape[-1]), B_fit)  # (..., b, c + 1)
+    def trial(used: Array, inverse: Array) -> Trial:
+        D_fit, B_fit = (np.tensordot(used, x, axes=1) for x in (D, B))
+        T = inverse @ B_fit  # (..., b, c + 1)
         S = D_fit - B_fit.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
         still = D_fit[..., c, c] == 0  # a column of a joint that does not move
@@ -436,10 +457,9 @@ def trials(sample: Sample, joints: slice, Z: Array) -> tuple[Trial, Trial]:
             x - w @ T_k
             for x, w, T_k in zip(every_X, every_W, np.broadcast_to(T, B.shape), strict=True)
         ]
-        return Trial(S, np.array([E_k.T @ E_k for E_k in E]))
+        return Trial(S, np.array([E_k.T @ E_k for E_k in E]), T)
 
-    apart = is_fitted & ~np.eye(len(D), dtype=bool)  # (K, K): what judges row k is fitted to
-    return trial(apart.astype(float)), trial(is_fitted.astype(float))
+    return trial(*sample.apart), trial(*sample.whole)
 
 
 def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
@@ -481,6 +501,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 std_error=std_error,
                 unit=unit,
                 error=error,
+                shift=_shift(whole, chosen, place[best]),
             )
         chosen += place[best]
         before, own = left[best], [c for c in own if c.code != best.code]
@@ -524,6 +545,12 @@ def chance(before: Array, after: Array, fitted: int) -> float:
     return float(min(chances))
 
 
+def _shift(whole: Trial, before: list[int], new: list[int]) -> Array:
+    """Return how a term, beside those found before, moves base parameters, shape (b,)."""
+    theta = whole.parameters([*before, *new])[len(before) :]
+    return -np.asarray(whole.T[:, new] @ theta)
+
+
 def _size(
     sample: Sample, j: int, term: Candidate, whole: Trial, before: list[int], new: list[int]
 ) -> tuple[float, float, str]:
@@ -541,16 +568,17 @@ def _size(
     return size, error, ("N m rms", "N rms")[int(sample.slides[j])]
 
 
-def _finding(misfit: Misfit) -> Finding:
+def _finding(misfit: Misfit, on_misfit: Sequence[str]) -> Finding:
     term, kept = misfit.term, misfit.confirmed
+    wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
+    stands = f"; {listed(wide)} stand on this misfit, and their intervals count it" if wide else ""
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
     done = term.advice.format(joint=misfit.joint)
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
         f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"
         f"{confirmed}; the residual is {100 * misfit.error:.1f} % of the torque. "
-        f"{done or 'The model has no such term yet'}; as it is, the friction intervals of this "
-        "joint are too narrow"
+        f"{done or 'No term of the model is like it'}{stands}"
     )
     evidence = {
         "share_pct": 100 * misfit.share,

@@ -1,6 +1,6 @@
 """identify(): from a model and logs to parameters and how far they can be trusted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,11 +19,13 @@ from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.baselines import urdf_with_drives
+from robotid.identification.drive_choice import DriveChoice, choose_drives, wanted_families
 from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
 from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
-from robotid.identification.misfit import settled
+from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
+from robotid.identification.model_error import with_model_error
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -54,6 +56,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
 from robotid.robot.bodies import held_parameters
+from robotid.robot.drives import AUTO
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -68,6 +71,9 @@ _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is
 _KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's, if it stayed there
 _STAYED = 0.3  # spreads that such a parameter may have moved
+_MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
+_DAMPED = 3  # of them, after which they go half way only
+_SETTLED = 1e-3  # of the torque, by which they may still move it
 _AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
 
 
@@ -97,6 +103,9 @@ class Identification:
         alarms: Faults of the recordings that make the result wrong, as the doctor found them.
         doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
+        drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
+        misfits: Terms that the model of its drives still lacks.
+        on_misfit: Names of drive parameters whose errors grew by these.
     """
 
     model: RobotModel
@@ -120,6 +129,9 @@ class Identification:
     alarms: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     report: str = ""
+    drives: tuple[DriveChoice, ...] = ()
+    misfits: tuple[Misfit, ...] = ()
+    on_misfit: tuple[str, ...] = ()
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def __repr__(self) -> str:
@@ -277,6 +289,7 @@ def identify(
     validation: Sequence[Log] = (),
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
+    friction: str | Mapping[str, str] = AUTO,
     doctor: bool = True,
     ignore: Sequence[str] = (),
 ) -> Identification:
@@ -288,6 +301,8 @@ def identify(
         validation: Recordings kept apart to measure the prediction with.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
+        friction: What friction joints have beside viscous and Coulomb's, as of
+            ``wanted_families``: "auto" has it chosen.
         doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
         ignore: Codes of errors and doubts that you know better.
 
@@ -305,7 +320,7 @@ def identify(
     fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (logs, validation))
     found = diagnose(model, logs, validation, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    return conclude(recordings, choice, found, ignore)
+    return conclude(recordings, choice, found, ignore, friction=friction)
 
 
 def conclude(
@@ -313,6 +328,8 @@ def conclude(
     choice: EstimatorSettings,
     found: Sequence[Finding] = (),
     ignore: Sequence[str] = (),
+    *,
+    friction: str | Mapping[str, str] = AUTO,
 ) -> Identification:
     """Identify a robot's parameters from recordings, in memory or not, and judge the result.
 
@@ -321,17 +338,21 @@ def conclude(
         choice: Which estimator.
         found: What was found of them before, as by the doctor.
         ignore: Codes of findings that the verdict does not count.
+        friction: As of ``identify``.
 
     Raises:
         DataError: If a row of a log cannot be used.
         RankDeficientError, NotConvergedError: As of ``identify``.
     """
     model, is_robust = recordings.model, choice.is_robust
+    wanted = wanted_families(friction, model.joints)
     with _explained(found):
-        fit = _fitted(recordings, choice)
+        fit = _with_drives(recordings, choice, wanted)
+    sample = take_sample(fit)
+    fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
-    told = refuted(settled(told, fit_findings(fit)), fit.predictions, fit.witness)
+    told = refuted(settled(told, fit_findings(fit, sample)), fit.predictions, fit.witness)
     alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
@@ -357,14 +378,38 @@ def _explained(found: Sequence[Finding]) -> Iterator[None]:
         raise
 
 
+def _with_drives(
+    recordings: Recordings,
+    choice: EstimatorSettings,
+    wanted: Mapping[str, Sequence[str] | None],
+) -> Identification:
+    """Identify a robot's parameters, and the friction of its joints that the logs show."""
+    fit = _fitted(recordings, choice)
+    drives = choose_drives(fit, wanted)
+    own = {drive.joint: drive.terms for drive in drives if drive.terms}
+    if own:
+        stated = recordings.model.layout.own
+        every = {d.name: (*stated.get(d.name, ()), *own.get(d.name, ()))
+                 for d in recordings.model.layout.drives}  # fmt: skip
+        model = recordings.model.with_terms(every)
+        known = dict(zip(fit.mapping.names, fit.standard, strict=True))
+        start = np.array([known.get(name, 0.0) for name in model.layout.names])
+        fit = _fitted(recordings.with_model(model.with_reference(start)), choice)
+    return replace(fit, drives=drives)
+
+
 def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification:
     """Identify a robot's parameters from recordings."""
+    recordings = _under_own_load(recordings, choice)
     model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice)
     prior, spread = ground.before.pi, ground.before.spread
     estimate, wls, errors = _measured(ground, choice)
     standard, covariance = _standard(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
+    if model.layout.remembering:  # what is written predicts the torque by its own load
+        model = model.with_reference(standard)
+        recordings = recordings.with_model(model)
     candidates = {"estimate": standard, "wls": mapping.to_standard(wls.theta, prior, spread)}
     sigma = ground.before.sigma
     driven = urdf_with_drives(model, mapping, ground.factors, sigma, ground.before.spread)
@@ -394,6 +439,45 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
     )
     hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at their bounds
     return replace(found, base_error=np.where(hidden, np.inf, base_error))
+
+
+def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Recordings:
+    """Return recordings whose drives are loaded by the bodies that the fit to them gives.
+
+    Least squares are iterated until their torque is the load; the estimator takes the last step.
+    """
+    model, mapping = recordings.model, recordings.mapping
+    if not model.layout.remembering:
+        return recordings
+    if isinstance(choice, BoundedSettings) and isinstance(choice.prior_weight, str):
+        choice = replace(choice, prior_weight=1.0)  # the load hardly knows of the prior's weight
+    for step in range(_MOST_LOADS):
+        ground = _ground(recordings, choice)
+        before = ground.before
+        standard, _ = _standard(ground.rough, mapping, before.pi, before.spread)
+        moved = standard - recordings.model.carried_by
+        if step >= _DAMPED:  # friction that takes a large share of the load may overshoot
+            standard = standard - 0.5 * moved
+        recordings = recordings.with_model(model.with_reference(standard))
+        loads = [_size_of(ground, x) for x in (moved, standard)]
+        if (loads[0] <= _SETTLED * loads[1]).all():
+            if make_estimator(choice, model, mapping, before).reads == "factors":
+                estimate, _, _ = _run(choice, ground)
+                standard, _ = _standard(estimate, mapping, before.pi, before.spread)
+            return recordings.with_model(model.with_reference(standard))
+    raise NotConvergedError(
+        f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
+        "'viscous+coulomb', or record motion that determines more",
+        "max_iterations",
+    )
+
+
+def _size_of(ground: "_Ground", pi: Array) -> Array:
+    """Return the root mean square of the torque of parameters in each row, shape (n_rows,)."""
+    factors, mapping = ground.factors, ground.recordings.mapping
+    beta = mapping.to_base(pi)
+    rows = zip(factors.triangles, factors.columns, strict=True)
+    return np.array([float(np.linalg.norm(R[:, :-1] @ beta[own])) for R, own in rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,12 @@
 """What an identification asks of its logs: their factors, their samples, their predictions."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 from robotid._typing import Array
 from robotid.identification.survey import ReducedPiece, SurveyedLog
-from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Reduction, compress_stretches, join_stretches
 from robotid.regressor.problem import Block, Problem, concatenate
 from robotid.regressor.used_rows import base_problem, independent_share
@@ -59,6 +59,22 @@ class Recordings:
     def pieces(self) -> list[ReducedPiece]:
         """The pieces of the logs to fit, in order."""
         return [ReducedPiece(piece, self.mapping) for log in self.fitted for piece in log.pieces]
+
+    def with_model(self, model: RobotModel) -> "Recordings":
+        """Return the same logs of a robot whose drives have other terms or another load.
+
+        Args:
+            model: The robot, with the same bodies, joints and couplings.
+        """
+        is_same = model.layout == self.model.layout
+        return replace(
+            self,
+            model=model,
+            mapping=self.mapping if is_same else structural_mapping(model),
+            fitted=[log.with_model(model) for log in self.fitted],
+            kept=[log.with_model(model) for log in self.kept],
+            checkpoint=None,  # it holds the pieces of the first fit
+        )
 
     def reduce(self) -> tuple[Reduction, ...]:
         """Reduce the logs to fit.

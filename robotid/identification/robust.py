@@ -178,7 +178,9 @@ def find_outliers(
 def _friction_step(model: RobotModel, standard: Array) -> Array:
     """Return how much torque a change of direction adds to each row, shape (n_rows,)."""
     layout, still, step = model.layout, np.zeros(1), np.zeros(model.n_rows)
-    forth, back = (DriveMotion(still, still, sign * np.ones(1)) for sign in (1.0, -1.0))
+    forth, back = (
+        DriveMotion(still, still, still, sign * np.ones(1), still, still) for sign in (1.0, -1.0)
+    )
     change = [(x.column(forth) - x.column(back)).item() for _, x in layout.drive_parameters]
     theta = standard[layout.n_inertial :]
     step[model.n_rows - len(model.joints) :] = np.abs(layout.drive_loads * theta) @ np.abs(change)

@@ -29,6 +29,7 @@ from robotid.logs.units import check_reach, check_units
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
+from robotid.regressor.memory import remember
 from robotid.regressor.rows import COMPILED, choose_engine
 from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.model import RobotModel
@@ -115,6 +116,13 @@ class LogPiece:
         """
         return self._kept if isinstance(self.header.source, Log) else self._read()
 
+    def take(self, rows: Rows) -> None:
+        """Keep rows that were smoothed before, of a robot with the same friction speeds."""
+        model = self.header.model
+        motion = remember(model, replace(rows.trajectory, memory=None))
+        mask = row_mask(model, motion, self.header.signals.min_velocity)
+        vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
+
     @cached_property
     def _kept(self) -> Rows:
         return self._read()
@@ -131,6 +139,7 @@ class LogPiece:
             own=slice(self.first, self.stop),
             speeds=friction_speeds(header.model.layout),
         )
+        trajectory = remember(header.model, trajectory)
         rows = slice(self.first - self.span[0], self.stop - self.span[0])
         mask = row_mask(header.model, trajectory, header.signals.min_velocity)
         return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
@@ -263,6 +272,20 @@ class SurveyedLog:
             Stretch(i, j, float(self.stamps[i]), float(self.stamps[j - 1]), number)
             for number, (i, j) in enumerate(pairwise([*edges, self.stop]))
         )
+
+    def with_model(self, model: RobotModel) -> "SurveyedLog":
+        """Return the log of a robot whose drives have other terms or another load.
+
+        Args:
+            model: The robot, with the same bodies, joints and couplings.
+        """
+        other = replace(self, model=model, asked=self.signals)
+        if self.is_held and np.array_equal(
+            friction_speeds(model.layout), friction_speeds(self.model.layout)
+        ):
+            for piece, own in zip(other.pieces, self.pieces, strict=True):
+                piece.take(own.read())
+        return other
 
     @property
     def whole(self) -> Rows:

@@ -122,6 +122,8 @@ class Trajectory:
         segment: Rows of one uninterrupted stretch share a number, shape (N,), int.
         direction: Sign of each speed that Coulomb friction follows, filtered as the torque is,
             shape (N, c) [-], in the order of ``friction_speeds``; None: the speed's own sign.
+        memory: What drive parameters multiply that an instant alone does not show, shape (N, m),
+            in the order of ``ParameterLayout.remembering``; None if a robot has none.
     """
 
     t: Array
@@ -133,6 +135,7 @@ class Trajectory:
     rate: float | None
     segment: Array
     direction: Array | None = None
+    memory: Array | None = None
 
     def __post_init__(self) -> None:
         _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
@@ -184,9 +187,17 @@ class Trajectory:
             self if step == 1 else replace(self, rate=None, **self._rows(slice(None, None, step)))
         )
 
-    def _rows(self, rows: slice) -> dict[str, Any]:
+    def at(self, rows: Array) -> "Trajectory":
+        """Return some samples.
+
+        Args:
+            rows: Their numbers.
+        """
+        return replace(self, **self._rows(rows))
+
+    def _rows(self, rows: slice | Array) -> dict[str, Any]:
         names = ["t", "q", "v", "a", "tau", "segment"]
-        names += [] if self.direction is None else ["direction"]
+        names += [name for name in ("direction", "memory") if getattr(self, name) is not None]
         return {name: getattr(self, name)[rows] for name in names}
 
 

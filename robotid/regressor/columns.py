@@ -7,16 +7,21 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.robot.drives import TERMS, DriveMotion
+from robotid.logs.data import Trajectory
+from robotid.robot.drives import DriveMotion
 from robotid.robot.parameters import ParameterLayout
 
 __all__ = [
     "RowPlan",
+    "drive_motion",
     "drive_values",
     "friction_directions",
     "friction_speeds",
+    "instant_memory",
     "plan_rows",
+    "remembered",
     "sure_rows",
+    "trajectory_values",
 ]
 
 
@@ -41,10 +46,11 @@ class RowPlan:
 
 def drive_values(
     layout: ParameterLayout,
+    q: Array,
     v: Array,
     a: Array,
     direction: Array,
-    which: Sequence[int] | None = None,
+    memory: Array | None = None,
 ) -> Array:
     """Return what drive parameters multiply, shape (k, N), by the speed w of their drives.
 
@@ -52,21 +58,111 @@ def drive_values(
 
     Args:
         layout: The standard parameters.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m]; those of the joints come last.
         v: Velocities, shape (N, n_rows) [rad/s, m/s]; those of the joints come last.
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         direction: As of ``friction_directions``, shape (N, c).
-        which: Which k of the drive parameters, in any order; all of them if None.
+        memory: As of ``Trajectory.memory``, shape (N, m); None if the layout has none.
+
+    Raises:
+        DataError: If a shape of direction or memory is another one.
+    """
+    motion = drive_motion(layout, q, v, a, direction)
+    kept = np.empty((len(v), 0)) if memory is None else memory
+    if kept.shape != (len(v), len(layout.remembering)):
+        raise DataError(
+            f"memory has shape {kept.shape}, wanted {(len(v), len(layout.remembering))}: a column "
+            "for each drive parameter that remembers; give the trajectory to remember() first"
+        )
+    place = {k: m for m, k in enumerate(layout.remembering)}
+    values = np.empty((len(layout.drive_parameters), len(v)))
+    for k, (x, (d, term)) in enumerate(zip(values, layout.drive_parameters, strict=True)):
+        x[:] = kept[:, place[k]] if k in place else term.column(motion.of(d))
+    return values
+
+
+def trajectory_values(
+    layout: ParameterLayout, motion: Trajectory, part: slice = slice(None)
+) -> Array:
+    """Return what drive parameters multiply along a trajectory, shape (k, N); see ``drive_values``.
+
+    Args:
+        layout: The standard parameters.
+        motion: The trajectory.
+        part: Which N samples of it.
+    """
+    direction, memory = (None if x is None else x[part] for x in (motion.direction, motion.memory))
+    signs = friction_directions(layout, motion.v[part], direction)
+    state = motion.q[part], motion.v[part], motion.a[part]
+    return drive_values(layout, *state, signs, memory)
+
+
+def drive_motion(
+    layout: ParameterLayout,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array,
+    load: Array | None = None,
+    rate: Array | None = None,
+    begins: Array | None = None,
+) -> DriveMotion:
+    """Return how drives move and what loads them, arrays of shape (d, N).
+
+    Args:
+        layout: The standard parameters.
+        q: Joint coordinates, as of ``drive_values``.
+        v: Velocities, as of ``drive_values``.
+        a: Accelerations, as of ``drive_values``.
+        direction: As of ``friction_directions``, shape (N, c).
+        load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N]; None: 0.
+        rate: Change of the whole torque in them, shape (N, n) [N m/s, N/s]; None: 0.
+        begins: Where a stretch begins, shape (N,), bool; None: the instants do not follow another.
     """
     R = layout.drive_ratios
-    first = v.shape[1] - R.shape[1]
-    w, dw = R @ v[:, first:].T, R @ a[:, first:].T  # (d, N)
-    signs = direction.T if direction.shape[1] else w
-    wanted = range(len(layout.drive_parameters)) if which is None else which
-    values = np.empty((len(wanted), len(v)))
-    for x, k in zip(values, wanted, strict=True):
-        d, term = layout.drive_parameters[k]
-        x[:] = term.column(DriveMotion(w[d], dw[d], signs[d]))
-    return values
+    n = R.shape[1]
+    w = R @ v[:, v.shape[1] - n :].T
+    still = np.zeros_like(w)
+    share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)  # a drive's part of the load
+    return DriveMotion(
+        q=R @ q[:, q.shape[1] - n :].T,
+        v=w,
+        a=R @ a[:, a.shape[1] - n :].T,
+        direction=direction.T if direction.shape[1] else w,
+        load=still if load is None else share @ load.T,
+        rate=still if rate is None else share @ rate.T,
+        begins=begins,
+    )
+
+
+def instant_memory(
+    layout: ParameterLayout, q: Array, v: Array, a: Array, direction: Array | None, load: Array
+) -> Array:
+    """Return what drives remember at instants that do not follow each other, shape (N, m).
+
+    Their drives have slid for long, and their torque does not change.
+
+    Args:
+        layout: The standard parameters.
+        q: Joint coordinates, as of ``drive_values``.
+        v: Velocities, as of ``drive_values``.
+        a: Accelerations, as of ``drive_values``.
+        direction: As of ``friction_directions``, shape (N, c), or None.
+        load: Torque of the rigid bodies in the rows of the joints, shape (N, n) [N m, N].
+    """
+    signs = friction_directions(layout, v, direction)
+    return remembered(layout, drive_motion(layout, q, v, a, signs, load))
+
+
+def remembered(layout: ParameterLayout, motion: DriveMotion) -> Array:
+    """Return what drive parameters multiply that an instant alone does not show, shape (N, m).
+
+    Args:
+        layout: The standard parameters.
+        motion: How the d drives move, arrays of shape (d, N).
+    """
+    own = [layout.drive_parameters[k] for k in layout.remembering]
+    return np.column_stack([term.column(motion.of(d)) for d, term in own])
 
 
 def friction_speeds(layout: ParameterLayout) -> Array:
@@ -80,9 +176,8 @@ def friction_speeds(layout: ParameterLayout) -> Array:
         whether a joint turns or slides (``drive_speeds``); c is the number of drives, or 0 if no
         term of the layout follows a direction.
     """
-    is_followed = any(TERMS[name].follows_direction for name in layout.terms)
     ratios: Array = layout.drive_ratios / layout.drive_speeds[:, None]
-    return ratios if is_followed else ratios[:0]
+    return ratios if layout.follows_direction else ratios[:0]
 
 
 def sure_rows(layout: ParameterLayout, v: Array, least: float) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.regressor.columns import RowPlan, drive_values
+from robotid.regressor.columns import RowPlan
 
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
@@ -84,16 +84,25 @@ class CompiledWriter:
         _prepare(states.reshape(bodies, 12 + 6 * depth, lanes.LANES), model, tree)
 
     def load(
-        self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
+        self, q: Array, v: Array, a: Array, tau: Array, values: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks, as of ``TrajectoryRows``; weights None: all 1."""
+        """Take the samples of the next blocks, and what drive parameters multiply in them.
+
+        Args:
+            q: Joint coordinates, as of ``Trajectory``; so are v, a and tau.
+            v: Velocities.
+            a: Accelerations.
+            tau: Torques.
+            values: As of ``drive_values``, shape (k, N).
+            weights: Weight of each row; None: all 1.
+        """
         self._base = np.zeros((12, 0))
         if self._model.free_flyer:
             self._base = _base_state(self._model, q, v, a)
             q = q[:, 1:]  # the pose has one entry more than the twist
         # copies that Numba finds writable and in C order: another kind would be compiled again
         self._q, self._v, self._a = (np.array(x, dtype=float, order="C") for x in (q, v, a))
-        values = drive_values(self._model.layout, v, a, direction, self._drives)
+        values = values[self._drives]
         if (self._ratios != 1.0).any():
             values *= self._ratios
         self._values = np.vstack([values, tau.T])

@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import drive_values, friction_directions
+from robotid.regressor.columns import trajectory_values
 from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.rows import COMPILED, TrajectoryRows, trajectory_rows
 from robotid.robot.model import RobotModel
@@ -86,6 +86,6 @@ def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> A
         torque = torque @ G  # tau = G^T tau_pinocchio
     layout, theta = model.layout, pi[model.layout.n_inertial :]
     if theta.any():
-        values = drive_values(layout, v, a, friction_directions(layout, v, trajectory.direction))
+        values = trajectory_values(layout, trajectory)
         torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
     return torque

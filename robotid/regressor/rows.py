@@ -12,7 +12,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import RowPlan, drive_values, friction_directions, plan_rows
+from robotid.regressor.columns import RowPlan, plan_rows, trajectory_values
 from robotid.regressor.compiled import (
     LONG_ENOUGH,
     CompiledWriter,
@@ -124,10 +124,9 @@ class TrajectoryRows(RowSource):
             last = min(first + _LOADED * length, stop)
             part = slice(first, last)
             weights = self.weights[part] if self._is_weighted else None
-            direction = None if motion.direction is None else motion.direction[part]
-            direction = friction_directions(self.model.layout, motion.v[part], direction)
+            values = trajectory_values(self.model.layout, motion, part)
             writer.load(
-                motion.q[part], motion.v[part], motion.a[part], motion.tau[part], direction, weights
+                motion.q[part], motion.v[part], motion.a[part], motion.tau[part], values, weights
             )
             for k in range(0, last - first, length):
                 end = min(k + length, last - first)
@@ -196,20 +195,19 @@ class _PinocchioWriter:
         self._raw = np.empty((out.shape[1], end))
 
     def load(
-        self, q: Array, v: Array, a: Array, tau: Array, direction: Array, weights: Array | None
+        self, q: Array, v: Array, a: Array, tau: Array, values: Array, weights: Array | None
     ) -> None:
-        """Take the samples of the next blocks."""
+        """Take the samples of the next blocks, and what drive parameters multiply in them."""
         self._q, self._v, self._a, self._tau, self._weights = q, v, a, tau, weights
-        self._direction = direction
+        self._values = values
 
     def write(self, start: int, stop: int) -> None:
         """Write the rows of samples start to stop of those loaded."""
         part = slice(start, stop)
         self._write_inertial(self._q[part], self._v[part], self._a[part])
-        out, v, a = self._out[:, : stop - start], self._v[part], self._a[part]
-        values = drive_values(self._model.layout, v, a, self._direction[part])
+        out = self._out[:, : stop - start]
         for place, k, ratio in chain.from_iterable(self._plan.drives):
-            np.multiply(ratio, values[k], out=out[place])
+            np.multiply(ratio, self._values[k, part], out=out[place])
         out[list(self._plan.torques)] = self._tau[part].T
         if self._weights is not None:
             for root, (i, j) in zip(

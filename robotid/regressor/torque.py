@@ -11,7 +11,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import drive_values, friction_directions
+from robotid.regressor.columns import drive_values, friction_directions, instant_memory
 from robotid.regressor.problem import Block, Problem
 from robotid.regressor.rows import BLOCK, trajectory_rows
 from robotid.robot.drives import TERMS, DriveMotion
@@ -23,13 +23,20 @@ __all__ = [
     "joint_torque_regressor",
     "mass_regressor",
     "random_regressor",
+    "trajectory_regressor",
 ]
 
+_DECADES = 3.0  # of speeds, at random states of a robot whose friction is a curve
 _BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
 def joint_torque_regressor(
-    model: RobotModel, q: Array, v: Array, a: Array, direction: Array | None = None
+    model: RobotModel,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array | None = None,
+    memory: Array | None = None,
 ) -> Array:
     """Return the regressor Y with tau = Y pi at each of N instants.
 
@@ -43,6 +50,8 @@ def joint_torque_regressor(
         a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
         direction: What stands for the signs in the c Coulomb columns, shape (N, c), as
             ``Trajectory.direction``; None: the signs.
+        memory: What an instant alone does not show, shape (N, m), as ``Trajectory.memory``; None:
+            drives that have slid for long, under the load of the model's reference.
 
     Returns:
         Regressors, shape (N n_rows, p): row of sample k, joint j is k n_rows + j.
@@ -63,9 +72,24 @@ def joint_torque_regressor(
             row = model.row_names[j]
             raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
     Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
-    _write_inertial(model, q, v, a, Y[:, :, : model.layout.n_inertial])
-    _write_drives(model, v, a, direction, Y[:, :, model.layout.n_inertial :])
+    size = model.layout.n_inertial
+    _write_inertial(model, q, v, a, Y[:, :, :size])
+    if memory is None and model.layout.remembering:
+        load = Y[:, model.n_rows - len(model.joints) :, :size] @ model.carried_by[:size]
+        memory = instant_memory(model.layout, q, v, a, direction, load)
+    _write_drives(model, q, v, a, direction, memory, Y[:, :, size:])
     return Y.reshape(len(q) * model.n_rows, -1)
+
+
+def trajectory_regressor(model: RobotModel, trajectory: Trajectory) -> Array:
+    """Return the regressor of a trajectory, shape (N n_rows, p), as ``joint_torque_regressor``.
+
+    Args:
+        model: The robot.
+        trajectory: N samples, with what the model's drives remember.
+    """
+    m = trajectory
+    return joint_torque_regressor(model, m.q, m.v, m.a, m.direction, m.memory)
 
 
 def mass_regressor(model: RobotModel, q: Array) -> Array:
@@ -115,12 +139,13 @@ class InstantRegressor:
         self._is_plain &= model.pin_model.nq == model.pin_model.nv
         layout = model.layout
         self._Y = np.zeros((model.n_rows, len(layout.names)))
-        # place of each drive term of each joint, couplings aside: they follow behind
+        # place of each term that all joints have; other drives are written as of a trajectory
         count, joints = len(layout.terms), np.arange(len(layout.joints))
         self._terms = [
             (TERMS[name], layout.n_inertial + joints * count + k)
             for k, name in enumerate(layout.terms)
         ]
+        self._is_uniform = not (layout.couplings or layout.own)
 
     def __call__(self, q: Array, v: Array, a: Array) -> Array:
         """Return the regressor of one instant, shape (n, c), as of ``joint_torque_regressor``.
@@ -136,11 +161,17 @@ class InstantRegressor:
         w, dw = (v, a) if G is None else (G @ v, G @ a)
         inertial = regressor(model.pin_model, self._data, x, w, dw)
         Y[:, : layout.n_inertial] = inertial if G is None else G.T @ inertial
-        rows, motion = np.arange(len(v)), DriveMotion(v, a, np.sign(v))
-        for term, place in self._terms:
-            Y[rows, place] = term.column(motion)
-        if layout.couplings:
-            _write_drives(model, v[None], a[None], None, Y[None, :, layout.n_inertial :])
+        if self._is_uniform:
+            rows, still = np.arange(len(v)), np.zeros_like(v)
+            motion = DriveMotion(q, v, a, np.sign(v), still, still)
+            for term, place in self._terms:
+                Y[rows, place] = term.column(motion)
+            return Y[:, self._columns]
+        size, memory = layout.n_inertial, None
+        if layout.remembering:
+            load = Y[:, :size] @ model.carried_by[:size]
+            memory = instant_memory(layout, q[None], v[None], a[None], None, load[None])
+        _write_drives(model, q[None], v[None], a[None], None, memory, Y[None, :, size:])
         return Y[:, self._columns]
 
     def mass(self, q: Array) -> Array:
@@ -187,13 +218,9 @@ def build_problem(
     def stream() -> Iterator[Block]:
         for start in range(0, shape[0], length):
             part = slice(start, start + length)
-            W = joint_torque_regressor(
-                model,
-                trajectory.q[part],
-                trajectory.v[part],
-                trajectory.a[part],
-                None if trajectory.direction is None else trajectory.direction[part],
-            )
+            m = trajectory
+            direction, memory = (None if x is None else x[part] for x in (m.direction, m.memory))
+            W = joint_torque_regressor(model, m.q[part], m.v[part], m.a[part], direction, memory)
             yield W, trajectory.tau[part].reshape(-1), weights[part].reshape(-1)
 
     def mass_stream() -> Iterator[Array]:
@@ -221,6 +248,8 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     q = rng.uniform(-1, 1, (samples, n)) * reach
     unit = np.minimum(reach, 1.0)  # [rad or m]
     v = rng.uniform(-1, 1, (samples, n)) * unit * rate
+    if model.layout.own:  # terms that only slow motion shows
+        v *= 10.0 ** rng.uniform(-_DECADES, 0.0, v.shape)
     a = rng.uniform(-1, 1, (samples, n)) * unit * rate**2
     if model.free_flyer:
         linear = np.array([model.length] * 3 + [1.0] * 3)
@@ -230,15 +259,24 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         q = np.hstack([pose, q])
         v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
         a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
-    return joint_torque_regressor(model, q, v, a)
+    kept = len(model.layout.remembering)  # loads and pasts are any, whatever the state
+    return joint_torque_regressor(
+        model, q, v, a, memory=rng.uniform(-1, 1, (samples, kept)) if kept else None
+    )
 
 
 def _write_drives(
-    model: RobotModel, v: Array, a: Array, direction: Array | None, out: Array
+    model: RobotModel,
+    q: Array,
+    v: Array,
+    a: Array,
+    direction: Array | None,
+    memory: Array | None,
+    out: Array,
 ) -> None:
     """Write the columns of the drive parameters, shape (N, n_rows, drive)."""
     layout, first = model.layout, model.n_rows - len(model.joints)
-    values = drive_values(layout, v, a, friction_directions(layout, v, direction))
+    values = drive_values(layout, q, v, a, friction_directions(layout, v, direction), memory)
     out[:, :first] = 0.0
     np.multiply(layout.drive_loads, values.T[:, None], out=out[:, first:])
 

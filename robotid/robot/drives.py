@@ -1,33 +1,71 @@
-"""The terms of a drive's torque: one entry each, and the rest of the package loops over them.
+"""The terms of a drive's torque: one class each, and the rest of the package loops over them.
 
-A term adds ``parameter * column`` to the torque of a drive. To add one, enter it in ``TERMS``: its
-regressor, prior spread, plant, sidecar, tables and job key follow.
+A term adds ``parameter * column`` to the torque of a drive. To add one, write its class and enter
+it in ``TERMS`` if it has no shape of its own, else in ``FAMILIES``: its regressor, prior spread,
+plant, sidecar, tables and job key follow.
+
+The columns of many terms are guarded: beyond the speeds or positions that the fit has seen they
+stay as they were at the end of that range, for no data say how they go on.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from operator import attrgetter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
+from typing import Any, ClassVar
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
 
-__all__ = ["DRIVE_TERMS", "TERMS", "DriveMotion", "DriveTerm", "friction_models"]
+__all__ = [
+    "AUTO",
+    "DRIVE_TERMS",
+    "FAMILIES",
+    "TERMS",
+    "DriveMotion",
+    "DriveTerm",
+    "Family",
+    "Shape",
+    "term_from_dict",
+]
+
+_ANYWHERE = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True, slots=True)
 class DriveMotion:
-    """How drives move; all arrays of one shape.
+    """How drives move, and what loads them; all arrays of one shape, time along the last axis.
 
     Attributes:
+        q: Angles or ways [rad or m].
         v: Speeds w [rad/s or m/s].
         a: Their changes dw/dt [rad/s^2 or m/s^2].
         direction: Which way friction acts: the signs of w, or what stands for them [-].
+        load: Torque of the rigid bodies [N m or N].
+        rate: Change of the whole torque [N m/s or N/s].
+        begins: Where a stretch without gaps begins, bool; None of instants that do not follow each
+            other, whose drives have slid for long.
     """
 
+    q: Array
     v: Array
     a: Array
     direction: Array
+    load: Array
+    rate: Array
+    begins: Array | None = None
+
+    def of(self, drive: int) -> "DriveMotion":
+        """Return the motion of one drive, of arrays with a row for each.
+
+        Args:
+            drive: Which one.
+        """
+        q, v, a = self.q[drive], self.v[drive], self.a[drive]
+        direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]
+        return DriveMotion(q, v, a, direction, load, rate, self.begins)
 
 
 @dataclass(frozen=True)
@@ -35,63 +73,615 @@ class DriveTerm:
     """One term of a drive's torque, linear in its parameter.
 
     Attributes:
-        name: Its name in parameters, as ``"elbow.viscous"``.
-        column: What the parameter multiplies, element by element; module-level, to be pickled.
+        seen: From where to where the fit has seen what ``guards`` names: q, or the size of v.
+
+    Class attributes:
+        label: Its name in parameters, as ``"elbow.viscous"``.
         units: Unit of the parameter for a drive that turns, and for one that slides.
         is_nonnegative: Whether the parameter cannot be negative by physics.
+        highest: The largest parameter that a drive which moves can have.
         is_shared: Whether a drive that turns with several joints has it too.
         is_inertia: Whether it multiplies the acceleration and so adds to the mass matrix.
         is_friction: Whether a job's ``friction`` chooses it; if not, it has a switch of its own.
         follows_direction: Whether its column holds the direction of friction.
-        is_default: Whether it is identified unless told otherwise.
+        remembers: Whether its column needs more than q, v, a and direction of an instant.
+        guards: "v" or "q" if its column stays as it is beyond the range seen, else "".
         preference: How much it is favoured as the name of a base parameter [-].
         usual: From where to where it usually lies, for simulated robots.
         dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
     """
 
-    name: str
-    column: Callable[[DriveMotion], Array]
-    units: tuple[str, str]
-    is_nonnegative: bool = True
-    is_shared: bool = True
-    is_inertia: bool = False
-    is_friction: bool = False
-    follows_direction: bool = False
-    is_default: bool = True
-    preference: float = 1.0
-    usual: tuple[float, float] = (-0.3, 0.3)
-    dynamics: str | None = None
+    seen: tuple[float, float] = _ANYWHERE
+
+    label: ClassVar[str] = ""
+    units: ClassVar[tuple[str, str]] = ("N m", "N")
+    is_nonnegative: ClassVar[bool] = False
+    highest: ClassVar[float] = np.inf
+    is_shared: ClassVar[bool] = True
+    is_inertia: ClassVar[bool] = False
+    is_friction: ClassVar[bool] = True
+    follows_direction: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False
+    guards: ClassVar[str] = ""
+    preference: ClassVar[float] = 1.0
+    usual: ClassVar[tuple[float, float]] = (0.2, 0.9)
+    dynamics: ClassVar[str | None] = None
+
+    @property
+    def name(self) -> str:
+        """Its name in parameters, as ``"elbow.viscous"``."""
+        return self.label
+
+    def column(self, motion: DriveMotion) -> Array:
+        """Return what the parameter multiplies, element by element, within the range seen.
+
+        Args:
+            motion: How a drive moves.
+        """
+        low, high = self.seen
+        if self.guards == "v":  # of either sign
+            motion = replace(motion, v=np.clip(motion.v, -high, high))
+        elif self.guards == "q":
+            motion = replace(motion, q=np.clip(motion.q, low, high))
+        return self._column(motion)
+
+    def _column(self, motion: DriveMotion) -> Array:
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the term as plain values, which ``term_from_dict`` reads."""
+        shape = {key: value for key, value in asdict(self).items() if key != "seen"}
+        guard = {} if self.seen == _ANYWHERE else {"seen": list(self.seen)}
+        return {"term": type(self).__name__, **shape, **guard}
 
 
-def _ones(motion: DriveMotion) -> Array:
-    return np.ones_like(motion.v)
+@dataclass(frozen=True)
+class Armature(DriveTerm):
+    """Inertia of the rotor behind its gear, tau = Ia dw/dt."""
+
+    label = "armature"
+    units = ("kg m^2", "kg")
+    is_nonnegative = True
+    is_inertia = True
+    is_friction = False
+    preference = 0.3
+    usual = (0.1, 0.5)
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.a
 
 
-#: All terms by name, in the order of the parameters.
+@dataclass(frozen=True)
+class Viscous(DriveTerm):
+    """Viscous friction, tau = Fv w."""
+
+    label = "viscous"
+    units = ("N m s/rad", "N s/m")
+    is_nonnegative = True
+    usual = (0.5, 4.0)
+    dynamics = "damping"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.v
+
+
+@dataclass(frozen=True)
+class Coulomb(DriveTerm):
+    """Coulomb friction, tau = Fc sign(w)."""
+
+    label = "coulomb"
+    is_nonnegative = True
+    follows_direction = True
+    usual = (0.5, 5.0)
+    dynamics = "friction"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.direction
+
+
+@dataclass(frozen=True)
+class Offset(DriveTerm):
+    """A constant torque: of a sensor's zero, or of Coulomb friction that differs by direction."""
+
+    label = "offset"
+    is_shared = False
+    is_friction = False
+    usual = (-0.3, 0.3)
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return np.ones_like(motion.v)
+
+
+@dataclass(frozen=True)
+class Asymmetric(DriveTerm):
+    """Viscous friction that differs by direction, tau = x |w|; of Coulomb's, see ``Offset``."""
+
+    label = "asymmetric"
+    units = ("N m s/rad", "N s/m")
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return np.abs(motion.v)
+
+
+@dataclass(frozen=True)
+class LoadFriction(DriveTerm):
+    """Coulomb friction that grows with the load of the gear, tau = mu sign(w) |tau_rigid|.
+
+    References:
+        Hamon, Gautier, Garrec (2010), Dynamic identification of robots with a dry friction model
+        depending on load and velocity.
+    """
+
+    label = "load"
+    units = ("N m per N m", "N per N")
+    is_nonnegative = True
+    highest = 0.5  # a gear that loses more holds what it should lower
+    follows_direction = True
+    remembers = True
+    usual = (0.04, 0.1)
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.direction * np.abs(motion.load)
+
+
+@dataclass(frozen=True)
+class Cubic(DriveTerm):
+    """Friction that bends with speed, tau = x w^3."""
+
+    label = "cubic"
+    units = ("N m s^3/rad^3", "N s^3/m^3")
+    guards = "v"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.v**3
+
+
+@dataclass(frozen=True)
+class Stribeck(DriveTerm):
+    """Friction beside Coulomb's that fades with speed, tau = x sign(w) exp(-|w| / w_s).
+
+    Above 0 it is Stribeck's hook at low speed; below 0 friction sets in slowly and saturates.
+
+    References:
+        Tustin (1947), The effects of backlash and of speed-dependent friction on the stability of
+        closed-cycle control systems.
+    """
+
+    speed: float = 0.1
+
+    label = "stribeck"
+    follows_direction = True
+    guards = "v"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        speed = np.maximum(np.abs(motion.v), self.seen[0])  # no data say how it goes on to 0
+        return motion.direction * np.exp(-speed / self.speed)
+
+
+@dataclass(frozen=True)
+class Tanh(DriveTerm):
+    """Friction that sets in over a speed, tau = x tanh(w / w_t)."""
+
+    speed: float = 0.1
+
+    label = "tanh"
+    is_nonnegative = True
+    guards = "v"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return np.tanh(motion.v / self.speed)
+
+
+@dataclass(frozen=True)
+class Power(DriveTerm):
+    """Friction that grows with a power of the speed, tau = x sign(w) |w|^p."""
+
+    exponent: float = 1.0 / 3.0
+
+    label = "power"
+    units = ("N m (s/rad)^p", "N (s/m)^p")
+    follows_direction = True
+    guards = "v"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.direction * np.abs(motion.v) ** self.exponent
+
+
+@dataclass(frozen=True)
+class Ramp(DriveTerm):
+    """One rise of a monotone piecewise-linear curve: from 0 at one speed to 1 at the next."""
+
+    number: int = 1
+    low: float = 0.0
+    high: float = 1.0
+
+    is_nonnegative = True
+    follows_direction = True
+
+    @property
+    def name(self) -> str:
+        return f"rise{self.number}"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        risen = (np.abs(motion.v) - self.low) / (self.high - self.low)
+        return motion.direction * np.clip(risen, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Harmonic(DriveTerm):
+    """A torque that repeats with the angle of joint or motor: cos or sin of ``order`` turns.
+
+    With ``order`` the gear ratio, or a multiple of it, the angle is that of the motor.
+    """
+
+    order: float = 1.0
+    is_sine: bool = False
+
+    is_shared = False
+    guards = "q"
+
+    @property
+    def name(self) -> str:
+        return f"{'sin' if self.is_sine else 'cos'}{self.order:g}"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        angle = self.order * motion.q
+        return np.sin(angle) if self.is_sine else np.cos(angle)
+
+
+@dataclass(frozen=True)
+class PositionCoulomb(DriveTerm):
+    """Coulomb friction that depends on position, tau = x sign(w) (q - q_0)^k, q_0 mid-range."""
+
+    order: int = 1
+    centre: float = 0.0
+
+    follows_direction = True
+    is_shared = False
+    guards = "q"
+
+    @property
+    def name(self) -> str:
+        return f"coulomb_q{self.order}"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.direction * (motion.q - self.centre) ** self.order
+
+
+@dataclass(frozen=True)
+class Presliding(DriveTerm):
+    """Friction that a drive takes up over a way after each reversal, tau = x z.
+
+    dz/ds = 1 - z sign(v) along the way s = q / s_0: z goes from -1 to 1 after a reversal.
+
+    References:
+        Dahl (1968), A solid friction model.
+    """
+
+    displacement: float = 0.01
+
+    label = "presliding"
+    is_nonnegative = True
+    follows_direction = True
+    remembers = True
+
+    def _column(self, motion: DriveMotion) -> Array:
+        if motion.begins is None:
+            return motion.direction
+        return _taken_up(motion, lambda v: np.ones_like(v), self.displacement)
+
+
+@dataclass(frozen=True)
+class LuGre(DriveTerm):
+    """Presliding with Stribeck's hook: dz/ds = 1 - z sign(v) / g(v), g = 1 + c exp(-(w/w_s)^2).
+
+    References:
+        Canudas de Wit, Olsson, Astrom, Lischinsky (1995), A new model for control of systems with
+        friction; without its micro-damping.
+    """
+
+    displacement: float = 0.01
+    speed: float = 0.1
+    excess: float = 0.5
+
+    label = "lugre"
+    is_nonnegative = True
+    follows_direction = True
+    remembers = True
+
+    def _level(self, v: Array) -> Array:
+        return 1.0 + self.excess * np.exp(-((v / self.speed) ** 2))
+
+    def _column(self, motion: DriveMotion) -> Array:
+        if motion.begins is None:
+            return motion.direction * self._level(motion.v)
+        return _taken_up(motion, self._level, self.displacement)
+
+
+def _taken_up(motion: DriveMotion, level: Callable[[Array], Array], displacement: float) -> Array:
+    """Return the state z of presliding along stretches, from sliding where they begin.
+
+    Exact between two samples if v keeps its sign and level there.
+    """
+    way = np.diff(motion.q, prepend=motion.q[:1])
+    towards = np.sign(way) * level(motion.v)
+    kept = np.exp(-np.abs(way) / (displacement * level(motion.v)))
+    begins = np.zeros(len(way), dtype=bool) if motion.begins is None else motion.begins
+    start = motion.direction * level(motion.v)
+    z, state = np.empty(len(way)), 0.0
+    steps = zip(towards.tolist(), kept.tolist(), start.tolist(), begins.tolist(), strict=True)
+    for k, (end, share, first, is_first) in enumerate(steps):
+        state = first if is_first else end + (state - end) * share if share < 1.0 else state
+        z[k] = state
+    return z
+
+
+@dataclass(frozen=True)
+class Spring(DriveTerm):
+    """A linear spring, tau = k q; the torque at q = 0 is the offset's."""
+
+    label = "spring"
+    units = ("N m/rad", "N/m")
+    is_shared = False
+    is_friction = True
+    guards = "q"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return motion.q
+
+
+@dataclass(frozen=True)
+class Hat(DriveTerm):
+    """One entry of a tabulated spring: 1 at its position, 0 at its neighbours', linear between."""
+
+    number: int = 1
+    at: float = 0.0
+    before: float = -1.0
+    after: float = 1.0
+
+    is_shared = False
+    guards = "q"
+
+    @property
+    def name(self) -> str:
+        return f"spring{self.number}"
+
+    def _column(self, motion: DriveMotion) -> Array:
+        knots, values = [self.before, self.at, self.after], [0.0, 1.0, 0.0]
+        hat: Array = np.interp(motion.q, knots, values)
+        return hat
+
+
+@dataclass(frozen=True)
+class Counterbalance(DriveTerm):
+    """A spring between two points of stated place, tau = k (L - L_0) dL/dq.
+
+    One point turns with the joint at a distance a from its axis, the other stands at a distance b;
+    L^2 = a^2 + b^2 - 2 a b cos(q - q_0) is the length of the spring, shortest at q_0.
+    """
+
+    arm: float = 0.1
+    base: float = 0.5
+    angle: float = 0.0
+    rest: float = 0.0
+
+    label = "counterbalance"
+    units = ("N/m", "N/m")
+    is_nonnegative = True
+    is_shared = False
+    usual = (50.0, 90.0)
+
+    def _column(self, motion: DriveMotion) -> Array:
+        turned = motion.q - self.angle
+        length = np.sqrt(self.arm**2 + self.base**2 - 2 * self.arm * self.base * np.cos(turned))
+        change = self.arm * self.base * np.sin(turned) / length
+        column: Array = (length - self.rest) * change
+        return column
+
+
+@dataclass(frozen=True)
+class Lag(DriveTerm):
+    """A torque that comes late, by a delay or an elastic gear: to first order -T d(tau)/dt."""
+
+    label = "lag"
+    units = ("s", "s")
+    remembers = True
+    is_friction = True
+    usual = (0.005, 0.02)
+
+    def _column(self, motion: DriveMotion) -> Array:
+        return -motion.rate
+
+
+#: The terms without a shape of their own, by name, in the order of the parameters.
 TERMS: dict[str, DriveTerm] = {
-    term.name: term
-    for term in (
-        DriveTerm(
-            "armature", attrgetter("a"), ("kg m^2", "kg"), is_inertia=True, preference=0.3,
-            usual=(0.1, 0.5),
-        ),
-        DriveTerm(
-            "viscous", attrgetter("v"), ("N m s/rad", "N s/m"), is_friction=True,
-            usual=(0.5, 4.0), dynamics="damping",
-        ),
-        DriveTerm(
-            "coulomb", attrgetter("direction"), ("N m", "N"), is_friction=True,
-            follows_direction=True, usual=(0.5, 5.0), dynamics="friction",
-        ),
-        DriveTerm("offset", _ones, ("N m", "N"), is_nonnegative=False, is_shared=False),
+    term.name: term for term in (Armature(), Viscous(), Coulomb(), Offset())
+}
+#: Names of the terms that are identified unless told otherwise.
+DRIVE_TERMS = tuple(TERMS)
+#: What ``friction`` says to have the families of each joint chosen.
+AUTO = "auto"
+
+Seen = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape parameter that terms are not linear in.
+
+    Attributes:
+        name: Field of the terms that holds it.
+        units: Its unit for a drive that turns, and for one that slides.
+        bounds: Where it is sought, in units of what it is measured by.
+        of: What it is measured by: "v", the largest speed seen, "q", the range seen; "": itself.
+    """
+
+    name: str
+    units: tuple[str, str]
+    bounds: tuple[float, float]
+    of: str = ""
+
+    def within(self, seen: Seen) -> tuple[float, float]:
+        """Return the bounds in the shape's own unit.
+
+        Args:
+            seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+        """
+        low, high = self.bounds
+        if not self.of:
+            return low, high
+        first, last = seen[self.of]
+        scale = last if self.of == "v" else last - first
+        return low * scale, high * scale
+
+
+@dataclass(frozen=True)
+class Family:
+    """Terms that come together, with the shape that they share.
+
+    Attributes:
+        name: Its name in a job's ``friction``.
+        meaning: What it is, in words of a finding.
+        make: Returns the terms of the ranges seen and of a shape.
+        shapes: Its shape parameters.
+        needs: What the motion must have seen of the position, in full turns; 0: anything.
+        is_automatic: Whether ``friction = "auto"`` tries it.
+    """
+
+    name: str
+    meaning: str
+    make: Callable[..., tuple[DriveTerm, ...]]
+    shapes: tuple[Shape, ...] = ()
+    needs: float = 0.0
+    is_automatic: bool = False
+
+
+_SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
+_WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
+_KNOTS = 4  # of a piecewise-linear curve of friction
+_TABLE = 8  # entries of a tabulated spring
+
+
+def _curve(seen: Seen) -> tuple[DriveTerm, ...]:
+    """Return the rises of a monotone curve over the speeds seen, closer together at low speed."""
+    knots = seen["v"][1] * np.linspace(0.0, 1.0, _KNOTS + 1) ** 2
+    return tuple(Ramp(number=k, low=a, high=b) for k, (a, b) in enumerate(_pairs(knots), start=1))
+
+
+def _pairs(knots: Array) -> list[tuple[float, float]]:
+    return list(pairwise(knots.tolist()))
+
+
+def _table(seen: Seen) -> tuple[DriveTerm, ...]:
+    """Return the entries of a tabulated spring but the middle one, which is the offset's."""
+    knots = np.linspace(*seen["q"], _TABLE + 1).tolist()
+    step = knots[1] - knots[0]
+    return tuple(
+        Hat(seen=seen["q"], number=k, at=x, before=x - step, after=x + step)
+        for k, x in enumerate(knots, start=1)
+        if k != _TABLE // 2 + 1
+    )
+
+
+def _harmonics(highest: int) -> Callable[[Seen], tuple[DriveTerm, ...]]:
+    def make(seen: Seen) -> tuple[DriveTerm, ...]:
+        return tuple(
+            Harmonic(seen=seen["q"], order=float(k), is_sine=is_sine)
+            for k in range(1, highest + 1)
+            for is_sine in (False, True)
+        )
+
+    return make
+
+
+def _by_position(seen: Seen) -> tuple[DriveTerm, ...]:
+    centre = 0.5 * (seen["q"][0] + seen["q"][1])
+    return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
+
+
+#: What a job's ``friction`` may name beside viscous and Coulomb friction, by name.
+FAMILIES: dict[str, Family] = {
+    family.name: family
+    for family in (
+        Family("load", "friction that grows with the load", lambda seen: (LoadFriction(),),
+               is_automatic=True),
+        Family("stribeck", "friction that changes with speed and levels off",
+               lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
+               is_automatic=True),
+        Family("tanh", "friction that sets in with speed",
+               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_SPEED,),
+               is_automatic=True),
+        Family("presliding", "friction that is taken up after each reversal",
+               lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
+        Family("lag", "a torque that comes late (a delay, an elastic gear)",
+               lambda seen: (Lag(),), is_automatic=True),
+        Family("harmonics2", "a torque that repeats once and twice a turn", _harmonics(2),
+               needs=0.5, is_automatic=True),
+        Family("harmonics4", "a torque that repeats one to four times a turn", _harmonics(4),
+               needs=0.5, is_automatic=True),
+        Family("asymmetric", "viscous friction that differs by direction",
+               lambda seen: (Asymmetric(),)),
+        Family("power", "friction that bends with speed",
+               lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
+               (Shape("exponent", ("-", "-"), (0.1, 0.9)),)),
+        Family("cubic", "friction that grows with the cube of the speed",
+               lambda seen: (Cubic(seen=seen["v"]),)),
+        Family("curve", "friction by a monotone curve over speed", _curve),
+        Family("lugre", "presliding with a hook at low speed",
+               lambda seen, way, speed, excess: (
+                   LuGre(displacement=way, speed=speed, excess=excess),
+               ),
+               (_WAY, _SPEED, Shape("excess", ("-", "-"), (0.01, 3.0)))),
+        Family("position", "Coulomb friction that depends on the position", _by_position),
+        Family("spring", "a linear spring", lambda seen: (Spring(seen=seen["q"]),)),
+        Family("spring_table", "a spring of any curve", _table),
     )
 }  # fmt: skip
-#: Names of the terms that are identified unless told otherwise.
-DRIVE_TERMS = tuple(name for name, term in TERMS.items() if term.is_default)
+_CLASSES: dict[str, type[DriveTerm]] = {
+    kind.__name__: kind
+    for kind in (
+        Asymmetric, LoadFriction, Cubic, Stribeck, Tanh, Power, Ramp, Harmonic, PositionCoulomb,
+        Presliding, LuGre, Spring, Hat, Counterbalance, Lag,
+    )
+}  # fmt: skip
 
 
-def friction_models() -> dict[str, tuple[str, ...]]:
-    """Return the terms by choice of a job's ``friction``: none, viscous, viscous+coulomb."""
-    names = [name for name, term in TERMS.items() if term.is_friction]
-    choices = [tuple(names[:count]) for count in range(len(names) + 1)]
-    return {"+".join(terms) or "none": terms for terms in choices}
+def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
+    """Return a term of its plain values, as ``DriveTerm.to_dict`` gives them.
+
+    Args:
+        table: Its class under "term", and the fields that are not left as they are.
+
+    Raises:
+        SettingsError: If there is no such term, or a field of it is unknown or no number.
+    """
+    kind = _CLASSES.get(str(table.get("term")))
+    if kind is None:
+        raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(_CLASSES)}")
+    known = {field.name: field.default for field in fields(kind)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key == "term":
+            continue
+        if key not in known:
+            raise SettingsError(f"{kind.__name__} has no {key!r}; it has {listed(known)}")
+        values[key] = _read_field(kind, key, value, known[key])
+    return kind(**values)
+
+
+def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
+    if key == "seen":
+        if isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value)):
+            return (float(value[0]), float(value[1]))
+        raise SettingsError(f"{kind.__name__}: seen is {value!r}, wanted [lowest, highest]")
+    is_flag = isinstance(default, bool)
+    if is_flag is not isinstance(value, bool) or not (is_flag or _is_number(value)):
+        wanted = "true or false" if is_flag else "a finite number"
+        raise SettingsError(f"{kind.__name__}: {key} is {value!r}, wanted {wanted}")
+    return type(default)(value)  # type: ignore[call-arg]
+
+
+def _is_number(value: object) -> bool:
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    )

@@ -14,7 +14,7 @@ import pinocchio as pin
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.findings import listed
-from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.drives import DRIVE_TERMS, DriveTerm
 from robotid.robot.native_messages import caught_messages
 from robotid.robot.parameters import Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
@@ -46,6 +46,8 @@ class RobotModel:
         free_flyer: Whether the base floats.
         locked: Positions of the joints held still [rad or m].
         mimic: How mimic joints are treated: "independent" or "coupled".
+        reference: Standard parameters by which torques that drive terms depend on are reckoned,
+            the load of a gear among them, shape (p,); None: those of the URDF.
     """
 
     tree: Tree
@@ -56,6 +58,7 @@ class RobotModel:
     free_flyer: bool
     locked: Mapping[str, float]
     mimic: str
+    reference: Array | None = None
 
     def __repr__(self) -> str:
         return (
@@ -75,6 +78,7 @@ class RobotModel:
         gravity: Sequence[float] = GRAVITY,
         terms: Sequence[str] = DRIVE_TERMS,
         couplings: Sequence[Coupling] = (),
+        own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
         snap_angles: bool = False,
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
@@ -91,6 +95,7 @@ class RobotModel:
             gravity: Gravity in the frame of the root link, shape (3,) [m/s^2].
             terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
             couplings: Drives that turn with several joints.
+            own_terms: Further terms of single drives, by name of the joint or coupling.
             snap_angles: Whether angles of joints that the file rounds, 3.1416, become the multiple
                 of pi/12 that they round; see ``exact_angle`` for which are taken as rounded.
 
@@ -129,6 +134,7 @@ class RobotModel:
             couplings=tuple(couplings),
             prismatic=frozenset(joint.name for joint in slides),
             strokes={j.name: j.upper - j.lower for j in slides if j.has_limits},
+            own={name: tuple(terms) for name, terms in own_terms.items() if terms},
         )
         return cls(tree, reduced, layout, G, shift, free_flyer, MappingProxyType(positions), mimic)
 
@@ -149,6 +155,9 @@ class RobotModel:
             "free_flyer": self.free_flyer,
             "mimic": self.mimic,
             "terms": list(self.layout.terms),
+            "own_terms": {
+                name: [term.to_dict() for term in terms] for name, terms in self.layout.own.items()
+            },
         }
 
     @property
@@ -191,6 +200,11 @@ class RobotModel:
         longest = max(float(np.linalg.norm(placement.translation)) for placement in placements)
         return longest if longest > 1e-6 else 1.0
 
+    @property
+    def carried_by(self) -> Array:
+        """Standard parameters by which the load of the drives is reckoned, shape (p,)."""
+        return self.standard_parameters() if self.reference is None else self.reference
+
     def standard_parameters(self) -> Array:
         """Return the standard parameters as the URDF states them, shape (p,), SI units.
 
@@ -198,6 +212,26 @@ class RobotModel:
         """
         inertial = [inertia.toDynamicParameters() for inertia in self.pin_model.inertias[1:]]
         return np.concatenate([*inertial, np.zeros(len(self.layout.drive_names))])
+
+    def with_terms(self, own: Mapping[str, Sequence[DriveTerm]]) -> "RobotModel":
+        """Return the same robot with other terms of single drives, and no reference.
+
+        Args:
+            own: The terms, by name of the joint or coupling.
+
+        Raises:
+            SettingsError: If a name is no drive's.
+        """
+        kept = {name: tuple(terms) for name, terms in own.items() if terms}
+        return replace(self, layout=replace(self.layout, own=kept), reference=None)
+
+    def with_reference(self, pi: Array) -> "RobotModel":
+        """Return the same robot with other parameters that drive terms depend on.
+
+        Args:
+            pi: Standard parameters, shape (p,).
+        """
+        return replace(self, reference=pi)
 
     def with_parameters(self, pi: Array) -> "RobotModel":
         """Return the same robot with other inertial parameters.

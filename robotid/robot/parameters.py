@@ -59,6 +59,7 @@ class ParameterLayout:
         couplings: Drives that turn with several joints.
         prismatic: Names of the joints that slide.
         strokes: Ranges of those whose range the URDF states, by name [m].
+        own: Further terms of single drives, by the drive's name; they follow the others.
     """
 
     bodies: tuple[str, ...]
@@ -67,6 +68,7 @@ class ParameterLayout:
     couplings: tuple[Coupling, ...] = ()
     prismatic: frozenset[str] = frozenset()
     strokes: Mapping[str, float] = field(default_factory=dict)
+    own: Mapping[str, tuple[DriveTerm, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         unknown = [term for term in self.terms if term not in TERMS]
@@ -89,6 +91,12 @@ class ParameterLayout:
                 raise SettingsError(
                     f"coupling {coupling.name!r} has the name of a joint; give it another name"
                 )
+        strangers = [name for name in self.own if name not in {d.name for d in self.drives}]
+        if strangers:
+            raise SettingsError(
+                f"terms are stated for {listed(strangers)}, which are no drives; drives: "
+                f"{listed(drive.name for drive in self.drives)}"
+            )
 
     @property
     def n_inertial(self) -> int:
@@ -133,8 +141,22 @@ class ParameterLayout:
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
         """Which of ``drives`` each drive parameter belongs to, and its term."""
-        owned = [self.terms] * len(self.joints) + [self.coupling_terms] * len(self.couplings)
-        return tuple((d, TERMS[term]) for d, terms in enumerate(owned) for term in terms)
+        shared = [self.terms] * len(self.joints) + [self.coupling_terms] * len(self.couplings)
+        return tuple(
+            (d, term)
+            for d, (drive, names) in enumerate(zip(self.drives, shared, strict=True))
+            for term in (*map(TERMS.__getitem__, names), *self.own.get(drive.name, ()))
+        )
+
+    @cached_property
+    def remembering(self) -> tuple[int, ...]:
+        """Which drive parameters multiply more than an instant shows; see ``Trajectory.memory``."""
+        return tuple(k for k, (_, term) in enumerate(self.drive_parameters) if term.remembers)
+
+    @property
+    def follows_direction(self) -> bool:
+        """Whether a term holds the direction of friction."""
+        return any(term.follows_direction for _, term in self.drive_parameters)
 
     @cached_property
     def drive_loads(self) -> Array:

@@ -12,6 +12,8 @@ __all__ = ["payload_spread", "prior_spread"]
 
 _SMALLEST_MASS = 0.1  # of the mean mass: a link may be that wrong even if its URDF says 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
+_POSITIONS = 16  # around a turn at which terms that depend on the position are looked at
+_FAINTEST = 1e-6  # size of a column that says nothing of its parameter
 
 
 def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
@@ -61,10 +63,15 @@ def _inertial_spread(model: RobotModel) -> Array:
 def _drive_spread(model: RobotModel, rms: Array) -> Array:
     first = model.n_rows - len(model.joints)
     tau, v, a = (_positive(row[first:]) for row in rms)
-    usual, carried = DriveMotion(v, a, np.ones_like(v)), carried_inertia(model)
+    carried = carried_inertia(model)
+    q = np.linspace(-np.pi, np.pi, _POSITIONS, endpoint=False)[:, None] + 0.0 * v
+    usual = DriveMotion(
+        q, v + 0.0 * q, a + 0.0 * q, np.ones_like(q), tau + 0.0 * q, tau * a / v + 0.0 * q
+    )
     spread = []
     for d, term in model.layout.drive_parameters:
-        alone = tau / np.abs(term.column(usual))
+        size = np.sqrt(np.mean(term.column(usual) ** 2, axis=0))
+        alone = tau / np.maximum(size, _FAINTEST)
         rows = [model.joints.index(joint) for joint, _ in model.layout.drives[d].ratios]
         spread.append((np.maximum(carried, alone) if term.is_inertia else alone)[rows].mean())
     return np.array(spread)

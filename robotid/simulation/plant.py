@@ -6,13 +6,15 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.exceptions import DataError
-from robotid.robot.drives import TERMS, DriveMotion
+from robotid.exceptions import DataError, NotConvergedError
+from robotid.regressor.columns import drive_motion
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
 __all__ = ["RobotPlant", "rk4"]
 
+_ITERATIONS = 200  # of the load and its friction, which shrink by the size of the parameter
+_SETTLED = 1e-12  # relative change of the acceleration that ends them
 _SIGN_SPEED = 2e-3  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
 
 
@@ -20,7 +22,8 @@ class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
     The drives' terms are those of the model; sign(v) is tanh(v / 2 mm/s), so that it can be
-    integrated; drives that turn with several joints load all of them.
+    integrated; drives that turn with several joints load all of them. Friction that grows with the
+    load knows the load of this very instant. A plant has no past: presliding slides, nothing lags.
 
     Args:
         model: The robot, with a fixed base.
@@ -38,11 +41,10 @@ class RobotPlant:
         self.model = model
         self._bodies = model.with_parameters(pi)
         self._data = self._bodies.pin_model.createData()
-        theta = {name: np.zeros(len(model.layout.drives)) for name in model.layout.terms}
-        for i, (drive, term) in enumerate(model.layout.drive_parameters, model.layout.n_inertial):
-            theta[term.name][drive] = pi[i]
-        self._drives = [(TERMS[name], of_drives) for name, of_drives in theta.items()]
+        theta = pi[model.layout.n_inertial :]
+        self._theta = model.layout.drive_loads * theta  # (n, k)
         self._armature = drive_inertia(model.layout, pi)
+        self._is_loaded = bool(theta[list(model.layout.remembering)].any())
 
     def mass_matrix(self, q: Array) -> Array:
         """Return D(q), the mass matrix with the drives' armature, shape (n, n).
@@ -61,13 +63,23 @@ class RobotPlant:
             q: Joint coordinates, shape (n,) [rad or m].
             v: Joint velocities, shape (n,) [rad/s or m/s].
         """
-        G, L = self.model.velocity_map, self.model.layout.drive_ratios.T
-        pin_model, x = self._bodies.pin_model, self.model.configurations(q[None])[0]
-        w = L.T @ v  # (d,), speeds of the drives
-        motion = DriveMotion(w, np.zeros_like(w), np.tanh(w / _SIGN_SPEED))
-        drives = sum((theta * term.column(motion) for term, theta in self._drives), 0.0 * w)
-        bias: Array = G.T @ pin.nonLinearEffects(pin_model, self._data, x, G @ v) + L @ drives
-        return bias
+        rigid = self._rigid(q, v)
+        return rigid + self._drives(q, v, rigid)
+
+    def _rigid(self, q: Array, v: Array) -> Array:
+        """Return the torque of the bodies at constant velocity, shape (n,) [N m or N]."""
+        G, x = self.model.velocity_map, self.model.configurations(q[None])[0]
+        rigid: Array = G.T @ pin.nonLinearEffects(self._bodies.pin_model, self._data, x, G @ v)
+        return rigid
+
+    def _drives(self, q: Array, v: Array, load: Array) -> Array:
+        """Return the torque of the drives at constant velocity, shape (n,) [N m or N]."""
+        layout = self.model.layout
+        signs = np.tanh(layout.drive_ratios @ v / _SIGN_SPEED)
+        motion = drive_motion(layout, q[None], v[None], 0.0 * v[None], signs[None], load[None])
+        columns = [term.column(motion.of(d))[0] for d, term in layout.drive_parameters]
+        torque: Array = self._theta @ np.array(columns)
+        return torque
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
         """Return the acceleration of a torque, D(q)^-1 (u - C(q, v)) [rad/s^2 or m/s^2], as q.
@@ -80,9 +92,26 @@ class RobotPlant:
         References:
             Tzvetkova, (11).
         """
-        if q.ndim == 1:
+        if q.ndim == 1 and not self._is_loaded:
             return np.linalg.solve(self.mass_matrix(q), u - self.bias(q, v))
+        if q.ndim == 1:
+            return self._loaded_acceleration(q, v, u)
         return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
+
+    def _loaded_acceleration(self, q: Array, v: Array, u: Array) -> Array:
+        """Return the acceleration whose load makes the friction that leaves it, by iteration."""
+        D, rigid = self.mass_matrix(q), self._rigid(q, v)
+        bodies, load, a = D - self._armature, rigid, np.zeros_like(u)
+        for _ in range(_ITERATIONS):
+            before, a = a, np.linalg.solve(D, u - rigid - self._drives(q, v, load))
+            load = rigid + bodies @ a
+            if np.abs(a - before).max() <= _SETTLED * (1.0 + np.abs(a).max()):
+                return a
+        raise NotConvergedError(
+            f"the friction that grows with the load does not settle in {_ITERATIONS} steps: its "
+            "parameters are too large for a drive that moves",
+            "max_iterations",
+        )
 
 
 def rk4(

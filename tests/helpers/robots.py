@@ -33,7 +33,7 @@ def motion(model, rng, samples, reach=3.0, direction=None):
     q = rng.uniform(-reach, reach, (samples, n))
     v, a, tau = rng.uniform(-2, 2, (3, samples, model.n_rows))
     values = {"t": np.arange(samples) / 100, "v": v, "a": a, "tau": tau, "joints": model.joints}
-    values["direction"] = direction
+    values |= {"direction": direction, "memory": None}
     if model.free_flyer:  # logs of a floating base are not read yet
         pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
         return SimpleNamespace(q=np.hstack([pose, q]), **values)

@@ -1,24 +1,52 @@
-"""Every term of the registry, and one made here, walks from the regressor to the written file."""
+"""Every term walks from the regressor to the written file, in the joints that have it."""
 
 import itertools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.synthetic import exact_log, truth
 
-from robotid.commands.job import job_from_settings
+from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, read_sidecar, write_urdf
 from robotid.identification.pipeline import identify
-from robotid.logs.data import Trajectory
+from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor import prediction
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict
 from robotid.regressor.rows import COMPILED, TrajectoryRows
-from robotid.regressor.torque import InstantRegressor, joint_torque_regressor
+from robotid.regressor.torque import (
+    InstantRegressor,
+    joint_torque_regressor,
+    trajectory_regressor,
+)
 from robotid.report.tables import tables
-from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm, friction_models
+from robotid.robot.drives import (
+    DRIVE_TERMS,
+    FAMILIES,
+    TERMS,
+    Asymmetric,
+    Counterbalance,
+    Cubic,
+    DriveMotion,
+    Harmonic,
+    Hat,
+    Lag,
+    LoadFriction,
+    LuGre,
+    PositionCoulomb,
+    Power,
+    Presliding,
+    Ramp,
+    Spring,
+    Stribeck,
+    Tanh,
+    term_from_dict,
+)
 from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
@@ -32,29 +60,32 @@ EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
 MOTOR = Coupling("motor", (("elbow_joint", 1.0), ("wrist_1_joint", -0.5)))
 R = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, -0.5]])  # drives over joints
+OWN = [
+    Asymmetric(), LoadFriction(), Cubic(seen=(0.0, 3.0)), Stribeck(speed=0.3), Tanh(speed=0.2),
+    Power(exponent=0.4), Ramp(low=0.1, high=0.7), Harmonic(order=2.0, is_sine=True),
+    PositionCoulomb(order=2, centre=0.3), Presliding(displacement=0.05),
+    LuGre(displacement=0.05, speed=0.3, excess=0.6), Spring(seen=(-1.0, 2.0)),
+    Hat(at=0.4, before=-0.3, after=0.9), Counterbalance(arm=0.2, base=0.6, angle=0.4, rest=0.3),
+    Lag(),
+]  # fmt: skip
+PAST = ("presliding", "lugre", "lag")  # which a single instant does not show
 
 
-def cubed(motion):
-    return motion.v**3
-
-
-CUBIC = DriveTerm(
-    "cubic", cubed, ("N m s^3/rad^3", "N s^3/m^3"), is_friction=True, is_default=False,
-    usual=(0.2, 0.9),
-)  # fmt: skip
-
-
-@pytest.fixture(params=[*TERMS, CUBIC.name])
-def term(request, monkeypatch):
-    monkeypatch.setitem(TERMS, CUBIC.name, CUBIC)
-    return TERMS[request.param]
+@pytest.fixture(params=[*TERMS.values(), *OWN], ids=lambda term: term.name)
+def term(request):
+    return request.param
 
 
 @pytest.fixture
 def model(term):
     couplings = (MOTOR,) if term.is_shared else ()
-    path = example_urdf("ur5_robot.urdf")
-    return RobotModel.from_urdf(path, joints=JOINTS, terms=(term.name,), couplings=couplings)
+    path, drives = example_urdf("ur5_robot.urdf"), [*JOINTS, *(c.name for c in couplings)]
+    is_common = term.name in TERMS
+    model = RobotModel.from_urdf(
+        path, joints=JOINTS, terms=(term.name,) if is_common else (), couplings=couplings,
+        own_terms={} if is_common else {drive: (term,) for drive in drives},
+    )  # fmt: skip
+    return model.with_reference(truth(model)) if term.remembers else model
 
 
 def states(rng, samples=70):
@@ -68,31 +99,67 @@ def drive_part(model):
     return slice(model.layout.n_inertial, None)
 
 
-def test_a_new_term_is_cubed_speed_in_every_joint_that_its_drive_turns_with(monkeypatch, rng):
-    monkeypatch.setitem(TERMS, CUBIC.name, CUBIC)
-    path = example_urdf("ur5_robot.urdf")
-    model = RobotModel.from_urdf(path, joints=JOINTS, terms=("cubic",), couplings=(MOTOR,))
+def log_of(model, pi, rng):
+    """Return a log of exact torques, those of what drives remember among them."""
+    log = exact_log(model, pi, rng)
+    motion = remember(model, process(log, EXACT))
+    return Log(t=log.t, q=log.q, v=log.v, a=log.a, joints=log.joints,
+               tau=predict(model, [pi], motion)[0])  # fmt: skip
+
+
+# What each term is, written down a second time: of w, dw/dt, sign w, angle and load.
+EXPECTED = {
+    "armature": lambda m: m.a,
+    "viscous": lambda m: m.v,
+    "coulomb": lambda m: np.sign(m.v),
+    "offset": lambda m: 1.0,
+    "asymmetric": lambda m: np.abs(m.v),
+    "load": lambda m: np.sign(m.v) * np.abs(m.load),
+    "cubic": lambda m: m.v**3,
+    "stribeck": lambda m: np.sign(m.v) / np.exp(np.abs(m.v) / 0.3),
+    "tanh": lambda m: (1 - np.exp(-2 * m.v / 0.2)) / (1 + np.exp(-2 * m.v / 0.2)),
+    "power": lambda m: np.sign(m.v) * np.exp(0.4 * np.log(np.abs(m.v))),
+    "rise1": lambda m: np.sign(m.v) * np.interp(np.abs(m.v), [0.1, 0.7], [0.0, 1.0]),
+    "sin2": lambda m: 2 * np.sin(m.q) * np.cos(m.q),
+    "coulomb_q2": lambda m: np.sign(m.v) * (m.q**2 - 0.6 * m.q + 0.09),
+    "presliding": lambda m: np.sign(m.v),
+    "lugre": lambda m: np.sign(m.v) * (1 + 0.6 * np.exp(-((m.v / 0.3) ** 2))),
+    "spring": lambda m: np.minimum(np.maximum(m.q, -1.0), 2.0),
+    "spring1": lambda m: np.maximum(
+        0.0, np.minimum((m.q + 0.3) / 0.7, (0.9 - m.q) / 0.5)
+    ),
+    "lag": lambda m: 0.0,
+}  # fmt: skip
+
+
+def test_the_column_of_each_term_is_what_its_equation_says(model, term, rng):
     x = states(rng)
     Y = joint_torque_regressor(model, x.q, x.v, x.a).reshape(70, 3, -1)[:, :, drive_part(model)]
-    expected = (x.v @ R.T)[:, None, :] ** 3 * R.T
-    np.testing.assert_allclose(Y, expected, atol=1e-14)
-    assert model.layout.drive_names[1:] == ("elbow_joint.cubic", "wrist_1_joint.cubic",
-                                            "motor.cubic")  # fmt: skip
-    assert model.layout.units[-1] == "N m s^3/rad^3"
-    assert "cubic" not in DRIVE_TERMS
-    assert friction_models()["viscous+coulomb+cubic"] == ("viscous", "coulomb", "cubic")
-    settings = {"urdf": str(path), "model": {"friction": "viscous+coulomb+cubic"}}
-    job = job_from_settings(settings, "job.toml", path.parent)
-    assert set(job.terms) == {*DRIVE_TERMS, "cubic"}
-    assert job.to_dict()["model"]["friction"] == "viscous+coulomb+cubic"
+    ratios = R[: len(model.layout.drives)]
+    load = np.zeros((70, 3))
+    if term.remembers:
+        bodies = model.with_terms({})
+        Y_I = joint_torque_regressor(bodies, x.q, x.v, x.a)[:, : model.layout.n_inertial]
+        load = (Y_I @ model.reference[: model.layout.n_inertial]).reshape(70, 3)
+    share = ratios / (ratios**2).sum(axis=1, keepdims=True)
+    m = DriveMotion(*(z @ ratios.T for z in (x.q, x.v, x.a, x.v)), load @ share.T, 0 * x.v)
+    if term.name == "counterbalance":  # k (L - L_0) dL/dq by a difference of the spring's energy
+        def energy(q):
+            where = [0.2 * np.cos(q - 0.4) - 0.6, 0.2 * np.sin(q - 0.4)]
+            return 0.5 * (np.hypot(*where) - 0.3) ** 2
+        expected = (energy(m.q + 1e-6) - energy(m.q - 1e-6)) / 2e-6
+    else:
+        expected = EXPECTED[term.name](m)
+    np.testing.assert_allclose(Y, (expected + 0 * m.v)[:, None, :] * ratios.T, atol=1e-9)
 
 
-def test_compiled_instant_and_plain_rows_are_one(model, rng):
-    x = states(rng)
-    W = joint_torque_regressor(model, x.q, x.v, x.a).reshape(70, 3, -1)
+def test_compiled_instant_and_plain_rows_are_one(model, term, rng):
+    x = remember(model, states(rng))
+    W = trajectory_regressor(model, x).reshape(70, 3, -1)
     kept = np.arange(W.shape[2])
-    at_once = InstantRegressor(model, kept)
-    np.testing.assert_allclose(at_once(x.q[3], x.v[3], x.a[3]), W[3], atol=1e-12)
+    if term.name not in PAST:
+        at_once = InstantRegressor(model, kept)
+        np.testing.assert_allclose(at_once(x.q[3], x.v[3], x.a[3]), W[3], atol=1e-12)
     for engine in (COMPILED, "Pinocchio"):
         rows = TrajectoryRows(model, x, 2 + np.cos(x.q), model.support(), kept, engine)
         blocks = [[own.copy() for own in block] for block in rows.blocks(0, 70)]
@@ -103,8 +170,8 @@ def test_compiled_instant_and_plain_rows_are_one(model, rng):
 
 
 def test_prediction_by_inverse_dynamics_is_that_by_rows(model, rng, monkeypatch):
-    x, pi = states(rng), truth(model)
-    expected = (joint_torque_regressor(model, x.q, x.v, x.a) @ pi).reshape(70, 3)
+    x, pi = remember(model, states(rng)), truth(model)
+    expected = (trajectory_regressor(model, x) @ pi).reshape(70, 3)
     for start in (0, 10**9):  # by inverse dynamics, by rows
         monkeypatch.setattr(prediction, "_START", start)
         np.testing.assert_allclose(predict(model, [pi], x)[0], expected, atol=1e-10)
@@ -115,11 +182,24 @@ def test_the_plant_moves_as_the_regressor_says(model, rng):
     plant = RobotPlant(model, pi)
     u = (joint_torque_regressor(model, x.q, x.v, x.a) @ pi).reshape(40, 3)
     for k in np.flatnonzero((np.abs(x.v @ R.T) > 0.1).all(axis=1)):  # tanh is the sign there
-        np.testing.assert_allclose(plant.acceleration(x.q[k], x.v[k], u[k]), x.a[k], atol=1e-9)
+        np.testing.assert_allclose(plant.acceleration(x.q[k], x.v[k], u[k]), x.a[k], atol=1e-8)
         D = joint_mass_matrices(model, pi, x.q[[k]])[0]
         np.testing.assert_allclose(plant.mass_matrix(x.q[k]), D, atol=1e-12)
 
 
+def test_friction_that_holds_any_load_is_refused_by_the_plant():
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=JOINTS, terms=(),
+        own_terms={"elbow_joint": [LoadFriction()]},
+    )  # fmt: skip
+    pi = truth(model)
+    pi[-1] = 5.0
+    with pytest.raises(NotConvergedError, match="grows with the load does not settle"):
+        RobotPlant(model, pi).acceleration(np.ones(3), np.ones(3), 50 * np.ones(3))
+
+
+@pytest.mark.parametrize("term", [*TERMS.values(), LoadFriction(), Stribeck(speed=0.3)],
+                         ids=lambda term: term.name)  # fmt: skip
 def test_a_simulated_robot_is_identified(model, rng):
     pi = truth(model)
     log = simulate(model, pi, random_fourier(model, rng), rate=500.0, duration=6.0, rng=rng)
@@ -130,11 +210,11 @@ def test_a_simulated_robot_is_identified(model, rng):
 
 def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
     pi = truth(model)
-    found = identify(model, [exact_log(model, pi, rng)], signals=EXACT, estimator="wls")
-    np.testing.assert_allclose(found.base, found.mapping.to_base(pi), atol=1e-7)
+    found = identify(model, [log_of(model, pi, rng)], signals=EXACT, estimator="wls", doctor=False)
+    np.testing.assert_allclose(found.base, found.mapping.to_base(pi), atol=1e-6)
     drives = drive_part(model)
-    if not term.is_inertia:  # that of a joint may come in a group with inertia of its body
-        np.testing.assert_allclose(found.standard[drives], pi[drives], atol=1e-7)
+    if not (term.is_inertia or term.name.startswith("sin")):  # those may come in a group
+        np.testing.assert_allclose(found.standard[drives], pi[drives], atol=1e-6)
     html = tables(found)["drives"].replace("<wbr>", "")
     lines = [re.sub(r"<[^>]*>", " ", row) for row in html.split("</tr>")[1:]]
     for name, value in zip(model.layout.drive_names, found.standard[drives], strict=True):
@@ -143,13 +223,14 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
         assert term.units[0] in line
 
 
+@pytest.mark.parametrize("term", TERMS.values(), ids=lambda term: term.name)
 def test_its_prior_spread_would_alone_explain_the_torque(model, term, rng):
     motion = process(exact_log(model, truth(model), rng), EXACT)
     spread = prior_spread(model, motion.squares, len(motion.t))[drive_part(model)]
     assert (spread > 0).all()
     for j, s in enumerate(spread[:3]):
         tau, v, a = (np.sqrt(np.mean(x[:, j] ** 2)) for x in (motion.tau, motion.v, motion.a))
-        alone = tau / term.column(type("Typical", (), {"v": v, "a": a, "direction": 1.0}))
+        alone = tau / {"armature": a, "viscous": v, "coulomb": 1.0, "offset": 1.0}[term.name]
         assert s >= alone * (1 - 1e-12) if term.is_inertia else s == pytest.approx(alone)
 
 
@@ -163,6 +244,9 @@ def test_it_is_written_and_read_back(model, term, rng, tmp_path):
     loaded, read_back = load_identified(tmp_path / "arm.urdf", sidecar)
     assert loaded.layout == model.layout
     np.testing.assert_array_equal(read_back[drive_part(model)], pi[drive_part(model)])
+    x = states(rng)
+    wanted, found = (predict(m, [pi], remember(m, x))[0] for m in (model, loaded))
+    np.testing.assert_allclose(found, wanted, atol=1e-9)  # the load of the gears, too
     if term.dynamics:
         value = repr(float(written[f"elbow_joint.{term.name}"]))
         assert f'{term.dynamics}="{value}"' in (tmp_path / "arm.urdf").read_text()
@@ -181,7 +265,136 @@ def test_the_layout_knows_its_sign_size_and_preference(model, term):
 
 
 def test_terms_of_one_drive_stand_side_by_side():
-    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS, couplings=(MOTOR,))
-    own = [f"{joint}.{term}" for joint, term in itertools.product(JOINTS, DRIVE_TERMS)]
+    own = {"elbow_joint": [LoadFriction(), Tanh(speed=0.2)], "motor": [Cubic()]}
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=JOINTS, couplings=(MOTOR,), own_terms=own
+    )
+    of_joints = [f"{joint}.{term}" for joint, term in itertools.product(JOINTS, DRIVE_TERMS)]
+    at = of_joints.index("elbow_joint.offset") + 1
     shared = [f"motor.{name}" for name in DRIVE_TERMS if TERMS[name].is_shared]
-    assert list(model.layout.drive_names) == own + shared
+    assert list(model.layout.drive_names) == [
+        *of_joints[:at], "elbow_joint.load", "elbow_joint.tanh", *of_joints[at:], *shared,
+        "motor.cubic",
+    ]  # fmt: skip
+    plain = model.with_terms({})
+    assert list(plain.layout.drive_names) == of_joints + shared
+    with pytest.raises(SettingsError, match="wrist_9, which are no drives"):
+        model.with_terms({"wrist_9": [Cubic()]})
+
+
+def test_a_guarded_term_stays_as_it_was_at_the_end_of_what_was_seen():
+    v = np.array([-9.0, -1.0, 0.5, 2.0, 9.0])
+    motion = DriveMotion(v, v, v, np.sign(v), v, v)
+    np.testing.assert_allclose(
+        Cubic(seen=(0.0, 1.5)).column(motion), [-(1.5**3), -1.0, 0.125, 1.5**3, 1.5**3]
+    )
+    hook = Stribeck(seen=(0.8, 2.0), speed=0.5).column(motion)
+    np.testing.assert_allclose(hook, np.exp(-2 * np.array([2, 1, 0.8, 2, 2])) * np.sign(v))
+    wave = Harmonic(seen=(-1.0, 2.0), order=3.0).column(motion)
+    np.testing.assert_allclose(wave, np.cos(3 * np.array([-1.0, -1.0, 0.5, 2.0, 2.0])))
+
+
+def reversing(rng, samples=4000):
+    """Return a joint that goes to and fro, with the stretch begun anew half way."""
+    t = np.arange(samples) / 500
+    q = 0.4 * np.sin(2 * t) + 0.1 * np.sin(7.3 * t + 0.4)
+    v = 0.8 * np.cos(2 * t) + 0.73 * np.cos(7.3 * t + 0.4)
+    begins = np.zeros(samples, dtype=bool)
+    begins[[0, samples // 2]] = True
+    return t, q, v, begins
+
+
+@pytest.mark.parametrize("term", [Presliding(displacement=0.03),
+                                  LuGre(displacement=0.03, speed=0.2, excess=0.5)])  # fmt: skip
+def test_presliding_is_the_solution_of_its_differential_equation(term, rng):
+    t, q, v, begins = reversing(rng)
+    still = np.zeros_like(q)
+    z = term.column(DriveMotion(q, v, still, np.sign(v), still, still, begins))
+
+    def level(w):
+        return 1 + 0.5 * np.exp(-((w / 0.2) ** 2)) if isinstance(term, LuGre) else 1.0
+
+    state, h = np.empty_like(q), (t[1] - t[0]) / 50  # a finer Euler scheme
+    for k in range(len(t)):
+        if begins[k]:
+            s = np.sign(v[k]) * level(v[k])
+        else:
+            for w in np.linspace(v[k - 1], v[k], 50):
+                s += h * (w - np.abs(w) / level(w) * s) / 0.03
+        state[k] = s
+    assert np.abs(state).max() > 0.9
+    np.testing.assert_allclose(z, state, atol=0.02)
+    assert np.abs(z - np.sign(v)).max() > 1.5  # it takes a way to turn round
+
+
+def test_a_late_torque_is_to_first_order_its_rate(rng):
+    path = example_urdf("ur5_robot.urdf")
+    model = RobotModel.from_urdf(path, joints=JOINTS, own_terms={j: [Lag()] for j in JOINTS})
+    pi, late = truth(model), 0.004
+    lags = [k for k, name in enumerate(model.layout.names) if name.endswith(".lag")]
+    pi[lags] = late
+    model = model.with_reference(pi)
+    t = np.arange(600) / 200
+    motion = random_fourier(model, rng)
+    q, v, a = motion.evaluate(t)
+    x = Trajectory(t=t, q=q, v=v, a=a, tau=0 * q, joints=JOINTS, rate=200.0,
+                   segment=np.zeros(600, dtype=int), direction=np.tanh(v @ R[:3].T / 0.3))
+    with_lag = predict(model, [pi], remember(model, x))[0]
+    punctual = replace(x, memory=np.zeros((600, 3)))
+    on_time = predict(model, [pi], punctual)[0]
+    expected = np.column_stack([np.interp(t - late, t, column) for column in on_time.T])
+    inner = slice(5, -5)
+    scale = np.abs(with_lag - on_time)[inner].max(axis=0)
+    assert (np.abs(with_lag - expected)[inner].max(axis=0) < 0.15 * scale).all()
+
+
+def test_a_trajectory_without_its_memory_is_refused(rng):
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms={"elbow_joint": [LoadFriction()]}
+    )
+    x = states(rng)
+    with pytest.raises(DataError, match=r"memory has shape \(70, 0\), wanted \(70, 1\)"):
+        predict(model, [truth(model)], x)
+    load = drive_motion_along(model, x).load
+    np.testing.assert_allclose(
+        remember(model, x).memory[:, 0], np.sign(x.v[:, 1]) * np.abs(load[1]), atol=1e-12
+    )
+
+
+def test_terms_are_read_back_from_plain_values(term):
+    if term.name not in TERMS:
+        assert term_from_dict(term.to_dict()) == term
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"term": "Stribek"}, "term is 'Stribek', wanted one of .*Stribeck"),
+        ({"term": "Stribeck", "sped": 1.0}, "Stribeck has no 'sped'; it has seen, speed"),
+        ({"term": "Stribeck", "speed": "x"}, "speed is 'x', wanted a finite number"),
+        ({"term": "Harmonic", "is_sine": 1}, "is_sine is 1, wanted true or false"),
+        ({"term": "Cubic", "seen": [1.0]}, "seen is .1.0., wanted .lowest, highest."),
+    ],
+)
+def test_a_term_that_cannot_be_read_is_refused(table, message):
+    with pytest.raises(SettingsError, match=message):
+        term_from_dict(table)
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda family: family.name)
+def test_families_make_terms_of_the_range_seen(family):
+    seen = {"v": (0.1, 2.0), "q": (-1.0, 2.0)}
+    sizes = [np.sqrt(np.prod(shape.within(seen))) for shape in family.shapes]
+    terms = family.make(seen, *sizes)
+    assert len({term.name for term in terms}) == len(terms) >= 1
+    for term in terms:
+        assert term_from_dict(term.to_dict()) == term
+        assert not term.guards or term.seen in (seen[term.guards], (-np.inf, np.inf))
+    for shape, size in zip(family.shapes, sizes, strict=True):
+        assert {getattr(term, shape.name) for term in terms} == {size}
+
+
+def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
+    own = {joint: [Stribeck(speed=0.02, seen=(0.03, 0.4))] for joint in JOINTS}
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms=own)
+    assert {f"{joint}.stribeck" for joint in JOINTS} <= set(structural_mapping(model).base_names)

@@ -1,0 +1,477 @@
+"""Which terms the drive of each joint has: the fewest that explain what was held out.
+
+Terms are tried beside viscous and Coulomb friction, joint by joint, on rows spread over the fitted
+logs. The family that explains most of the stretches left out is taken if it does so beyond chance,
+then the next one beside it, until nothing is left to gain. Recordings kept apart have no say in it.
+
+What a family is not linear in, its shape, is sought on a grid and then by Brent's method, with all
+linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import stdtr
+
+from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
+from robotid.identification.misfit import Sample, Trial, take_sample, trials
+from robotid.regressor.memory import drive_motion_along
+from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, DriveTerm, Family, Seen
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = ["DriveChoice", "FoundShape", "Tried", "choose_drives", "wanted_families"]
+
+_OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
+_GRID = 6  # sizes of a shape that are tried, over its bounds
+_FAMILIES = 4  # chosen for a joint, at most
+_CHANCE = 0.015  # that a family is chosen that is not there, each time that one is tried
+_LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
+_SEEN = 0.003  # of the torque: a gain that is smaller is not worth a parameter
+_ALIKE = 0.02  # of the squared residual, within which two families explain alike
+_EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
+_SLOWEST = 0.02  # share of the rows that are slower than what counts as seen
+_TURN = 2 * np.pi  # [rad]
+_STEP = 1e-3  # relative, of a derivative
+_NOTHING = 1e-300
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Terms of a joint that were tried.
+
+    Attributes:
+        families: Names of what was tried beside viscous and Coulomb friction.
+        held_out_error_pct: Residual of held-out stretches over the torque [%].
+        chance: How likely held-out stretches gain that much by chance [-]; 1 without a gain.
+        is_taken: Whether it was taken.
+    """
+
+    families: tuple[str, ...]
+    held_out_error_pct: float
+    chance: float
+    is_taken: bool
+
+
+@dataclass(frozen=True)
+class FoundShape:
+    """A shape that was found.
+
+    Attributes:
+        name: Which one, as ``stribeck.speed``.
+        value: Its value.
+        std_error: Its standard error.
+        unit: Its unit.
+        is_at_bound: Whether it is at the end of the range that it was sought in.
+    """
+
+    name: str
+    value: float
+    std_error: float
+    unit: str
+    is_at_bound: bool
+
+
+@dataclass(frozen=True)
+class DriveChoice:
+    """The terms of one joint's drive.
+
+    Attributes:
+        joint: The joint.
+        families: Names of what it has beside viscous and Coulomb friction.
+        terms: The terms themselves.
+        tried: What was tried, step by step.
+        shapes: The shapes that were found.
+        sizes: Shapes of each family.
+        seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+    """
+
+    joint: str
+    families: tuple[str, ...]
+    terms: tuple[DriveTerm, ...]
+    tried: tuple[Tried, ...] = ()
+    shapes: tuple[FoundShape, ...] = ()
+    sizes: tuple[tuple[float, ...], ...] = ()
+    seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
+        """Return the terms with one of the shapes larger by a share.
+
+        Args:
+            which: Which of ``shapes``.
+            share: The share [-].
+        """
+        flat = [(at, k) for at, own in enumerate(self.sizes) for k in range(len(own))]
+        sizes = [list(own) for own in self.sizes]
+        at, k = flat[which]
+        sizes[at][k] *= 1.0 + share
+        every = zip(self.families, sizes, strict=True)
+        return tuple(term for name, own in every for term in FAMILIES[name].make(self.seen, *own))
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """A joint's drive along the sampled rows."""
+
+    j: int
+    slides: bool
+    motions: tuple[DriveMotion, ...]  # of each recording, all its rows
+    taken: tuple[Array, ...]  # rows of each recording in the sample
+    seen: Seen
+
+    def columns(self, terms: Sequence[DriveTerm]) -> Array:
+        """Return what terms multiply in the sampled rows, shape (N, c)."""
+        parts = [
+            np.column_stack([term.column(motion)[rows] for term in terms])
+            for motion, rows in zip(self.motions, self.taken, strict=True)
+        ]
+        return np.concatenate(parts)
+
+
+def wanted_families(
+    friction: str | Mapping[str, str], joints: Sequence[str]
+) -> dict[str, tuple[str, ...] | None]:
+    """Return the names of the families each joint is to have; None where they are to be chosen.
+
+    Args:
+        friction: "auto", or names of friction with + between them; or that by joint, "*" for all
+            joints that are not named ("auto" if it is left out). Viscous and Coulomb friction are
+            the model's terms.
+        joints: Names of the joints.
+
+    Raises:
+        SettingsError: If a name or a joint is unknown.
+    """
+    stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
+    strangers = [joint for joint in stated if joint not in (*joints, "*")]
+    if strangers:
+        raise SettingsError(
+            f"friction is stated for {listed(strangers)}, not among the joints to identify: "
+            f"{listed(joints)}"
+        )
+    wanted: dict[str, tuple[str, ...] | None] = {}
+    for joint in joints:
+        names = stated.get(joint, stated["*"])
+        own = [name for name in names.split("+") if name and name not in _OF_MODEL]
+        unknown = [name for name in own if name not in FAMILIES]
+        if names != AUTO and unknown:
+            raise SettingsError(
+                f"friction of {joint} has {listed(unknown)}, wanted auto, or some of "
+                f"{listed(FAMILIES)}"
+            )
+        wanted[joint] = None if names == AUTO else tuple(own)
+    return wanted
+
+
+def choose_drives(
+    identification: "Identification", wanted: Mapping[str, Sequence[str] | None]
+) -> tuple[DriveChoice, ...]:
+    """Return the terms of each joint's drive.
+
+    Args:
+        identification: What was found with viscous and Coulomb friction alone.
+        wanted: Families that joints are to have, by name; None: those that held-out stretches of
+            the fitted logs ask for; see ``wanted_families``.
+
+    Returns:
+        A choice per joint; none where a joint hardly moved, or the logs are too short to judge.
+    """
+    sample = take_sample(identification, is_steady=False)
+    if sample is None or identification.model.free_flyer:
+        return ()
+    model = identification.model.with_reference(identification.standard)
+    kept = [e for e in identification.validation if not e.is_refitted]
+    recordings = [e.recording for e in (*identification.fitted, *kept)]
+    motions = [drive_motion_along(model, recording.trajectory) for recording in recordings]
+    used = sample.weight[: sample.rows] > 0
+    choices = []
+    for j, joint in enumerate(sample.joints):
+        names = wanted[joint]
+        if not used[:, j].any() or (names is not None and not names):
+            continue
+        own = tuple(motion.of(j) for motion in motions)
+        seen = _seen(own, sample.taken, used[:, j])
+        drive = _Drive(j, bool(sample.slides[j]), own, sample.taken, seen)
+        choices.append(_auto(sample, drive) if names is None else _fixed(sample, drive, names))
+    return tuple(choices)
+
+
+def _seen(motions: Sequence[DriveMotion], taken: Sequence[Array], used: Array) -> Seen:
+    """Return the ranges of position and of the size of speed in the fitted rows that count."""
+    fitted = [(m.q[rows], m.v[rows]) for m, rows in zip(motions, taken, strict=True)]
+    q, v = (np.concatenate(x)[: len(used)][used] for x in zip(*fitted, strict=True))
+    speed = np.abs(v)
+    return {
+        "q": (float(q.min()), float(q.max())),
+        "v": (float(np.quantile(speed, _SLOWEST)), float(speed.max())),
+    }
+
+
+def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Family, list[float]]]:
+    """Yield families with every shape on their grid."""
+    for family in families:
+        turns = (drive.seen["q"][1] - drive.seen["q"][0]) / _TURN
+        if family.needs and (drive.slides or turns < family.needs):
+            continue
+        grids = [np.geomspace(*shape.within(drive.seen), _GRID) for shape in family.shapes]
+        yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trials:
+    """Candidates of a joint, and what they leave."""
+
+    own: list[tuple[Family, list[float]]]
+    place: list[list[int]]  # columns of each
+    is_positive: Array  # which columns multiply what cannot be negative, bool
+    highest: Array  # what their parameters are at most
+    apart: Trial
+    whole: Trial
+    fitted: int
+
+    @classmethod
+    def of(cls, sample: Sample, drive: _Drive, families: Sequence[Family]) -> "_Trials":
+        own = list(_candidates(drive, families))
+        terms = [family.make(drive.seen, *sizes) for family, sizes in own]
+        columns = [drive.columns(those) for those in terms]
+        ends = np.cumsum([x.shape[1] for x in columns]).tolist()
+        place = [list(range(e - x.shape[1], e)) for x, e in zip(columns, ends, strict=True)]
+        Z = np.hstack(columns) if columns else np.empty((len(sample.r), 0))
+        flat = [term for those in terms for term in those]
+        positive = np.array([term.is_nonnegative for term in flat], dtype=bool)
+        largest = max(float(np.abs(motion.tau[:, drive.j]).max()) for motion in sample.at)
+        highest = np.array([min(term.highest, largest / _reach(drive, term)) for term in flat])
+        apart, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+        return cls(own, place, positive, highest, apart, whole, sample.fitted)
+
+    def left(self, chosen: Sequence[int]) -> Array:
+        """Return the squared residual of each fitted stretch with some candidates."""
+        return self.apart.left(self._columns(chosen))[: self.fitted]
+
+    def is_possible(self, chosen: Sequence[int]) -> bool:
+        """Return whether no parameter of some candidates has a size that physics forbids.
+
+        Friction is of one sign, and below the largest torque of the joint.
+        """
+        columns = self._columns(chosen)
+        theta = self.whole.parameters(columns)
+        is_signed = (theta[self.is_positive[columns]] >= 0).all()
+        return bool(is_signed and (np.abs(theta) <= self.highest[columns]).all())
+
+    def _columns(self, chosen: Sequence[int]) -> list[int]:
+        return [k for i in chosen for k in self.place[i]]
+
+
+def _reach(drive: _Drive, term: DriveTerm) -> float:
+    """Return how large the column of a curve of speed may be; next to 0 of another term.
+
+    Behind a filter directions are small where a drive is slow, and hide how large a curve is there.
+    """
+    if term.guards != "v":
+        return _NOTHING
+    v = np.linspace(*drive.seen["v"], 50)
+    one, none = np.ones_like(v), np.zeros_like(v)
+    return float(np.abs(term.column(DriveMotion(none, v, none, one, none, none))).max()) + _NOTHING
+
+
+def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
+    """Return the fewest families that held-out stretches ask for."""
+    every = _Trials.of(sample, drive, [f for f in FAMILIES.values() if f.is_automatic])
+    torque = float(sample.torque[drive.j])
+    chosen: list[int] = []
+    before = every.left([])
+    tried = [Tried((), _percent(before, torque), 1.0, True)]
+    for _ in range(_FAMILIES):
+        groups = {every.own[i][0].name.rstrip("0123456789") for i in chosen}
+        left = {
+            i: every.left([*chosen, i])
+            for i, (family, _) in enumerate(every.own)
+            if family.name.rstrip("0123456789") not in groups and every.is_possible([*chosen, i])
+        }
+        best = _best(every, left, before, torque)
+        names = [every.own[i][0].name for i in chosen]
+        tried += list(_told(every, left, before, torque, names, best))
+        if best is None:
+            break
+        chosen.append(best)
+        before = left[best]
+    return _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+
+
+def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: float) -> int | None:
+    """Return the simplest of the candidates that explain as much as the best; None without one."""
+    whole = float(before.sum())
+    gains = {i: float((before - after).sum()) for i, after in left.items()}
+    sure = {
+        i: gain
+        for i, gain in gains.items()
+        if gain > _LEAST * whole and gain > _SEEN**2 * torque and _chance(before, left[i]) < _CHANCE
+    }
+    alike = [i for i, gain in sure.items() if gain >= max(sure.values()) - _ALIKE * whole]
+    order = list(FAMILIES)
+    return min(
+        alike,
+        key=lambda i: (len(every.place[i]), order.index(every.own[i][0].name), -sure[i]),
+        default=None,
+    )
+
+
+def _chance(before: Array, after: Array) -> float:
+    """Return how likely stretches gain that much, in the mean of their shares, by chance [-]."""
+    gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
+    spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
+    return float(stdtr(len(gain) - 1, -gain.mean() / spread))
+
+
+def _told(
+    every: _Trials,
+    left: Mapping[int, Array],
+    before: Array,
+    torque: float,
+    names: Sequence[str],
+    best: int | None,
+) -> Iterator[Tried]:
+    """Yield what each family would leave, at its best shape."""
+    by_family: dict[str, int] = {}
+    for i, after in left.items():
+        name = every.own[i][0].name
+        if i == best or (
+            by_family.get(name, i) != best and after.sum() <= left[by_family.get(name, i)].sum()
+        ):
+            by_family[name] = i
+    for name, i in by_family.items():
+        chance = _chance(before, left[i])
+        yield Tried((*names, name), _percent(left[i], torque), chance, i == best)
+
+
+def _percent(left: Array, torque: float) -> float:
+    return 100.0 * float(np.sqrt(left.sum() / max(torque, _NOTHING)))
+
+
+def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
+    """Return the families asked for, with the shapes that fit best."""
+    families = [FAMILIES[name] for name in names]
+    every = _Trials.of(sample, drive, families)
+    groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
+    missing = [name for name, group in zip(names, groups, strict=True) if not group]
+    if missing:
+        raise SettingsError(
+            f"friction of {sample.joints[drive.j]} has {listed(missing)}, but the joint slides, or "
+            "turned less than half a turn in the fitted logs; leave it out, or record more"
+        )
+    chosen = [group[len(group) // 2] for group in groups]
+    for _ in range(3 if len(names) > 1 else 1):  # one after the other, a few times over
+        for at, group in enumerate(groups):
+            rest = [*chosen[:at], *chosen[at + 1 :]]
+            chosen[at] = min(group, key=lambda i: float(every.left([*rest, i]).sum()))
+    torque = float(sample.torque[drive.j])
+    tried = (
+        Tried((), _percent(every.left([]), torque), 1.0, False),
+        Tried(tuple(names), _percent(every.left(chosen), torque), 1.0, True),
+    )
+    return _found(sample, drive, [every.own[i] for i in chosen], tried)
+
+
+def _found(
+    sample: Sample,
+    drive: _Drive,
+    chosen: Sequence[tuple[Family, list[float]]],
+    tried: tuple[Tried, ...],
+) -> DriveChoice:
+    """Return the choice with its shapes refined."""
+    sizes = [list(own) for _, own in chosen]
+    families = [family for family, _ in chosen]
+    shapes = []
+    for at, family in enumerate(families):
+        for k, shape in enumerate(family.shapes):
+            value = _refined(sample, drive, families, sizes, (at, k))
+            sizes[at][k] = value
+            low, high = shape.within(drive.seen)
+            margin = _EDGE * np.log(high / low)
+            is_at_bound = min(np.log(value / low), np.log(high / value)) < margin
+            shapes.append((at, k, bool(is_at_bound)))
+    terms = tuple(
+        term
+        for family, own in zip(families, sizes, strict=True)
+        for term in family.make(drive.seen, *own)
+    )
+    return DriveChoice(
+        joint=sample.joints[drive.j],
+        families=tuple(family.name for family in families),
+        terms=terms,
+        tried=tried,
+        shapes=tuple(
+            FoundShape(
+                name=f"{families[at].name}.{families[at].shapes[k].name}",
+                value=sizes[at][k],
+                std_error=_shape_error(sample, drive, families, sizes, (at, k)),
+                unit=families[at].shapes[k].units[int(drive.slides)],
+                is_at_bound=is_at_bound,
+            )
+            for at, k, is_at_bound in shapes
+        ),
+        sizes=tuple(tuple(own) for own in sizes),
+        seen=drive.seen,
+    )
+
+
+def _columns(drive: _Drive, families: Sequence[Family], sizes: Sequence[Sequence[float]]) -> Array:
+    parts = [
+        drive.columns(f.make(drive.seen, *own)) for f, own in zip(families, sizes, strict=True)
+    ]
+    return np.hstack(parts)
+
+
+def _refined(
+    sample: Sample,
+    drive: _Drive,
+    families: Sequence[Family],
+    sizes: Sequence[Sequence[float]],
+    which: tuple[int, int],
+) -> float:
+    """Return the size of one shape that leaves least of the held-out stretches, near its own."""
+    from scipy.optimize import minimize_scalar
+
+    at, k = which
+    low, high = families[at].shapes[k].within(drive.seen)
+    step = np.log(high / low) / (_GRID - 1)
+    own = np.log(sizes[at][k])
+
+    def left(log_size: float) -> float:
+        tried = [list(x) for x in sizes]
+        tried[at][k] = float(np.exp(log_size))
+        Z = _columns(drive, families, tried)
+        apart, _ = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+        return float(apart.left(list(range(Z.shape[1])))[: sample.fitted].sum())
+
+    bounds = (max(own - step, np.log(low)), min(own + step, np.log(high)))
+    found = minimize_scalar(left, bounds=bounds, method="bounded", options={"maxiter": 12})
+    return float(np.exp(found.x)) if found.fun <= left(own) else float(sizes[at][k])
+
+
+def _shape_error(
+    sample: Sample,
+    drive: _Drive,
+    families: Sequence[Family],
+    sizes: Sequence[Sequence[float]],
+    which: tuple[int, int],
+) -> float:
+    """Return the standard error of a shape: that of the column d(torque)/d(shape) beside all."""
+    at, k = which
+    Z = _columns(drive, families, sizes)
+    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+    theta = whole.parameters(list(range(Z.shape[1])))
+    moved = [list(x) for x in sizes]
+    h = _STEP * sizes[at][k]
+    moved[at][k] += h
+    slope = (_columns(drive, families, moved) - Z) @ theta / h
+    _, beside = trials(sample, slice(drive.j, drive.j + 1), np.column_stack([Z, slope])[:, None])
+    every = list(range(Z.shape[1] + 1))
+    _, covariance = beside.estimate(every, sample.fitted)
+    return float(np.sqrt(max(covariance[-1, -1], 0.0)))

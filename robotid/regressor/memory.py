@@ -1,0 +1,74 @@
+"""What drives remember along a trajectory: the load of their gears, its change, their reversals."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import (
+    drive_motion,
+    friction_directions,
+    remembered,
+    trajectory_values,
+)
+from robotid.regressor.prediction import predict
+from robotid.robot.drives import DriveMotion
+from robotid.robot.model import RobotModel
+
+__all__ = ["drive_motion_along", "remember"]
+
+
+def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory with what the drives of a robot remember along it.
+
+    Args:
+        model: The robot; its reference tells the load of the gears.
+        trajectory: N samples in order of time.
+
+    Returns:
+        The trajectory with ``memory``; as it is if no drive remembers anything.
+    """
+    if not model.layout.remembering:
+        return trajectory
+    motion = drive_motion_along(model, replace(trajectory, memory=None))
+    return replace(trajectory, memory=remembered(model.layout, motion))
+
+
+def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion:
+    """Return how the drives of a robot move along a trajectory, and what loads them.
+
+    The load is the torque of the bodies, its change that of the whole torque, by the model's
+    reference; what comes late by itself has no part in it.
+
+    Args:
+        model: The robot.
+        trajectory: N samples in order of time, without ``memory``.
+
+    Returns:
+        Arrays of shape (d, N).
+    """
+    layout, m, pi = model.layout, trajectory, model.carried_by
+    first = model.n_rows - len(model.joints)
+    signs = friction_directions(layout, m.v, m.direction)
+    begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
+    plain = model.with_terms({})
+    bodies = np.zeros(len(plain.layout.names))
+    bodies[: layout.n_inertial] = pi[: layout.n_inertial]
+    load = predict(plain, [bodies], m)[0][:, first:]
+    motion = drive_motion(layout, m.q, m.v, m.a, signs, load, None, begins)
+    if layout.remembering:
+        m = replace(m, memory=remembered(layout, motion))
+    drives = trajectory_values(layout, m).T @ (layout.drive_loads * pi[layout.n_inertial :]).T
+    rate = _rate(load + drives, m)
+    return drive_motion(layout, m.q, m.v, m.a, signs, load, rate, begins)
+
+
+def _rate(torque: Array, motion: Trajectory) -> Array:
+    """Return the change of torques within each stretch, shape (N, n) [N m/s, N/s]."""
+    rate = np.zeros_like(torque)
+    edges = np.flatnonzero(np.diff(motion.segment)) + 1
+    for part in np.split(np.arange(len(motion.t)), edges):
+        if len(part) > 1:
+            rate[part] = np.gradient(torque[part], motion.t[part], axis=0)
+    return rate
