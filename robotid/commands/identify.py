@@ -58,7 +58,9 @@ def run_job(
     with folder_beside(target) as partial:
         outputs = {"report": "report.html"}
         if identification.has_urdf:
-            write_urdf(model, identification.standard, partial / name, dynamics=job.dynamics)
+            write_urdf(
+                identification.model, identification.standard, partial / name, dynamics=job.dynamics
+            )
             outputs |= {"urdf": name, "sidecar": sidecar}
         write_report(identification, partial / "report.html")
         result = build_result(identification, job.to_dict(), outputs=outputs)

@@ -11,7 +11,7 @@ from robotid._files import read_json
 from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.result import read_result, stated_parameters
+from robotid.export.result import read_result, stated_model
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.identification.evaluation import predict
 from robotid.identification.pipeline import Identification
@@ -118,18 +118,19 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     model = job.model()
     (entry,) = job.identification
     motion = job.read(entry, model)
-    vectors = {label: stated_parameters(r, model) for label, r in findings.results.items()}
+    robots = {label: stated_model(r, model) for label, r in findings.results.items()}
+    bodies = {label: robot.carried_by for label, robot in robots.items()}
     second = None
     if ghost is not None:
         second = (Path(ghost).name, *_ghost(job, model, Path(ghost)))
     prior = model.standard_parameters()
-    torques = _torques(job, model, motion, vectors)
+    torques = _torques(job, motion, robots)
     return replay(
         model,
         motion.t,
         motion.q,
         torques=torques,
-        masses={"URDF": prior, **vectors} if vectors else None,
+        masses={"URDF": prior, **bodies} if bodies else None,
         ghost=second,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=[*_payloads(findings.track), *_contacts(torques, model)],
@@ -186,14 +187,14 @@ def _track(path: Path) -> Mapping[str, Any] | None:
     return content
 
 
-def _torques(job: Job, model: RobotModel, log: Log, vectors: Mapping[str, Array]) -> Torques:
-    if not vectors:
-        return Torques(log.t, log.tau)
-    rows = hold_log(model, log, job.signals).whole
-    motion = rows.trajectory
-    predicted = predict(model, list(vectors.values()), motion)
-    shown = [_sure(torque, rows.mask) for torque in predicted]
-    return Torques(motion.t, motion.tau, dict(zip(vectors, shown, strict=True)))
+def _torques(job: Job, log: Log, robots: Mapping[str, RobotModel]) -> Torques:
+    """Return measured torques, and those of robots loaded by their own parameters."""
+    shown, motion = {}, None
+    for label, robot in robots.items():
+        rows = hold_log(robot, log, job.signals).whole
+        motion = rows.trajectory
+        shown[label] = _sure(predict(robot, [robot.carried_by], motion)[0], rows.mask)
+    return Torques(log.t, log.tau) if motion is None else Torques(motion.t, motion.tau, shown)
 
 
 def _sure(torque: Array, mask: Array) -> Array:

@@ -12,6 +12,7 @@ from robotid.doctor.diagnosis import diagnose
 from robotid.export.result import (
     load_result,
     recording_metrics,
+    stated_model,
     stated_parameters,
     stated_urdf_with_drives,
     stated_witness,
@@ -49,7 +50,7 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     result = loaded.content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     job = job_from_settings(settings, Path(path).name, Path())
-    source = job.model()
+    source = stated_model(result, job.model())
     if loaded.has_urdf:
         model, pi = loaded.identified
     else:

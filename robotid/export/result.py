@@ -15,13 +15,15 @@ from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
-from robotid.export.urdf import load_identified
+from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.identification.bands import REACH
+from robotid.identification.drive_choice import DriveChoice
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import SOURCES, Identification
 from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import __version__, versions
@@ -32,6 +34,7 @@ __all__ = [
     "load_result",
     "read_result",
     "recording_metrics",
+    "stated_model",
     "stated_parameters",
     "stated_urdf_with_drives",
     "stated_witness",
@@ -68,6 +71,7 @@ _SHAPE = {
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
+    "own_terms?": {...: [TABLE]},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
     "verdict": {
@@ -127,6 +131,10 @@ def build_result(
                 strict=True,
             )
         ],
+        "own_terms": model.options["own_terms"],
+        "friction": {
+            drive.joint: _friction(identification, drive) for drive in identification.drives
+        },
         "consistency": _consistency(identification),
         "identification": identification.metrics().to_dict(),
         "validation": [
@@ -321,6 +329,41 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
     if missing:
         raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
     return np.array([stated[name] for name in model.layout.names])
+
+
+def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:
+    """Return the robot with the friction that a result has found, loaded by its bodies.
+
+    Args:
+        result: Content of a result.json.
+        model: Its robot, as its job describes it.
+
+    Raises:
+        ModelError: If a parameter of the robot is not in it.
+        SettingsError: If a term of it is unknown.
+    """
+    found = model.with_terms(terms_from_facts(result.get("own_terms", {})))
+    return found.with_reference(stated_parameters(result, found))
+
+
+def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
+    """Return what friction a joint has, and what was tried."""
+    own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
+    return {
+        "terms": [*own, *drive.families],
+        "shapes": [dataclasses.asdict(shape) for shape in drive.shapes],
+        "seen": {key: list(pair) for key, pair in drive.seen.items()},
+        "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
+        "tried": [
+            {
+                "terms": [*own, *tried.families],
+                "held_out_error_pct": _finite(tried.held_out_error_pct),
+                "chance": _finite(tried.chance),
+                "is_taken": tried.is_taken,
+            }
+            for tried in drive.tried
+        ],
+    }
 
 
 def _inputs(identification: Identification) -> list[dict[str, Any]]:

@@ -28,7 +28,7 @@ from robotid.robot.tree import read_tree
 from robotid.robot.urdf_text import read_with_yourdfpy
 from robotid.versions import __version__
 
-__all__ = ["load_identified", "read_sidecar", "write_urdf"]
+__all__ = ["load_identified", "read_sidecar", "terms_from_facts", "write_urdf"]
 
 _SCHEMA_VERSION = 1
 _SHAPE = {

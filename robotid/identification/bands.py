@@ -1,6 +1,7 @@
 """How far predicted torques can be trusted: their bands from the covariance of the parameters."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,9 +9,13 @@ from robotid._typing import Array
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.torque import trajectory_regressor
+from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["REACH", "TorqueBand", "torque_band"]
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = ["REACH", "FrictionCurve", "TorqueBand", "friction_curve", "torque_band"]
 
 #: Standard deviations that a 95 % band reaches.
 REACH = 1.96
@@ -68,3 +73,46 @@ def torque_band(
     variance = np.einsum("ij,ij->i", W @ covariance, W)
     std = np.sqrt(np.maximum(variance, 0.0)).reshape(len(samples), -1)
     return TorqueBand(samples, std, np.asarray(noise))
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionCurve:
+    """Friction and offset of a joint's own drive while it moves steadily.
+
+    Attributes:
+        v: Speeds, shape (k,) [rad/s or m/s].
+        torque: Friction and offset there, shape (k,) [N m or N].
+        std: Its standard deviation from the uncertainty of the parameters, shape (k,).
+        load: Torque of the bodies that the gear carries meanwhile [N m or N].
+    """
+
+    v: Array
+    torque: Array
+    std: Array
+    load: float
+
+
+def friction_curve(
+    found: "Identification", joint: str, v: Array, *, q: float = 0.0, load: float = 0.0
+) -> FrictionCurve:
+    """Return friction and offset of a joint against its speed.
+
+    Args:
+        found: The identification.
+        joint: The joint.
+        v: Speeds, shape (k,) [rad/s or m/s].
+        q: Position, of which some friction depends [rad or m].
+        load: Torque of the bodies that the gear carries [N m or N].
+    """
+    layout = found.model.layout
+    d, none = layout.joints.index(joint), np.zeros_like(v)
+    motion = DriveMotion(q + none, v, none, np.sign(v), load + none, none)
+    own = [
+        (k, term)
+        for k, (drive, term) in enumerate(layout.drive_parameters, start=layout.n_inertial)
+        if drive == d and not term.is_inertia
+    ]
+    X = np.column_stack([none, *(term.column(motion) for _, term in own)])[:, 1:]
+    k = [k for k, _ in own]
+    variance = np.einsum("ij,jk,ik->i", X, found.standard_covariance[np.ix_(k, k)], X)
+    return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)

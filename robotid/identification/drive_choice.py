@@ -39,6 +39,8 @@ _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bo
 _SLOWEST = 0.02  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _STEP = 1e-3  # relative, of a derivative
+_STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
+_FEWEST = 3  # stretches that show chance
 _NOTHING = 1e-300
 
 
@@ -323,7 +325,14 @@ def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: floa
 
 
 def _chance(before: Array, after: Array) -> float:
-    """Return how likely stretches gain that much, in the mean of their shares, by chance [-]."""
+    """Return how likely stretches gain that much, in the mean of their shares, by chance [-].
+
+    Stretches in which the joint stands still have no say.
+    """
+    moves = before > _STILL * before.max()
+    if moves.sum() < _FEWEST:
+        return 1.0
+    before, after = before[moves], after[moves]
     gain = (before - after) / np.maximum(np.maximum(before, after), _NOTHING)
     spread = max(float(np.std(gain, ddof=1)) / np.sqrt(len(gain)), _NOTHING)
     return float(stdtr(len(gain) - 1, -gain.mean() / spread))

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid._html import code, figure, number, table
+from robotid._html import code, figure, number, table, text
 from robotid._typing import Array
+from robotid.findings import listed
+from robotid.identification.bands import REACH, FrictionCurve, friction_curve
+from robotid.identification.drive_choice import DriveChoice
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.information import Information, information
 from robotid.identification.pipeline import Identification
+from robotid.regressor.memory import drive_motion_along
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
 from robotid.report.svg import (
     INK,
@@ -30,6 +34,7 @@ _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
 _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # a correlation worth naming
+_CURVE = 60  # points of a friction curve on each side
 _CELL = 11  # [px] of the correlation matrix
 _STEPS = 8  # shades of each sign in it
 
@@ -69,17 +74,26 @@ def drive_figures(found: Identification) -> str:
     layout = found.model.layout
     if not layout.drive_names:
         return ""
-    bars = "".join(_drive_figure(found, term) for term in layout.terms)
+    terms = dict.fromkeys(term.name for _, term in layout.drive_parameters)
+    bars = "".join(_drive_figure(found, term) for term in terms)
+    choice = "".join(_choice(found, drive) for drive in found.drives)
+    if choice:
+        choice = (
+            "<h3>Which friction the logs show</h3>\n<p>Beside viscous and Coulomb friction, for "
+            "each joint: the error of stretches that were held out of the fit, and how likely they "
+            f"gain that much by chance.</p>\n{choice}"
+        )
     curves = ""
     if not all(term.is_inertia for _, term in layout.drive_parameters):
         curves = (
             "<h3>Friction against speed</h3>\n<p>Torque that inertia, gravity and armature leave, "
             f"on {escape(_shown(found).recording.name)}, and the friction and offset identified. "
             "Dots that bend away from the blue ones ask for another friction model; what is beyond "
-            "chance is among the warnings and notes.</p>\n"
+            "chance is among the warnings and notes. The line is the friction of steady motion, "
+            "with the 95 % band of its parameters.</p>\n"
             f'<div class="plots">\n{_friction_figures(found)}</div>\n'
         )
-    return f'{curves}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
+    return f'{curves}{choice}<h3>Values</h3>\n<div class="plots">\n{bars}</div>\n'
 
 
 def body_figures(found: Identification) -> str:
@@ -163,7 +177,9 @@ def _period(t: Array, segment: Array) -> float:
 
 def _friction_figures(found: Identification) -> str:
     evaluation, model = _shown(found), found.model
+    motion = evaluation.recording.trajectory
     left, friction = friction_split(model, evaluation, found.standard)
+    loads = drive_motion_along(model, motion).load if model.layout.remembering else None
     figures = []
     for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True)):
         rows = np.flatnonzero(evaluation.recording.mask[:, row])
@@ -171,13 +187,40 @@ def _friction_figures(found: Identification) -> str:
         if not len(rows):
             figures.append(f"<p>{escape(name)}: no rows used.</p>\n")
             continue
-        v = evaluation.recording.trajectory.v[rows, row]
+        v, q = motion.v[rows, row], float(np.median(motion.q[rows, row]))
         units = ("m/s" if unit == "N" else "rad/s", unit)
-        plot = _plot_friction(v, left[rows, row], friction[rows, row], units=units)
+        load = 0.0
+        if loads is not None and any(x.name == "load" for x in model.layout.own.get(name, ())):
+            load = float(np.sqrt(np.mean(loads[row, rows] ** 2)))
+        side = np.linspace(np.abs(v).min(), np.abs(v).max(), _CURVE)
+        curve = friction_curve(found, name, np.append(-side[::-1], side), q=q, load=load)
+        plot = _plot_friction(v, left[rows, row], friction[rows, row], curve, units=units)
         title = f"Friction of {name} against speed, measured and identified"
         svg = svg_element(plot, title, f"friction{row}")
         figures.append(figure(f"<strong>{escape(name)}</strong>", svg))
     return "".join(figures)
+
+
+def _choice(found: Identification, drive: DriveChoice) -> str:
+    """Return what friction of a joint was tried, what was taken, and its shapes."""
+    taken = " + ".join(drive.families) or "nothing more"
+    shapes = [
+        f"{shape.name} = {shape.value:.3g} ± {shape.std_error:.2g} {shape.unit}"
+        + (" (at its bound)" if shape.is_at_bound else "")
+        for shape in drive.shapes
+    ]
+    said = f"{drive.joint}: {taken}" + (f"; {listed(shapes)}" if shapes else "")
+    rows = [
+        [
+            text(" + ".join(tried.families) or "viscous and Coulomb"),
+            number(tried.held_out_error_pct, ".2f"),
+            number(tried.chance, ".1e") if tried.families else text(""),
+            text("taken" if tried.is_taken else ""),
+        ]
+        for tried in drive.tried
+    ]
+    headers = ["terms", "held-out error %", "chance", ""]
+    return f"<details><summary>{escape(said)}</summary>{table(said, headers, rows)}</details>\n"
 
 
 def _drive_figure(found: Identification, term: str) -> str:
@@ -306,19 +349,33 @@ def _plot_residual(
     return figure
 
 
-def _plot_friction(v: Array, left: Array, friction: Array, *, units: tuple[str, str]) -> Any:  # noqa: ANN401
-    """Draw the torque that inertia and gravity leave, and the friction found; shape (M,) each."""
+def _plot_friction(
+    v: Array,
+    left: Array,
+    friction: Array,
+    curve: FrictionCurve,
+    *,
+    units: tuple[str, str],
+) -> Any:  # noqa: ANN401
+    """Draw the torque that inertia and gravity leave, the friction found, (M,) each, its curve."""
     with drawing(2.4, simplify=False) as figure:
         axes = figure.subplots()
         # a path of dots is a tenth of the size of as many markers
         for y, colour, width, alpha, label in (
             (left, INK, 1.6, 0.4, "torque left"),
-            (friction, PREDICTED, 2.2, 1.0, "friction and offset identified"),
+            (friction, PREDICTED, 2.2, 1.0, "identified"),
         ):
             x = np.column_stack([v, v, np.full(len(v), np.nan)]).ravel()
             dots = np.column_stack([y, y, np.full(len(y), np.nan)]).ravel()
             axes.plot(x, dots, color=colour, alpha=alpha, lw=width, solid_capstyle="round")
             axes.plot([], [], "o", ms=width + 1, color=colour, alpha=alpha, label=label)
+        load = f" at {curve.load:.3g} {units[1]} of load" if curve.load else ""
+        label = f"steady{load}, 95 % band"
+        for half in (curve.v < 0, curve.v > 0):
+            low, high = (curve.torque[half] + s * REACH * curve.std[half] for s in (-1.0, 1.0))
+            axes.fill_between(curve.v[half], low, high, color=RESIDUAL, alpha=0.3, lw=0.0)
+            axes.plot(curve.v[half], curve.torque[half], color=RESIDUAL, lw=1.0)
+        axes.plot([], [], color=RESIDUAL, lw=1.0, label=label)
         axes.axhline(0.0, color=INK, lw=0.5)
         axes.set(xlabel=f"speed [{units[0]}]", ylabel=f"friction [{units[1]}]")
         axes.grid(visible=True)

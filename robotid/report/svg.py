@@ -78,7 +78,7 @@ def legend(axes: Any, height: float) -> None:  # noqa: ANN401
         axes: Axes of Matplotlib, drawn in.
         height: Where it stands, as a share of the height of the axes.
     """
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=2, borderpad=0)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=3, borderpad=0)
 
 
 def plain_decades(axes: Any) -> None:  # noqa: ANN401
