@@ -1,6 +1,6 @@
 """Payloads from two runs: logs with them, and logs or a result without."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,14 @@ from robotid.commands.logs import survey_logs
 from robotid.exceptions import DataError, SettingsError
 from robotid.export.result import load_result
 from robotid.findings import listed
+from robotid.identification.drive_choice import wanted_families
 from robotid.identification.payload_fit import fit_payloads
+from robotid.identification.pipeline import with_drives
 from robotid.identification.recordings import Recordings
+from robotid.identification.settings import ConsistentSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.drives import DriveTerm
+from robotid.robot.model import RobotModel
 
 __all__ = ["is_result", "measure_payload", "stated_masses"]
 
@@ -89,14 +94,28 @@ def measure_payload(
     surveyed = survey_logs(job, model, job.identification, entries)
     mapping = structural_mapping(model)
     loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)
-    found = fit_payloads(
-        loaded,
-        reference,
-        links=links,
-        masses=stated_masses(masses, links),
-        unknown_gains=unknown,
-    )
+    known = stated_masses(masses, links)
+    found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
+    gains = {joint: gain.value for joint, gain in found.gains.items()}
+    own = _chosen_terms(replace(job, gains={**job.gains, **gains}), model, entries)
+    if own:
+        loaded, reference = (run.with_model(model.with_terms(own)) for run in (loaded, reference))
+        found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
     return found.to_dict()
+
+
+def _chosen_terms(
+    job: Job, model: RobotModel, entries: Sequence[LogEntry]
+) -> Mapping[str, tuple[DriveTerm, ...]]:
+    """Return the friction that the reference shows beside viscous and Coulomb's, by drive."""
+    if not any(job.friction.values()):
+        return {}
+    (surveyed,) = survey_logs(job, model, entries)
+    reference = Recordings(model, structural_mapping(model), surveyed)
+    choice = ConsistentSettings(prior_weight=1.0, draws=0)
+    return with_drives(
+        reference, choice, wanted_families(job.friction, model.joints)
+    ).model.layout.own
 
 
 def _of_result(job: Job, path: str) -> tuple[Job, list[LogEntry]]:

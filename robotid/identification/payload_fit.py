@@ -10,7 +10,7 @@ from robotid._typing import Array
 from robotid.estimators import Consistent, Constraints, Estimate
 from robotid.estimators.stretches import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
-from robotid.exceptions import DataError, SettingsError
+from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.identification.recordings import Recordings
 from robotid.identification.survey import hold_log
@@ -33,6 +33,8 @@ _NOTHING = 0.01  # ... or of this share of the robot's
 _COM = 0.05  # ... of a centre of mass, of the robot's length
 _INERTIA = 0.3  # ... of an inertia about it, of the mean principal moment
 _SAME = 1e-3  # of the largest: a column of a link that motion shows that little is not shown
+_MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
+_SETTLED = 1e-4  # relative change of the parameters at which it is
 _FREE = 1e-9  # weight of the prior in the fit that keeps a payload possible: none
 
 
@@ -73,6 +75,12 @@ class Payload:
         c = self.com
         inertia: Array = self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
         return inertia
+
+    @property
+    def parameters(self) -> Array:
+        """The ten inertial parameters in the link's frame, shape (10,)."""
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia_at_link.tolist()
+        return np.array([self.mass, *(self.mass * self.com), xx, xy, yy, xz, yz, zz])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values; what is not determined is None."""
@@ -221,6 +229,37 @@ def fit_payloads(
     Raises:
         DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
     """
+    if not loaded.model.layout.remembering:
+        return _fit(loaded, reference, links, masses, unknown_gains)
+    # gears are loaded by the bodies that are sought
+    bodies, before = loaded.model.standard_parameters(), np.inf
+    payload = np.zeros_like(bodies)
+    for _ in range(_MOST_LOADS):
+        ground, other = (
+            run.with_model(run.model.with_reference(pi))
+            for run, pi in ((reference, bodies), (loaded, bodies + payload))
+        )
+        found = _fit(other, ground, links, masses, unknown_gains)
+        size = float(np.linalg.norm(found.base))
+        if abs(size - before) < _SETTLED * size:
+            return found
+        bodies, payload = _loads(found, ground)
+        before = size
+    raise NotConvergedError(
+        f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
+        "'viscous+coulomb', or record motion that determines more",
+        "max_iterations",
+    )
+
+
+def _fit(
+    loaded: Recordings,
+    reference: Recordings,
+    links: Sequence[str],
+    masses: Mapping[str, float],
+    unknown_gains: Sequence[str],
+) -> PayloadFit:
+    """Fit two runs whose gears are loaded as their models say."""
     model = loaded.model
     columns = _payload_columns(model, loaded.mapping.K, links)
     _check_known(model, links, masses, unknown_gains)
@@ -259,6 +298,17 @@ def fit_payloads(
         np.sqrt(np.diag(found.covariance)[:b]),
         found.unexplained,
     )
+
+
+def _loads(found: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
+    """Return what loads the gears: the robot's standard parameters, and what payloads add."""
+    model = reference.model
+    bodies = reference.mapping.to_standard(found.base, model.standard_parameters())
+    added = np.zeros_like(bodies)
+    for payload in found.payloads:
+        body, transfer = link_transfer(model, payload.link)
+        added[10 * body : 10 * body + 10] += transfer @ payload.parameters
+    return bodies, added
 
 
 def _payload_columns(model: RobotModel, K: Array, links: Sequence[str]) -> Array:

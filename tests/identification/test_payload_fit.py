@@ -14,6 +14,7 @@ from robotid.identification.payload_fit import identify_payload
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import FAMILIES
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 MASS, COM = 2.0, np.array([0.02, 0.03, 0.08])
@@ -93,7 +94,7 @@ def test_a_known_mass_is_kept_and_makes_the_rest_surer(ur5, rng):
 def test_intervals_hold_the_truth_of_payload_gains_and_robot(ur5):
     beta = structural_mapping(ur5).to_base(truth(ur5))
     outside = []
-    for seed in range(6):
+    for seed in range(3):
         log, without = recorded(ur5, np.random.default_rng(seed), noise=LEVEL, friction=1.2)
         free = identify_payload(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
         low, high = free.mass_interval
@@ -128,6 +129,27 @@ def test_gains_are_exact_without_noise_and_some_may_be_known(ur5, rng):
     )
     assert found["tool0"].mass == pytest.approx(MASS, rel=1e-6)
     assert found.gains["elbow_joint"].value == pytest.approx(GAINS[2], rel=1e-6)
+
+
+def test_friction_that_grows_with_the_load_is_reckoned_with_the_payload(ur5, rng):
+    log, without = recorded(ur5, rng, samples=500)
+    pi = truth(ur5)
+    pi[ur5.layout.n_inertial :] = 0.0
+
+    def with_friction(x, extra=0.0):
+        rigid = (joint_torque_regressor(ur5, x.q, x.v, x.a) @ pi).reshape(x.tau.shape) + extra
+        return replace(x, tau=x.tau + 0.08 * np.sign(x.v) * np.abs(rigid))
+
+    logs = with_friction(log, load_torque(ur5, log, "tool0")), with_friction(without)
+    own = {joint: FAMILIES["load"].make({}) for joint in ur5.joints}
+    found = [
+        identify_payload(model, logs[:1], logs[1:], links=["tool0"], signals=EXACT)["tool0"]
+        for model in (ur5, ur5.with_terms(own))
+    ]
+    assert abs(found[0].mass - MASS) > 0.001
+    assert found[1].mass == pytest.approx(MASS, abs=1e-5)
+    assert found[1].mass_std_error < 0.05 * found[0].mass_std_error
+    np.testing.assert_allclose(found[1].com, COM, atol=1e-5)
 
 
 def test_an_inertia_that_the_motion_does_not_show_is_refused(ur5, rng):
