@@ -343,8 +343,8 @@ def _print_payload(content: dict[str, Any]) -> None:
         low, high = found["mass_interval"]
         print(f"payload on {link}")
         print(
-            f"  mass {mass:.4g} kg"
-            + (", stated" if known else f" (95 % interval {low:.4g} to {high:.4g})")
+            f"  mass {mass:.4f} kg"
+            + (", stated" if known else f" (95 % interval {low:.4f} to {high:.4f})")
         )
         if found["com"] is not None:
             pairs = zip("xyz", found["com"], found["com_std_error"], strict=True)

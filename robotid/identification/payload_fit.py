@@ -29,7 +29,7 @@ __all__ = ["Gain", "Payload", "PayloadFit", "fit_payloads", "identify_payload"]
 
 _SURE = 3.0  # standard errors that a mass has at least
 _MASS = 0.3  # largest standard error of a mass that counts as determined, of that mass,
-_NOTHING = 0.01  # ... or of this share of the robot's
+_NOTHING = 0.05  # ... or of this share of the robot's
 _COM = 0.05  # ... of a centre of mass, of the robot's length
 _INERTIA = 0.3  # ... of an inertia about it, of the mean principal moment
 _SAME = 1e-3  # of the largest: a column of a link that motion shows that little is not shown

@@ -70,7 +70,7 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
 def test_the_text_says_what_a_controller_asks_for(files, capsys):
     said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
                  "--mass", "2")  # fmt: skip
-    assert said.startswith("payload on tool0\n  mass 2 kg, stated\n")
+    assert said.startswith("payload on tool0\n  mass 2.0000 kg, stated\n")
     assert "centre of mass in the frame of tool0 [m]: x 0.0" in said
     assert "inertia about the origin of tool0, axes of tool0 [kg m^2]: Ixx 0.0" in said
     assert "inertia about its centre of mass, axes of tool0" in said
