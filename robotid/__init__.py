@@ -9,7 +9,10 @@ if TYPE_CHECKING:
     from robotid.doctor.diagnosis import check_logs
     from robotid.doctor.urdf import inspect_urdf
     from robotid.exceptions import RobotIdError
+    from robotid.export.mjcf import write_mjcf
+    from robotid.export.ranges import write_ranges
     from robotid.export.result import load_result
+    from robotid.export.sdf import write_sdf
     from robotid.export.urdf import write_urdf
     from robotid.identification.payload_fit import identify_payload
     from robotid.identification.pipeline import Identification, identify
@@ -47,7 +50,10 @@ __all__ = [
     "replay",
     "run_job",
     "write_log",
+    "write_mjcf",
+    "write_ranges",
     "write_report",
+    "write_sdf",
     "write_urdf",
 ]
 
@@ -57,7 +63,10 @@ _HOMES = {
     "doctor.diagnosis": ["check_logs"],
     "doctor.urdf": ["inspect_urdf"],
     "exceptions": ["RobotIdError"],
+    "export.mjcf": ["write_mjcf"],
+    "export.ranges": ["write_ranges"],
     "export.result": ["load_result"],
+    "export.sdf": ["write_sdf"],
     "export.urdf": ["write_urdf"],
     "identification.payload_fit": ["identify_payload"],
     "identification.pipeline": ["Identification", "identify"],

@@ -248,6 +248,12 @@ def _compare(options: argparse.Namespace) -> None:
         print(f"\nwritten to {options.out}")
 
 
+def _export(options: argparse.Namespace) -> None:
+    from robotid.commands.export import export_result
+
+    _show(export_result(options.result, options.format, options.out), options, "export")
+
+
 def _convert(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
@@ -272,6 +278,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "validate": ("measure a result's prediction on other logs", _validate),
     "payload": ("what hangs on a link: a log with it against one without", _payload),
     "compare": ("several results side by side", _compare),
+    "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
     "convert": (
         "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names",
         _convert,

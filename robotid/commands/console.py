@@ -157,6 +157,7 @@ def print_content(command: str, content: dict[str, Any]) -> None:
         "validate": _print_validation,
         "payload": _print_payload,
         "compare": _print_comparison,
+        "export": _print_export,
         "convert": _print_conversion,
     }
     prints[command](content)
@@ -225,7 +226,7 @@ def terminal_progress(
 
 
 def _print_result(result: dict[str, Any]) -> None:
-    from robotid.identification.summary import error_lines, verdict_lines
+    from robotid.identification.summary import error_lines, friction_lines, verdict_lines
 
     structure, wls = result["structure"], result["wls"]
     before, after, _ = result["witness"]["masses"]
@@ -237,6 +238,7 @@ def _print_result(result: dict[str, Any]) -> None:
     _print_lines("fitted recordings", *error_lines(result["identification"], wls["identification"]))
     for ours, theirs in zip(result["validation"], wls["validation"], strict=True):
         _print_lines(f"kept apart: {ours['log']}", *error_lines(ours, theirs))
+    _print_lines(*friction_lines(result["friction"]))
     for warning in result["warnings"]:
         _print_lines(f"{warning['code']}: {warning['message']}")
     _print_lines(*verdict_lines(result["verdict"]))
@@ -290,7 +292,8 @@ def _print_comparison(content: dict[str, Any]) -> None:
     heads = [*labels, *[f"{label}-A" for label in labels[1:]]]
     print(f"  {'':{width}}" + "".join(f"{head:>10}" for head in heads))
     for entry in content["base_parameters"]:
-        cells = "".join(f"{value:10.4g}" for value in entry["values"])
+        values = entry["values"]
+        cells = "".join("-".rjust(10) if x is None else f"{x:10.4g}" for x in values)
         cells += "".join(cell(value, 10) for value in entry["differences"])
         print(f"  {entry['name']:{width}}{cells}")
     for key in ("settings", "versions"):
@@ -370,6 +373,12 @@ def _print_payload(content: dict[str, Any]) -> None:
         for joint, gain in content["gains"].items():
             low, high = gain["interval"]
             print(f"{joint} = {gain['gain']:.4g}  # 95 % interval {low:.4g} to {high:.4g}")
+
+
+def _print_export(done: dict[str, Any]) -> None:
+    print(f"written: {', '.join(done['files'])}")
+    for note in done["not_stated"]:
+        print(f"  {note}")
 
 
 def _print_conversion(done: dict[str, Any]) -> None:

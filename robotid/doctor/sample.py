@@ -155,7 +155,7 @@ def _probe(
     whole = joint_torque_regressor(_in_gravity(model, np.zeros(3)), q, v, a).reshape(shape)
     pulled = [_in_gravity(model, g) for g in np.eye(3)]
     G = np.array([joint_torque_regressor(m, q, still, still).reshape(shape) for m in pulled])
-    own = len(model.joints) * len(model.layout.terms)
+    own = model.layout.n_own
     return Probe(
         model, motion, rows, q, v, a, motion.tau[rows],
         whole[:, :, :size], G[:, :, :, :size], whole[:, :, size + own :],

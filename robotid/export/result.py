@@ -14,6 +14,7 @@ from robotid._files import file_sha256, read_json
 from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.identification.bands import REACH
@@ -71,6 +72,7 @@ _SHAPE = {
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
+    "ranges?": {"robot": TEXT},
     "own_terms?": {...: [TABLE]},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
@@ -136,6 +138,7 @@ def build_result(
             drive.joint: _friction(identification, drive) for drive in identification.drives
         },
         "consistency": _consistency(identification),
+        **({"ranges": parameter_ranges(identification)} if identification.has_urdf else {}),
         "identification": identification.metrics().to_dict(),
         "validation": [
             recording_metrics(e, "estimate") | {"band": _band(identification, e)}
@@ -349,20 +352,12 @@ def stated_model(result: Mapping[str, Any], model: RobotModel) -> RobotModel:
 def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
     """Return what friction a joint has, and what was tried."""
     own = [term for term in found.model.layout.terms if TERMS[term].is_friction]
+    told = drive.to_dict()
     return {
         "terms": [*own, *drive.families],
-        "shapes": [dataclasses.asdict(shape) for shape in drive.shapes],
-        "seen": {key: list(pair) for key, pair in drive.seen.items()},
+        **told,
         "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
-        "tried": [
-            {
-                "terms": [*own, *tried.families],
-                "held_out_error_pct": _finite(tried.held_out_error_pct),
-                "chance": _finite(tried.chance),
-                "is_taken": tried.is_taken,
-            }
-            for tried in drive.tried
-        ],
+        "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in told["tried"]],
     }
 
 

@@ -7,7 +7,7 @@ for, armature and friction of coupled drives above all, goes into ``<name>.drive
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,22 @@ from robotid.export import xml_splice
 from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
 from robotid.regressor.torque import random_regressor
-from robotid.robot.bodies import LinkPlace, held_parameters, link_places
+from robotid.robot.bodies import LinkPlace, central_inertial, held_parameters, link_places
 from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
-from robotid.robot.tree import read_tree
+from robotid.robot.tree import MOMENTS, read_tree
 from robotid.robot.urdf_text import read_with_yourdfpy
 from robotid.versions import __version__
 
-__all__ = ["load_identified", "read_sidecar", "terms_from_facts", "write_urdf"]
+__all__ = [
+    "link_parameters",
+    "load_identified",
+    "numbers_text",
+    "read_sidecar",
+    "terms_from_facts",
+    "write_urdf",
+]
 
 _SCHEMA_VERSION = 1
 _SHAPE = {
@@ -71,10 +78,9 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
             cannot be edited, the target is not usable, or the written file differs from pi.
     """
     source, goal = Path(model.tree.path), Path(target)
-    _check_parameters(model, pi)
+    written = link_parameters(model, pi)
     _check_target(source, goal)
     original, places = source.read_bytes(), link_places(model)
-    written = _link_parameters(model, pi)
     document = xml_splice.parse(original, source.name)
     edits = _inertial_edits(document, written, places) + _angle_edits(document, model)
     if dynamics:
@@ -233,8 +239,21 @@ def _check_target(source: Path, target: Path) -> None:
         raise ModelError(f"the target {str(target)!r} is the original URDF; choose another name")
 
 
-def _link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
-    """Return the ten parameters of each link to write, after refusing impossible values."""
+def link_parameters(model: RobotModel, pi: Array) -> dict[str, Array]:
+    """Return the ten parameters of each link that a joint moves, in its frame, links held apart.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+
+    Returns:
+        Parameters by name of the link, shape (10,).
+
+    Raises:
+        DataError: If pi does not have p finite entries.
+        ModelError: If a link or a drive would be physically impossible.
+    """
+    _check_parameters(model, pi)
     layout = model.layout
     advice = "identify with the 'consistent' estimator, which keeps bodies and drives possible"
     own = pi[: layout.n_inertial] - held_parameters(model)
@@ -282,28 +301,28 @@ def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
     return edits
 
 
-def _inertial(values: Array) -> list[str]:
+def _inertial(parameters: Array) -> list[str]:
     """Return an ``<inertial>`` about the centre of mass, line by line."""
-    m, first = values[0], values[1:4]
-    c = first / m
-    ixx, ixy, iyy, ixz, iyz, izz = values[4:]
-    about_origin = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-    about_com = about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))  # (3, 3), Steiner
-    axes = "xyz"
-    moments = [
-        f'i{axes[i]}{axes[j]}="{_text(about_com[i, j])}"' for i in range(3) for j in range(i, 3)
-    ]
+    body = central_inertial(parameters)
+    moments = " ".join(
+        f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, body.inertia, strict=True)
+    )
     return [
         "<inertial>",
-        f'<origin xyz="{" ".join(map(_text, c))}" rpy="0 0 0"/>',
-        f'<mass value="{_text(m)}"/>',
-        f"<inertia {' '.join(moments)}/>",
+        f'<origin xyz="{numbers_text(body.com)}" rpy="0 0 0"/>',
+        f'<mass value="{numbers_text([body.mass])}"/>',
+        f"<inertia {moments}/>",
         "</inertial>",
     ]
 
 
-def _text(value: float) -> str:
-    return repr(float(value) + 0.0)  # no "-0.0"
+def numbers_text(values: Iterable[float]) -> str:
+    """Return numbers as an attribute of an XML file has them, to the last bit.
+
+    Args:
+        values: The numbers.
+    """
+    return " ".join(repr(float(value) + 0.0) for value in values)  # no "-0.0"
 
 
 def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
@@ -315,7 +334,7 @@ def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Ed
         if name not in model.joints:
             continue
         names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
-        new = {names[key]: _text(values[key]) for key in names if key in values}
+        new = {names[key]: numbers_text([values[key]]) for key in names if key in values}
         if new and found:
             edits += xml_splice.set_attributes(document, found[0], new)
         elif new:

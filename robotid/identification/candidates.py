@@ -54,6 +54,7 @@ class Candidate:
             the motion given, so that all rows are to be asked for at once.
         meaning: What it is, in words of a finding.
         advice: What the user can do, with {joint} for the joint; empty if nothing.
+        family: Friction of a job that has it, see ``FAMILIES``; empty if none has.
         units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
             is the torque of the term, root mean square.
         turns: Whether only a joint that turns has it.
@@ -69,6 +70,7 @@ class Candidate:
     advice: str = ""
     units: tuple[str, str] | None = None
     turns: bool = False
+    family: str = ""
     coupled: str = ""
     is_imitated: bool = False
 
@@ -126,38 +128,46 @@ CANDIDATES = (
         "stribeck", "friction_shape", _stribeck,
         f"{_FRICTION} but rises towards standstill (Stribeck)",
         "Raise min_velocity to leave the slow rows out",
+        family="stribeck",
     ),
     Candidate(
         "presliding", "friction_shape", _presliding,
         f"{_FRICTION} but sets in with speed, or a drive that sticks",
         "Set friction_band, or raise min_velocity to leave the slow rows out",
         is_imitated=True,
+        family="tanh",
     ),
     Candidate(
         "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
         f"{_FRICTION} but bends with speed, as |v|^(1/3) does",
+        family="power",
     ),
     Candidate(
         "cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
         f"{_FRICTION} but bends with speed, as v^3 does",
+        family="cubic",
     ),
     Candidate(
         "load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
         "friction that grows with the load",
         units=("N m per N m of load", "N per N of load"),
+        family="load",
     ),
     Candidate(
         "periodic", "position_periodic", _periodic,
         "a torque that repeats with the joint's position (cogging, an eccentric gear)",
         turns=True,
+        family="harmonics4",
     ),
     Candidate(
         "linear spring", "spring", lambda m: m.q[:, None], "a spring on the joint",
         units=("N m/rad", "N/m"),
+        family="spring",
     ),
     Candidate(
         "counterbalance", "spring", lambda m: _periodic(m, 2),
         "a spring or counterbalance that follows the joint's position", turns=True,
+        family="harmonics2",
     ),
     Candidate(
         "windup", "backlash", _windup,

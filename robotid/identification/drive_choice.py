@@ -9,9 +9,9 @@ linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import stdtr
@@ -101,6 +101,15 @@ class DriveChoice:
     shapes: tuple[FoundShape, ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was tried, taken and found, as plain values."""
+        return {
+            "families": list(self.families),
+            "shapes": [asdict(shape) for shape in self.shapes],
+            "seen": {key: list(pair) for key, pair in self.seen.items()},
+            "tried": [{**asdict(step), "families": list(step.families)} for step in self.tried],
+        }
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes larger by a share.

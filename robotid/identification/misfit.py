@@ -574,6 +574,9 @@ def _finding(misfit: Misfit, on_misfit: Sequence[str]) -> Finding:
     stands = f"; {listed(wide)} stand on this misfit, and their intervals count it" if wide else ""
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
     done = term.advice.format(joint=misfit.joint)
+    if term.family:
+        added = f"state {misfit.joint} = [{term.family!r}] in [drives] to add it to the model"
+        done = f"{done}, or {added}" if done else f"{added[0].upper()}{added[1:]}"
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
         f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"

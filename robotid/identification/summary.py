@@ -46,6 +46,7 @@ def identification_text(found: Identification) -> str:
     lines = [identification_line(found)[1:-1], *verdict_lines(found.verdict.to_dict())[1:]]
     for caption, ours, wls in _tables(found):
         lines += [caption, *error_lines(ours.to_dict(), wls.to_dict())]
+    lines += friction_lines({drive.joint: drive.to_dict() for drive in found.drives})
     if found.report:
         lines.append(f"report: {found.report}")
     return "\n".join(lines)
@@ -76,6 +77,24 @@ def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None
             f"  {cell(driven, 15)}{flag}"
         )
     return lines
+
+
+def friction_lines(friction: Mapping[str, Any]) -> list[str]:
+    """Return what friction joints have beside viscous and Coulomb's, and what it gained, as text.
+
+    Args:
+        friction: By joint, as in result.json.
+    """
+    lines = []
+    for joint, found in friction.items():
+        if found["families"]:
+            before, after = (
+                step["held_out_error_pct"]
+                for step in (found["tried"][0], [s for s in found["tried"] if s["is_taken"]][-1])
+            )
+            gain = f"held-out error {before:.1f} -> {after:.1f} %"
+            lines.append(f"  {joint}: {' + '.join(found['families'])} ({gain})")
+    return ["friction beside viscous and Coulomb's:", *lines] if lines else []
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:

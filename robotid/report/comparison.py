@@ -11,6 +11,7 @@ from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.findings import listed
+from robotid.robot.drives import TERMS
 
 __all__ = ["compare_results", "write_comparison"]
 
@@ -98,7 +99,11 @@ def _require_same_mapping(
 ) -> None:
     """Refuse results whose base parameters stand for other things."""
     ours, theirs = (
-        {entry["name"]: entry["expression"] for entry in result["base_parameters"]}
+        {
+            entry["name"]: entry["expression"]
+            for entry in result["base_parameters"]
+            if not _is_chosen(entry["name"], result)
+        }
         for result in (one, other)
     )
     what = "compare results of one URDF, with the same joints and drive terms"
@@ -118,6 +123,12 @@ def _require_same_mapping(
             f"{len(changed)} base parameters stand for other sums in {first} and {second}: "
             f"{listed(changed, 5)}; {name} is {ours[name]} and {theirs[name]}; {what}"
         )
+
+
+def _is_chosen(name: str, result: Mapping[str, Any]) -> bool:
+    """Return whether a parameter is one of friction that only some results may have found."""
+    drives = {entry["name"] for entry in result["drive_parameters"]}
+    return name in drives and name.rpartition(".")[2] not in TERMS
 
 
 def _recordings(result: Mapping[str, Any], role: str) -> tuple[tuple[Any, ...], ...]:
@@ -182,23 +193,27 @@ def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return values beside each other, with (b_k - b_1) / sqrt(s_k^2 + s_1^2)."""
+    """Return values beside each other, with (b_k - b_1) / sqrt(s_k^2 + s_1^2); None for none."""
     each = [{e["name"]: e for e in result["base_parameters"]} for result in results]
-    return [
-        {
-            "name": name,
-            "unit": first["unit"],
-            "expression": first["expression"],
-            "values": [by_name[name]["value"] for by_name in each],
-            "std_errors": [by_name[name]["std_error"] for by_name in each],
-            "differences": [_difference(first, by_name[name]) for by_name in each[1:]],
-        }
-        for name, first in each[0].items()
-    ]
+    stated = {name: entry for by_name in reversed(each) for name, entry in by_name.items()}
+    rows = []
+    for name in dict.fromkeys(name for by_name in each for name in by_name):
+        own = [by_name.get(name, {}) for by_name in each]
+        rows.append(
+            {
+                "name": name,
+                "unit": stated[name]["unit"],
+                "expression": stated[name]["expression"],
+                "values": [entry.get("value") for entry in own],
+                "std_errors": [entry.get("std_error") for entry in own],
+                "differences": [_difference(own[0], entry) for entry in own[1:]],
+            }
+        )
+    return rows
 
 
 def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | None:
-    if one["std_error"] is None or other["std_error"] is None:
+    if one.get("std_error") is None or other.get("std_error") is None:
         return None
     combined = math.hypot(one["std_error"], other["std_error"])
     ratio = (other["value"] - one["value"]) / combined if combined > 0 else math.inf

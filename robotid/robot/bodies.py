@@ -10,10 +10,22 @@ from robotid._typing import Array
 from robotid.exceptions import ModelError
 from robotid.findings import listed
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia_basis
+from robotid.robot.parameters import (
+    inertial_from_pseudo_inertia,
+    pseudo_inertia,
+    pseudo_inertia_basis,
+)
 from robotid.robot.tree import Inertial
 
-__all__ = ["LinkPlace", "held_parameters", "link_places", "link_transfer"]
+__all__ = [
+    "LinkPlace",
+    "central_inertial",
+    "held_parameters",
+    "inertial_parameters",
+    "link_places",
+    "link_transfer",
+    "principal_moments",
+]
 
 
 @dataclass(frozen=True)
@@ -57,7 +69,7 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
         inertial = model.tree.inertials.get(link)
         parameters = np.zeros(10)
         if inertial is not None:
-            parameters = transfer @ _inertial_parameters(inertial)
+            parameters = transfer @ inertial_parameters(inertial)
         places.append(LinkPlace(link, body, role, parameters))
     return tuple(places)
 
@@ -103,8 +115,12 @@ def held_parameters(model: RobotModel) -> Array:
     return held.reshape(-1)
 
 
-def _inertial_parameters(inertial: Inertial) -> Array:
-    """Return the ten inertial parameters of a link about its own frame."""
+def inertial_parameters(inertial: Inertial) -> Array:
+    """Return the ten inertial parameters of a link about its own frame, shape (10,).
+
+    Args:
+        inertial: What its URDF states.
+    """
     ixx, ixy, ixz, iyy, iyz, izz = inertial.inertia
     moments = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     R = pin.rpy.rpyToMatrix(*inertial.rpy)
@@ -112,3 +128,34 @@ def _inertial_parameters(inertial: Inertial) -> Array:
     about_origin = R @ moments @ R.T + m * (c @ c * np.eye(3) - np.outer(c, c))
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_origin.tolist()
     return np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
+
+
+def central_inertial(parameters: Array) -> Inertial:
+    """Return the mass, centre and inertia about it of ten parameters about the link's own frame.
+
+    Args:
+        parameters: Inertial parameters of a body with mass, shape (10,).
+    """
+    m, c = float(parameters[0]), parameters[1:4] / parameters[0]
+    xx, xy, yy, xz, yz, zz = parameters[4:]
+    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    I = about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))  # (3, 3), Steiner  # noqa: E741
+    moments = tuple(I[np.triu_indices(3)].tolist())  # ixx ixy ixz iyy iyz izz
+    return Inertial(m, tuple(c.tolist()), (0.0, 0.0, 0.0), moments)
+
+
+def principal_moments(parameters: Array) -> tuple[Array, Array]:
+    """Return the second moments of mass about the centre along the principal axes, and the axes.
+
+    The body is possible if none is negative. The moments of inertia are their sums by pairs.
+
+    Args:
+        parameters: Inertial parameters of a body with mass, shape (10,).
+
+    Returns:
+        Moments, shape (3,), ascending [kg m^2]; axes, right-handed, in columns, shape (3, 3).
+    """
+    H = np.column_stack([np.eye(3), -parameters[1:4] / parameters[0]])  # to the centre
+    moments, axes = np.linalg.eigh(H @ pseudo_inertia(parameters)[0] @ H.T)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return moments, axes

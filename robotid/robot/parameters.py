@@ -108,6 +108,11 @@ class ParameterLayout:
         """Drive terms of a coupling: those of a joint without the offset."""
         return tuple(term for term in self.terms if TERMS[term].is_shared)
 
+    @property
+    def n_own(self) -> int:
+        """Number of drive parameters of the joints' own drives, which come before the others."""
+        return sum(d < len(self.joints) for d, _ in self.drive_parameters)
+
     @cached_property
     def drives(self) -> tuple[Coupling, ...]:
         """The drives: one per joint, which turns with it alone, then the couplings."""

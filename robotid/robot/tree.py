@@ -18,13 +18,14 @@ from robotid.exceptions import ModelError
 from robotid.findings import listed
 from robotid.robot.urdf_text import parse_urdf, read_numbers, write_exact_angles
 
-__all__ = ["MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
+__all__ = ["MOMENTS", "MOVABLE", "Inertial", "Joint", "Tree", "read_tree"]
 
 #: The types of joint that have a degree of freedom.
 MOVABLE = ("revolute", "continuous", "prismatic")
 _ENDLESS = 200.0  # [rad or m] a stated range this wide is none: no cable winds 30 turns
 _ZERO = (0.0, 0.0, 0.0)
-_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+#: Attributes of an ``<inertia>``, in the order of ``Inertial.inertia``.
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _LIGHTEST = 1e-15  # [kg] of a link that has a mass: what is divided by it stays finite
 _DEEPEST = 500  # joints from the root to a link; Pinocchio goes down them by recursion
 _TAKEN = ("universe", "root_joint")  # Pinocchio's names of the world and of a floating base
@@ -290,7 +291,7 @@ def _inertial(inertial: ET.Element, at: str) -> Inertial:
         raise ModelError(f"{at} mass is {value:g} kg, wanted more than 0; correct the sign")
     if 0 < value < _LIGHTEST:
         raise ModelError(f"{at} mass is {value:g} kg, wanted 0 or at least {_LIGHTEST:g}")
-    moments = tuple(read_numbers(inertia, key, at)[0] for key in _MOMENTS)
+    moments = tuple(read_numbers(inertia, key, at)[0] for key in MOMENTS)
     return Inertial(value, com, rpy, moments)
 
 
@@ -302,7 +303,7 @@ def _add_inertial(link: ET.Element, inertial: Inertial) -> None:
     element = ET.SubElement(link, "inertial")
     ET.SubElement(element, "origin", xyz=_text(inertial.com), rpy=_text(inertial.rpy))
     ET.SubElement(element, "mass", value=repr(inertial.mass))
-    moments = dict(zip(_MOMENTS, map(repr, inertial.inertia), strict=True))
+    moments = dict(zip(MOMENTS, map(repr, inertial.inertia), strict=True))
     ET.SubElement(element, "inertia", moments)
 
 

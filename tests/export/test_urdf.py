@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.robots import motion
+from helpers.robots import motion, possible_parameters
 
 from robotid.doctor.urdf import inspect_urdf
 from robotid.estimators import OLS
@@ -19,7 +19,7 @@ from robotid.regressor.torque import build_problem, random_regressor
 from robotid.robot.bodies import link_places
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.robot.parameters import Coupling, pseudo_inertia
 from robotid.robot.tree import read_tree
 from robotid.robot.urdf_text import read_with_yourdfpy
 
@@ -74,22 +74,6 @@ def source(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_bytes(RICH.encode())
     return path
-
-
-def possible_parameters(model, rng):
-    """Return parameters near the URDF's, every link possible, drives between 0.1 and 1."""
-    held = np.zeros((len(model.layout.bodies), 10))
-    for place in link_places(model):
-        if place.body >= 0 and place.role == "held":
-            held[place.body] += place.parameters
-    pi = model.standard_parameters()
-    inertial = pi[: model.layout.n_inertial].reshape(-1, 10)
-    for body, values in enumerate(inertial):
-        w, V = np.linalg.eigh(pseudo_inertia(values - held[body])[0])
-        w = np.maximum(w, 1e-3) * rng.uniform(0.8, 1.2, 4)
-        inertial[body] = inertial_from_pseudo_inertia(V @ np.diag(w) @ V.T) + held[body]
-    pi[model.layout.n_inertial :] = rng.uniform(0.1, 1, len(pi) - model.layout.n_inertial)
-    return pi
 
 
 def assert_same_torque(model, pi, loaded, read_back):
@@ -352,7 +336,7 @@ def test_a_failure_while_writing_leaves_the_folder_as_it_was(source, tmp_path, r
     write_urdf(model, pi, tmp_path / "new.urdf")
     before = listing(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(urdf, "_text", lambda value: f"{value:.4g}")  # loses digits
+        patch.setattr(urdf, "numbers_text", lambda x: " ".join(f"{v:.4g}" for v in x))
         with pytest.raises(
             ModelError, match=r"new.urdf was not written: read back, it gives anoth"
         ):

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from robotid.logs.data import Trajectory
-from robotid.robot.parameters import Coupling
+from robotid.robot.bodies import held_parameters
+from robotid.robot.parameters import Coupling, inertial_from_pseudo_inertia, pseudo_inertia
 
 WRIST = Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -0.5)))
 ROBOTS = {
@@ -38,3 +39,16 @@ def motion(model, rng, samples, reach=3.0, direction=None):
         pose = np.array([pin.SE3ToXYZQUAT(pin.SE3.Random()) for _ in range(samples)])
         return SimpleNamespace(q=np.hstack([pose, q]), **values)
     return Trajectory(q=q, rate=100.0, segment=np.zeros(samples, dtype=int), **values)
+
+
+def possible_parameters(model, rng):
+    """Return parameters near the URDF's, every link possible, drives between 0.1 and 1."""
+    held = held_parameters(model).reshape(-1, 10)
+    pi = model.standard_parameters()
+    inertial = pi[: model.layout.n_inertial].reshape(-1, 10)
+    for body, values in enumerate(inertial):
+        w, V = np.linalg.eigh(pseudo_inertia(values - held[body])[0])
+        w = np.maximum(w, 1e-3) * rng.uniform(0.8, 1.2, 4)
+        inertial[body] = inertial_from_pseudo_inertia(V @ np.diag(w) @ V.T) + held[body]
+    pi[model.layout.n_inertial :] = rng.uniform(0.1, 1, len(pi) - model.layout.n_inertial)
+    return pi

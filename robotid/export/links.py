@@ -1,0 +1,225 @@
+"""An identified robot as simulators want it: where its links sit, how they move and look."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robotid._files import write_text
+from robotid._typing import Array
+from robotid.exceptions import ModelError
+from robotid.export.urdf import link_parameters
+from robotid.findings import listed
+from robotid.robot.bodies import inertial_parameters, link_places
+from robotid.robot.meshes import Shape, find_mesh, read_shapes
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
+from robotid.robot.tree import Joint
+from robotid.versions import __version__
+
+__all__ = ["WORLD", "Format", "SimulatedLink", "unstated_terms", "write_model"]
+
+#: What simulators call the frame that does not move.
+WORLD = "world"
+_NAMED = 6  # meshes left out
+_ROUNDING = 1e-12  # of the largest eigenvalue of a pseudo-inertia: a smaller one below 0 is 0
+
+
+@dataclass(frozen=True)
+class Format:
+    """What a simulator's format can state.
+
+    Attributes:
+        name: Its name.
+        terms: The drive terms of a joint that it states.
+        has_couplings: Whether it states them of drives that turn with several joints, too.
+        is_readable: Whether the simulator reads a mesh.
+    """
+
+    name: str
+    terms: Collection[str]
+    has_couplings: bool
+    is_readable: Callable[[Path], bool]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedLink:
+    """One link. Poses are x y z [m] and a quaternion x y z w, shape (7,).
+
+    Attributes:
+        name: Its name.
+        parent: Link that it hangs on, or "world".
+        pose: Its pose in the parent's frame, joints at 0 but for locked ones.
+        joint: The joint that it hangs on; None if it is the root.
+        moves: Whether that joint moves it; if not, it is fixed or locked.
+        leader: Joint that this one follows, ratio, offset; None if it leads itself.
+        floats: Whether it is the floating base.
+        inertial: Its inertial parameters, shape (10,); None if it has none of its own, as where
+            those of the link that it is fixed to hold it.
+        shapes: What it looks like, "visual", and touches with, "collision": shape, pose in the
+            link's frame, path of the mesh.
+    """
+
+    name: str
+    parent: str
+    pose: Array
+    joint: Joint | None
+    moves: bool
+    leader: tuple[str, float, float] | None
+    floats: bool
+    inertial: Array | None
+    shapes: Sequence[tuple[str, Shape, Array, Path | None]]
+
+
+def write_model(
+    model: RobotModel,
+    pi: Array,
+    target: str | Path,
+    original: str | Path | None,
+    to: Format,
+    build: Callable[[Sequence[SimulatedLink], dict[str, float]], ET.Element],
+    notes: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Write a robot in the format of a simulator.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        target: The file to write.
+        original: A URDF beside which meshes are looked for, the model's own aside.
+        to: The format.
+        build: Returns the file's content of links, parents first, and parameters by name.
+        notes: What else is to be said of it.
+
+    Returns:
+        What the file does not state, a sentence each; its head has them, too.
+
+    Raises:
+        DataError: If pi does not have p finite entries, or the folder does not exist.
+        ModelError: If a link or a drive would be physically impossible, or has the world's name.
+        SettingsError: If the target is a folder.
+    """
+    inertials, meshes = _inertials(model, pi), set[str]()
+    shapes = _shapes(model, to, [*([original] if original else []), model.tree.path], meshes)
+    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    top = build(_links(model, inertials, shapes), values)
+    unstated = unstated_terms(model, pi, to.name, to.terms, has_couplings=to.has_couplings)
+    names = listed(sorted(Path(mesh).name for mesh in meshes), _NAMED)
+    left_out = f"meshes left out, not found or of a kind that {to.name} has not: {names}"
+    said = (*unstated, *([left_out] if meshes else []), *notes)
+    head = f"{model.name}, identified from {Path(model.tree.path).name}; robotid {__version__}"
+    comment = "\n    ".join([head, *said])
+    while "--" in comment:  # which would end it
+        comment = comment.replace("--", "- -")
+    top.insert(0, ET.Comment(f" {comment} "))
+    ET.indent(top)
+    write_text(ET.tostring(top, encoding="unicode") + "\n", target)
+    return said
+
+
+def unstated_terms(
+    model: RobotModel, pi: Array, name: str, terms: Collection[str], *, has_couplings: bool = False
+) -> list[str]:
+    """Return a sentence on the drive parameters that a format has no place for, if any.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        name: The format.
+        terms: The drive terms that it states.
+        has_couplings: Whether it states drives that turn with several joints.
+    """
+    layout = model.layout
+    drives = zip(layout.drive_parameters, layout.drive_names, pi[layout.n_inertial :], strict=True)
+    missing = [
+        drive
+        for (d, term), drive, value in drives
+        if value != 0.0 and not (term.name in terms and (has_couplings or d < len(layout.joints)))
+    ]
+    sentence = f"{name} has no place for {listed(missing)}; the sidecar of the URDF has them"
+    return [sentence] if missing else []
+
+
+def _links(
+    model: RobotModel,
+    inertials: dict[str, Array],
+    shapes: dict[str, list[tuple[str, Shape, Array, Path | None]]],
+) -> list[SimulatedLink]:
+    """Return the links, parents first; a root link named "world" is the world itself."""
+    arriving = {joint.child: joint for joint in model.tree.joints}
+    if WORLD in arriving or (model.free_flyer and model.tree.root == WORLD):
+        raise ModelError(
+            f"a link that moves is named {WORLD!r}, the name of what does not move; rename it"
+        )
+    links, names = [], [model.tree.root]
+    for name in names:  # which grows by the children of each
+        names += [joint.child for joint in model.tree.joints if joint.parent == name]
+        if name == WORLD:
+            continue
+        joint, parent, pose = arriving.get(name), WORLD, np.eye(7)[6]
+        if joint is not None:
+            parent, pose = joint.parent, _pose(joint, model.locked.get(joint.name, 0.0))
+        moves = joint is not None and joint.is_movable and joint.name not in model.locked
+        follows = joint is not None and moves and joint.name not in model.joints
+        leader = _leader(model, joint) if joint is not None and follows else None
+        floats = model.free_flyer and name == model.tree.root
+        own = inertials.get(name), shapes.get(name, [])
+        links.append(SimulatedLink(name, parent, pose, joint, moves, leader, floats, *own))
+    return links
+
+
+def _leader(model: RobotModel, joint: Joint) -> tuple[str, float, float]:
+    """Return the joint that another one follows, the ratio and the offset."""
+    row = model.pin_model.joints[model.pin_model.getJointId(joint.name)].idx_v
+    ratios = model.velocity_map[row, -len(model.joints) :]
+    leader = int(np.abs(ratios).argmax())
+    return model.joints[leader], float(ratios[leader]), float(model.position_offset[row])
+
+
+def _pose(joint: Joint, position: float) -> Array:
+    """Return the pose of a joint's child in its parent."""
+    R, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
+    way = position * axis / np.linalg.norm(axis)
+    if joint.type == "prismatic":
+        return np.append(joint.xyz + R.apply(way), R.as_quat())
+    return np.append(joint.xyz, (R * Rotation.from_rotvec(way)).as_quat())
+
+
+def _inertials(model: RobotModel, pi: Array) -> dict[str, Array]:
+    """Return the parameters, shape (10,), of the links that have an inertial of their own."""
+    found = link_parameters(model, pi)
+    for place in link_places(model):
+        stated = model.tree.inertials.get(place.link)
+        if place.link in found or place.is_lumped or stated is None:
+            continue
+        values = inertial_parameters(stated)
+        eigenvalues = np.linalg.eigvalsh(pseudo_inertia(values)[0])
+        if eigenvalues[0] >= -_ROUNDING * abs(eigenvalues[-1]) and values[0] > 0:
+            found[place.link] = values
+        elif place.body >= 0 and values.any():  # one that is fixed to the world changes nothing
+            raise ModelError(
+                f"link {place.link!r}, behind a locked joint, has an impossible inertial, which no "
+                "simulator reads; correct it in the URDF, and identify again"
+            )
+    return found
+
+
+def _shapes(
+    model: RobotModel, to: Format, urdfs: Sequence[str | Path], left_out: set[str]
+) -> dict[str, list[tuple[str, Shape, Array, Path | None]]]:
+    """Return the shapes of each link, and put what the URDF calls meshes left out into a set."""
+    found: dict[str, list[tuple[str, Shape, Array, Path | None]]] = {}
+    for tag in ("visual", "collision"):
+        for shape in read_shapes(model.tree.robot, tag):
+            places = (find_mesh(shape.file, urdf) for urdf in urdfs if shape.file)
+            path = next((place.resolve() for place in places if place is not None), None)
+            if shape.file and (path is None or not to.is_readable(path)):
+                left_out.add(shape.file)
+            elif shape.kind:
+                H = shape.placement
+                pose = np.append(H[:3, 3], Rotation.from_matrix(H[:3, :3]).as_quat())
+                found.setdefault(shape.link, []).append((tag, shape, pose, path))
+    return found

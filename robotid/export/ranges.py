@@ -1,0 +1,176 @@
+"""Ranges for domain randomisation: what a simulator may draw each parameter from, and why.
+
+A body is drawn as its mass, its centre, and its second moments of mass about the centre along
+fixed axes: any of them above 0 make a possible body, so each may be drawn by itself.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robotid._files import write_text
+from robotid._typing import Array
+from robotid.export.urdf import link_parameters
+from robotid.identification.bands import REACH
+from robotid.identification.pipeline import Identification
+from robotid.robot.bodies import principal_moments
+from robotid.robot.parameters import pseudo_inertia_basis
+from robotid.versions import __version__
+
+__all__ = ["parameter_ranges", "ranges_text", "write_ranges"]
+
+_HEAD = """\
+Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
+
+nominal is the identified value, low to high its 95 % interval, cut to what is possible. Low ends of
+what must be more than 0 are those of its logarithm. source says what the interval rests on:
+  data   the motion;
+  prior  the motion says nothing, and it is how wrong the URDF may plausibly be;
+  mixed  both, or in sums with others;
+  bound  physics holds the value where it is; a drive at 0 has no known interval: no low, no high.
+
+second_moments are the integrals of x^2, y^2, z^2 dm about the centre of mass along the principal
+axes, whose quaternion w x y z turns them into the link's. The principal moments of inertia are
+  Ixx = y + z,  Iyy = z + x,  Izz = x + y
+of them, which is possible for any draw; draws of principal_moments themselves need not be.
+
+Values drawn one by one change the torque more than the data allow, since it is sums of parameters
+that the motion determines. undetermined names the sums that it leaves open. Drive parameters are
+those of the joint, gear included.
+"""
+
+
+def parameter_ranges(found: Identification) -> dict[str, Any]:
+    """Return the ranges of the parameters of links and drives, plain values only.
+
+    The intervals of centre and moments are to first order in those of the parameters.
+
+    Args:
+        found: What was identified.
+
+    Returns:
+        {"robot", "confidence", "bodies": {link: {"mass", "com", "principal_axes",
+        "second_moments", "principal_moments"}}, "drives": {drive: {term: ...}}, "undetermined"};
+        each figure as {"nominal", "low", "high", "source"}.
+
+    Raises:
+        ModelError: If a link or a drive would be physically impossible.
+    """
+    layout, sources = found.model.layout, found.sources
+    own, errors, bodies = link_parameters(found.model, found.standard), found.standard_error, {}
+    for i, body in enumerate(layout.bodies):
+        part = slice(10 * i, 10 * i + 10)
+        covariance = found.standard_covariance[part, part]
+        bodies[body] = _body(own[body], covariance, sources[part])
+    drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
+    for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+        name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
+        source = "bound" if found.at_bound[k] else sources[k]
+        drives[name][layout.names[k].removeprefix(f"{name}.")] = _range(
+            found.standard[k], errors[k], source, least=least
+        ) | {"unit": layout.units[k]}
+    return {
+        "robot": found.model.name,
+        "confidence": 0.95,
+        "bodies": bodies,
+        "drives": drives,
+        "undetermined": list(found.determination.undetermined),
+    }
+
+
+def write_ranges(found: Identification, target: str | Path) -> None:
+    """Write the ranges of what was identified as YAML.
+
+    Args:
+        found: What was identified.
+        target: The file to write.
+
+    Raises:
+        DataError: If its folder does not exist.
+        ModelError: If a link or a drive would be physically impossible.
+        SettingsError: If the target is a folder.
+    """
+    write_text(ranges_text(parameter_ranges(found)), target)
+
+
+def ranges_text(ranges: Mapping[str, Any]) -> str:
+    """Return ranges as YAML, with a head that says what they are.
+
+    Args:
+        ranges: As ``parameter_ranges`` returns them, and result.json has them.
+    """
+    head = _HEAD.format(robot=json.dumps(ranges["robot"]), version=__version__)
+    lines = [f"# {line}".rstrip() for line in head.splitlines()]
+    return "\n".join([*lines, *_yaml(ranges, "")]) + "\n"
+
+
+def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any]:
+    """Return the ranges of a link of ten parameters, shape (10,), with covariance (10, 10)."""
+    m, c = pi[0], pi[1:4] / pi[0]
+    moments, V = principal_moments(pi)
+    # moments = diag(P J P^T) with J linear in pi; what c changes of it is of second order
+    P = V.T @ np.column_stack([np.eye(3), -c])  # (3, 4)
+    d_moments = np.einsum("ka,iab,kb->ki", P, pseudo_inertia_basis(), P)
+    d_com = (np.eye(10)[1:4] - np.outer(c, np.eye(10)[0])) / m
+    d_inertia = d_moments.sum(axis=0) - d_moments
+    values = np.array([m, *c, *moments, *(moments.sum() - moments)])  # (10,)
+    D = np.vstack([np.eye(10)[:1], d_com, d_moments, d_inertia])  # (10, 10), d values / d pi
+    errors = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, covariance, D), 0.0))
+    origins = [sources[0], *(_joint_source([sources[0], sources[k]]) for k in (1, 2, 3))]
+    origins += [_joint_source(sources)] * 6
+    x, y, z, w = Rotation.from_matrix(V).as_quat()
+    mass, *rest = (
+        _range(value, error, origin, is_positive=not 1 <= k <= 3)
+        for k, (value, error, origin) in enumerate(zip(values, errors, origins, strict=True))
+    )
+    return {
+        "mass": mass,
+        "com": dict(zip("xyz", rest[:3], strict=True)),
+        "principal_axes": [float(x) for x in (w, x, y, z)],
+        "second_moments": dict(zip("xyz", rest[3:6], strict=True)),
+        "principal_moments": dict(zip(("Ixx", "Iyy", "Izz"), rest[6:], strict=True)),
+    }
+
+
+def _joint_source(sources: Sequence[str]) -> str:
+    """Return what a figure of several parameters rests on."""
+    return sources[0] if len(set(sources)) == 1 else "mixed"
+
+
+def _range(
+    value: float, error: float, source: str, *, is_positive: bool = False, least: float = -math.inf
+) -> dict[str, Any]:
+    """Return the range of a figure; without ends if its standard error is not known."""
+    nominal, half = float(value), REACH * float(error)
+    if not math.isfinite(half):
+        return {"nominal": nominal, "source": source}
+    low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)
+    return {"nominal": nominal, "low": low, "high": nominal + half, "source": source}
+
+
+def _yaml(value: Mapping[str, Any], indent: str) -> Iterator[str]:
+    """Yield the lines of a table: one for each that holds no other table."""
+    for key, entry in value.items():
+        name = f"{indent}{json.dumps(key, ensure_ascii=False)}:"
+        if isinstance(entry, Mapping) and any(isinstance(x, Mapping) for x in entry.values()):
+            yield name
+            yield from _yaml(entry, indent + "  ")
+        else:
+            yield f"{name} {_flow(entry)}"
+
+
+def _flow(entry: Any) -> str:  # noqa: ANN401
+    """Return a figure, a name, a list or a table in one line."""
+    if isinstance(entry, Mapping):
+        return "{" + ", ".join(f"{key}: {_flow(x)}" for key, x in entry.items()) + "}"
+    if isinstance(entry, list):
+        return "[" + ", ".join(map(_flow, entry)) + "]"
+    if isinstance(entry, float):  # YAML 1.1 reads 1e-05 as text, and 1.0e-05 as a number
+        mantissa, e, exponent = f"{entry:.6g}".partition("e")
+        return mantissa + (".0" if e and "." not in mantissa else "") + e + exponent
+    return json.dumps(entry, ensure_ascii=False)

@@ -1,0 +1,151 @@
+"""Write an identified robot as SDF 1.9, which Gazebo and Drake read."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.export.links import WORLD, Format, SimulatedLink, write_model
+from robotid.export.urdf import numbers_text
+from robotid.robot.bodies import central_inertial
+from robotid.robot.meshes import Shape
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import MOMENTS, Joint
+
+__all__ = ["write_sdf"]
+
+_VERSION, _VERSION_OF_MIMIC = "1.9", "1.11"
+#: Element of a joint's ``<dynamics>`` that states a term of its drive.
+_DYNAMICS = {"viscous": "damping", "coulomb": "friction"}
+_ROTOR = "armature"  # stated by an element of Drake's own
+_MESHES = (".dae", ".stl", ".obj", ".glb", ".gltf")
+_SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
+
+
+def write_sdf(
+    model: RobotModel, pi: Array, target: str | Path, *, original: str | Path | None = None
+) -> tuple[str, ...]:
+    """Write standard parameters as an SDF file of one model.
+
+    A link that a joint moves has the inertial of all that are fixed to it, which are frames; links
+    behind locked joints keep their own. Viscous and Coulomb friction are the joint's damping and
+    friction; the armature is Drake's rotor inertia, which Gazebo has no place for.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        target: The file to write.
+        original: The URDF that the model's was made of, beside which meshes are looked for, too.
+
+    Returns:
+        What the file does not state, a sentence each; its head has them, too.
+
+    Raises:
+        DataError: If pi does not have p finite entries, or the folder does not exist.
+        ModelError: If a link or a drive would be physically impossible.
+        SettingsError: If the target is a folder.
+    """
+    gravity = numbers_text(model.pin_model.gravity.linear)
+    notes = [
+        "Drake reads armature (drake:rotor_inertia), not friction; Gazebo the reverse",
+        f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with",
+    ]
+    to = Format("SDF", (*_DYNAMICS, _ROTOR), False, lambda mesh: mesh.suffix.lower() in _MESHES)
+    return write_model(model, pi, target, original, to, partial(_sdf, model.name), notes)
+
+
+def _sdf(name: str, links: Sequence[SimulatedLink], values: Mapping[str, float]) -> ET.Element:
+    version = _VERSION_OF_MIMIC if any(link.leader for link in links) else _VERSION
+    top = ET.Element("sdf", {"version": version, "xmlns:drake": "drake.mit.edu"})
+    robot = ET.SubElement(top, "model", name=name)
+    holders: dict[str, ET.Element] = {}  # the element that shows what a link looks like
+    for link in links:
+        is_frame = not (link.moves or link.floats) and link.inertial is None
+        if is_frame and link.parent in holders:
+            frame = ET.SubElement(robot, "frame", name=link.name, attached_to=link.parent)
+            _add_pose(frame, link.pose, link.parent)
+            holders[link.name] = holders[link.parent]
+        else:
+            holders[link.name] = _add_link(robot, link)
+            if not link.floats:
+                _add_joint(robot, link, values)
+        for number, (tag, shape, pose, mesh) in enumerate(link.shapes):
+            element = ET.SubElement(holders[link.name], tag, name=f"{link.name}_{number}")
+            _add_pose(element, pose, link.name)
+            _add_geometry(element, shape, mesh)
+    return top
+
+
+def _add(parent: ET.Element, tag: str, *values: float) -> ET.Element:
+    element = ET.SubElement(parent, tag)
+    element.text = numbers_text(values)
+    return element
+
+
+def _add_pose(parent: ET.Element, pose: Array, relative_to: str) -> None:
+    element = _add(parent, "pose", *pose)
+    element.set("rotation_format", "quat_xyzw")
+    if relative_to != WORLD:
+        element.set("relative_to", relative_to)
+
+
+def _add_link(robot: ET.Element, link: SimulatedLink) -> ET.Element:
+    element = ET.SubElement(robot, "link", name=link.name)
+    _add_pose(element, link.pose, link.parent)
+    if link.inertial is not None:
+        inertial, stated = ET.SubElement(element, "inertial"), central_inertial(link.inertial)
+        _add(inertial, "pose", *stated.com, 0.0, 0.0, 0.0)
+        _add(inertial, "mass", stated.mass)
+        inertia = ET.SubElement(inertial, "inertia")
+        for tag, moment in zip(MOMENTS, stated.inertia, strict=True):
+            _add(inertia, tag, moment)
+    return element
+
+
+def _add_joint(robot: ET.Element, link: SimulatedLink, values: Mapping[str, float]) -> None:
+    joint = link.joint or Joint(f"{WORLD}_to_{link.name}", "fixed", WORLD, link.name)
+    kind = joint.type if link.moves else "fixed"
+    element = ET.SubElement(robot, "joint", name=joint.name, type=kind)
+    ET.SubElement(element, "parent").text = link.parent
+    ET.SubElement(element, "child").text = link.name
+    if not link.moves:
+        return
+    axis = ET.SubElement(element, "axis")
+    _add(axis, "xyz", *joint.axis)
+    if link.leader is not None:
+        leader, ratio, offset = link.leader
+        mimic = ET.SubElement(axis, "mimic", joint=leader)
+        for tag, value in (("multiplier", ratio), ("offset", offset), ("reference", 0.0)):
+            _add(mimic, tag, value)
+    limit, dynamics = ET.SubElement(axis, "limit"), ET.SubElement(axis, "dynamics")
+    if joint.has_limits:
+        _add(limit, "lower", joint.lower)
+        _add(limit, "upper", joint.upper)
+    for tag, value in (("effort", joint.effort), ("velocity", joint.velocity)):
+        if 0.0 < value < np.inf:
+            _add(limit, tag, value)
+    for term, tag in _DYNAMICS.items():
+        if (drive := values.get(f"{joint.name}.{term}")) is not None:
+            _add(dynamics, tag, drive)
+    if (rotor := values.get(f"{joint.name}.{_ROTOR}")) is not None:
+        _add(element, "drake:rotor_inertia", rotor)
+        _add(element, "drake:gear_ratio", 1.0)
+
+
+def _add_geometry(element: ET.Element, shape: Shape, mesh: Path | None) -> None:
+    geometry = ET.SubElement(ET.SubElement(element, "geometry"), shape.kind)
+    if mesh is not None:
+        ET.SubElement(geometry, "uri").text = mesh.as_uri()
+        _add(geometry, "scale", *shape.size)
+    elif shape.kind == "box":
+        _add(geometry, "size", *shape.size)
+    else:
+        for tag, value in zip(_SIZES[shape.kind], shape.size, strict=True):
+            _add(geometry, tag, value)
+    if element.tag == "visual" and shape.rgba is not None:
+        material = ET.SubElement(element, "material")
+        for tag in ("ambient", "diffuse"):
+            _add(material, tag, *shape.rgba)

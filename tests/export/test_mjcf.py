@@ -1,0 +1,187 @@
+"""What MuJoCo loads moves as what was identified."""
+
+import xml.etree.ElementTree as ET
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.robots import possible_parameters
+from helpers.simulators import SIMULATED, simulated, states
+from scipy.spatial.distance import pdist
+
+from robotid.exceptions import ModelError
+from robotid.export.mjcf import write_mjcf
+from robotid.robot.drives import Cubic, Spring
+from robotid.robot.model import RobotModel
+
+OFF = mujoco.mjtDisableBit
+SMALL = """<robot name="arm--1">
+<link name="base"><visual><geometry><mesh filename="a.stl"/></geometry></visual></link>
+<link name="upper">{inertials[0]}
+  <visual><origin xyz="0 0 .1" rpy="0 0 1"/><geometry><box size=".1 .2 .4"/></geometry></visual>
+  <collision><geometry><cylinder radius=".05" length=".4"/></geometry></collision></link>
+<link name="{last}">{inertials[1]}
+  <collision><geometry><sphere radius=".07"/></geometry></collision>
+  <visual><geometry><mesh filename="b.stl" scale="1 2 3"/></geometry></visual></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 3 4"/>
+  <limit lower="-1" upper="2" effort="7" velocity="1"/></joint>
+<joint name="k" type="continuous"><parent link="upper"/><child link="{last}"/><axis xyz="1 0 0"/>
+  <limit effort="0" velocity="1"/></joint></robot>"""
+INERTIAL = """<inertial><origin xyz=".1 0 0"/><mass value="2"/>
+<inertia ixx=".1" iyy=".1" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>"""
+
+
+def small(folder, last="lower", held=".1", **options):
+    path, inertials = folder / "arm.urdf", [INERTIAL.format(izz=izz) for izz in (".1", held)]
+    path.write_text(SMALL.format(last=last, inertials=inertials))
+    return RobotModel.from_urdf(path, **options)
+
+
+def load(path):
+    model = mujoco.MjModel.from_xml_path(str(path))
+    return model, mujoco.MjData(model)
+
+
+def named(model, joint):
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
+    model, pi = simulated(name)
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    robot.opt.disableflags = OFF.mjDSBL_CONSTRAINT
+    for state in states(model, pi, 5):
+        assert robot.nv == len(state.v)
+        P, turning = np.zeros((robot.nv, robot.nv)), np.zeros(robot.nv)  # v_mujoco = P v
+        if model.free_flyer:  # MuJoCo's base velocity is in the world's axes, its spin in its own
+            R = pin.XYZQUATToSE3(state.q[:7]).rotation
+            P[:3, :3], P[3:6, 3:6] = R, np.eye(3)
+            turning[:3] = R @ np.cross(state.v[3:6], state.v[:3])
+            data.qpos[:7] = state.q[[0, 1, 2, 6, 3, 4, 5]]
+        for joint, column in state.columns.items():
+            P[robot.jnt_dofadr[named(robot, joint)], column] = 1.0
+            data.qpos[robot.jnt_qposadr[named(robot, joint)]] = state.angles[joint]
+        data.qvel, data.qacc = P @ state.v, P @ state.a + turning
+        mujoco.mj_inverse(robot, data)
+        M = np.zeros((robot.nv, robot.nv))
+        for row, unit in zip(M, np.eye(robot.nv), strict=True):
+            mujoco.mj_mulM(robot, data, row, unit)
+        np.testing.assert_allclose(P.T @ M @ P, state.M, atol=1e-9 * abs(state.M).max(), rtol=0)
+        found = P.T @ data.qfrc_inverse
+        np.testing.assert_allclose(found, state.tau, atol=1e-9 * abs(state.tau).max(), rtol=0)
+
+
+def test_inverse_dynamics_on_a_log_are_the_fits(identified, tmp_path):
+    """Friction is a constraint to MuJoCo, sign(v) only where the joint moves."""
+    model, pi = identified.model, identified.standard
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    robot.opt.disableflags = OFF.mjDSBL_LIMIT | OFF.mjDSBL_CONTACT
+    assert robot.nu == len(model.joints)
+    at = [robot.jnt_dofadr[named(robot, joint)] for joint in model.joints]
+    evaluation = identified.validation[0]
+    motion, wanted = evaluation.recording.trajectory, evaluation.torques["estimate"]
+    found = np.empty_like(wanted)
+    for k in range(len(motion.t)):
+        data.qpos[at], data.qvel[at], data.qacc[at] = motion.q[k], motion.v[k], motion.a[k]
+        mujoco.mj_inverse(robot, data)
+        # the control whose force, without the bias, moves the joint so
+        data.ctrl = 0.0
+        mujoco.mj_fwdActuation(robot, data)
+        found[k] = (data.qfrc_inverse - data.qfrc_actuator)[at]
+    moves = np.abs(motion.v) > 0.2  # [rad/s]
+    assert moves.mean() > 0.5
+    values = dict(zip(model.layout.names, pi, strict=True))
+    coulomb, offset = (
+        np.array([values[f"{joint}.{term}"] for joint in model.joints])
+        for term in ("coulomb", "offset")
+    )
+    assert np.abs([coulomb, offset]).min() > 0
+    wanted = wanted + coulomb * (np.sign(motion.v) - motion.direction)  # filtered as the torque is
+    np.testing.assert_allclose(found[moves], wanted[moves], atol=1e-9 * abs(wanted).max(), rtol=0)
+
+
+def test_friction_is_coulombs_at_slow_speeds_too(identified, tmp_path):
+    model, pi = identified.model, identified.standard
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    data.qpos, data.qvel, data.qacc = 0.5, 0.005, 0.0
+    mujoco.mj_inverse(robot, data)
+    coulomb = [pi[model.layout.names.index(f"{joint}.coulomb")] for joint in model.joints]
+    np.testing.assert_allclose(-data.qfrc_constraint, coulomb, rtol=1e-12)
+
+
+def test_limits_shapes_and_meshes(tmp_path):
+    box = b"\0" * 80 + (4).to_bytes(4, "little")
+    corners = np.vstack([np.zeros(3), np.eye(3)]).astype("<f4")
+    for face in ([0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]):
+        box += bytes(12) + corners[face].tobytes() + b"\0\0"
+    (tmp_path / "b.stl").write_bytes(box)
+    (tmp_path / "a.stl").write_text("solid a\nendsolid a\n")  # MuJoCo reads no text
+    model = small(tmp_path)
+    pi = possible_parameters(model, np.random.default_rng(0))
+    pi[model.layout.names.index("k.offset")] = 0.0
+    notes = write_mjcf(model, pi, tmp_path / "robot.xml")
+    assert notes == ("meshes left out, not found or of a kind that MJCF has not: a.stl",)
+    robot, _ = load(tmp_path / "robot.xml")
+    np.testing.assert_array_equal(robot.jnt_range, [[-1, 2], [0, 0]])
+    np.testing.assert_allclose(robot.jnt_axis, [[0, 0.6, 0.8], [1, 0, 0]])
+    np.testing.assert_array_equal(robot.actuator_ctrlrange, [[-7, 7], [0, 0]])
+    np.testing.assert_array_equal(robot.actuator_ctrllimited, [True, False])
+    np.testing.assert_array_equal(robot.actuator_biastype, [1, 0])
+    kinds = mujoco.mjtGeom
+    sizes = {kinds.mjGEOM_BOX: [0.05, 0.1, 0.2], kinds.mjGEOM_CYLINDER: [0.05, 0.2, 0]}
+    sizes[kinds.mjGEOM_SPHERE] = [0.07, 0, 0]
+    for kind, size in sizes.items():
+        (geom,) = np.flatnonzero(robot.geom_type == kind)
+        np.testing.assert_allclose(robot.geom_size[geom], size)
+        assert robot.geom_contype[geom] == (kind != kinds.mjGEOM_BOX)  # which is only seen
+        assert robot.geom_group[geom] == (2 if kind == kinds.mjGEOM_BOX else 3)
+    assert not robot.geom_conaffinity.any()
+    turned = [np.cos(0.5), 0, 0, np.sin(0.5)]
+    np.testing.assert_allclose(robot.geom_quat[0], turned)
+    edges = [1, 2, 5**0.5, 3, 10**0.5, 13**0.5]  # of the scaled mesh, wherever it was moved
+    np.testing.assert_allclose(np.sort(pdist(robot.mesh_vert)), edges, rtol=1e-5)
+
+
+def test_joints_that_follow_are_held_to_their_leader(tmp_path):
+    model, pi = simulated("fingers that slide")
+    write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, _ = load(tmp_path / "robot.xml")
+    pair = [named(robot, f"panda_finger_joint{i}") for i in (2, 1)]
+    assert [robot.eq_obj1id[0], robot.eq_obj2id[0]] == pair
+    np.testing.assert_array_equal(robot.eq_data[0, :5], [0, 1, 0, 0, 0])
+    assert robot.nu == robot.nv - 1
+
+
+def test_a_term_that_mjcf_has_no_place_for_is_named(tmp_path):
+    model = small(tmp_path, own_terms={"j": [Cubic()], "k": [Spring(), Cubic()]})
+    pi = possible_parameters(model, np.random.default_rng(0))
+    pi[model.layout.names.index("j.cubic")] = 0.0  # nothing is lost of it
+    pi[model.layout.names.index("k.spring")] = stiffness = -3.0
+    notes = write_mjcf(model, pi, tmp_path / "robot.xml")
+    robot, data = load(tmp_path / "robot.xml")
+    data.qpos = [0.0, 0.4]
+    mujoco.mj_forward(robot, data)
+    np.testing.assert_allclose(data.qfrc_passive, [0.0, -stiffness * 0.4])
+    assert notes[0] == "MJCF has no place for k.cubic; the sidecar of the URDF has them"
+    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
+    comment = ET.parse(tmp_path / "robot.xml", parser).getroot()[0].text
+    assert notes[0] in comment
+    assert notes[1] in comment
+    assert "arm- -1" in comment  # two dashes would end it
+
+
+def test_what_no_simulator_reads_is_refused_before_anything_is_written(tmp_path):
+    model = small(tmp_path, last="world")
+    pi = possible_parameters(model, np.random.default_rng(0))
+    with pytest.raises(ModelError, match="a link that moves is named 'world'"):
+        write_mjcf(model, pi, tmp_path / "robot.xml")
+    model = small(tmp_path, held=".5", joints=["j"])
+    pi = model.standard_parameters()  # the sum of both links, of which one is impossible
+    with pytest.raises(ModelError, match="link 'lower', behind a locked joint, has an impossible"):
+        write_mjcf(model, pi, tmp_path / "robot.xml")
+    assert not (tmp_path / "robot.xml").exists()

@@ -1,0 +1,132 @@
+"""Ranges for randomisation: the intervals of what was identified, possible whatever is drawn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from robotid.export.ranges import parameter_ranges, ranges_text, write_ranges
+from robotid.export.result import build_result
+from robotid.robot.parameters import pseudo_inertia
+
+AXES = ("x", "y", "z")
+
+
+@pytest.fixture(scope="module")
+def ranges(identified):
+    return parameter_ranges(identified)
+
+
+def figures(content):
+    """Yield every figure with its keys."""
+    for group in ("bodies", "drives"):
+        for owner, entries in content[group].items():
+            for key, entry in entries.items():
+                if key == "principal_axes":
+                    continue
+                for inner, figure in ({"": entry} if "source" in entry else entry).items():
+                    yield (owner, key, inner), figure
+
+
+def test_nominal_values_are_those_identified(identified, ranges):
+    J = pseudo_inertia(identified.standard[: identified.model.layout.n_inertial])
+    for body, J_i in zip(identified.model.layout.bodies, J, strict=True):
+        found = ranges["bodies"][body]
+        m = found["mass"]["nominal"]
+        c = np.array([found["com"][axis]["nominal"] for axis in AXES])
+        w, x, y, z = found["principal_axes"]
+        R = Rotation.from_quat([x, y, z, w]).as_matrix()
+        second = [found["second_moments"][axis]["nominal"] for axis in AXES]
+        again = np.zeros((4, 4))
+        again[:3, :3] = R @ np.diag(second) @ R.T + m * np.outer(c, c)
+        again[:3, 3] = again[3, :3] = m * c
+        again[3, 3] = m
+        np.testing.assert_allclose(again, J_i, atol=1e-12 * abs(J_i).max())
+        moments = [found["principal_moments"][f"I{axis}{axis}"]["nominal"] for axis in AXES]
+        np.testing.assert_allclose(moments, np.sum(second) - second)
+    values = dict(zip(identified.model.layout.names, identified.standard, strict=True))
+    for drive, terms in ranges["drives"].items():
+        for term, figure in terms.items():
+            assert figure["nominal"] == values.pop(f"{drive}.{term}")
+    assert len(values) == identified.model.layout.n_inertial
+
+
+def test_widths_are_those_of_draws_from_the_covariance(identified):
+    """Small ones: the ranges are to first order."""
+    small = replace(identified, standard_covariance=1e-6 * identified.standard_covariance)
+    content, body = parameter_ranges(small), identified.model.layout.bodies[1]
+    found = content["bodies"][body]
+    rng, part = np.random.default_rng(0), slice(10, 20)
+    w, V = np.linalg.eigh(small.standard_covariance[part, part])
+    draws = rng.standard_normal((20_000, 10)) @ (V * np.sqrt(w.clip(0))).T
+    J = pseudo_inertia((identified.standard[part] + draws).reshape(-1)).reshape(-1, 4, 4)
+    c = J[:, :3, 3] / J[:, 3:, 3]
+    about = J[:, :3, :3] - J[:, 3, 3, None, None] * c[:, :, None] * c[:, None, :]
+    w, x, y, z = found["principal_axes"]
+    R = Rotation.from_quat([x, y, z, w]).as_matrix()
+    second = np.einsum("ak,nab,bk->nk", R, about, R)
+    drawn = {"mass": {"": J[:, 3, 3]}}
+    drawn["com"] = dict(zip(AXES, c.T, strict=True))
+    drawn["second_moments"] = dict(zip(AXES, second.T, strict=True))
+    sums = second.sum(axis=1, keepdims=True) - second
+    drawn["principal_moments"] = {f"I{a}{a}": x for a, x in zip(AXES, sums.T, strict=True)}
+    for key, parts in drawn.items():
+        for inner, values in parts.items():
+            figure = found[key][inner] if inner else found[key]
+            width = figure["high"] - figure["low"]
+            assert width == pytest.approx(2 * 1.96 * values.std(), rel=0.04), (key, inner)
+            assert figure["nominal"] == pytest.approx(
+                (figure["high"] + figure["low"]) / 2, rel=1e-3
+            )
+
+
+def test_what_is_drawn_is_possible_however_wide_the_intervals(identified):
+    wide = replace(identified, standard_covariance=25.0 * identified.standard_covariance)
+    for (_, key, _), figure in figures(parameter_ranges(wide)):
+        if key in ("mass", "second_moments", "principal_moments"):
+            assert 0 < figure["low"] < figure["nominal"] < figure["high"]
+        elif key in ("armature", "viscous", "coulomb") and "low" in figure:
+            assert 0 <= figure["low"] <= figure["nominal"] <= figure["high"]
+
+
+def test_sources_are_said_and_a_drive_at_its_bound_has_no_interval(identified):
+    layout = identified.model.layout
+    at = layout.names.index("elbow_joint.coulomb")
+    standard = identified.standard.copy()
+    standard[at] = 0.0
+    unbounded = replace(identified.errors, unbounded=None)
+    held = replace(identified, standard=standard, errors=unbounded)
+    assert held.sources[at] == "prior"  # the URDF's value, 0, stands; but no interval is known
+    content = parameter_ranges(held)
+    bound = {"nominal": 0.0, "source": "bound", "unit": "N m"}
+    assert content["drives"]["elbow_joint"]["coulomb"] == bound
+    sources = dict(zip(layout.names, held.sources, strict=True))
+    assert len(set(sources.values())) > 1
+    for (owner, key, inner), figure in figures(content):
+        if key in ("mass", "com"):
+            own = {sources[f"{owner}.m"]} | ({sources[f"{owner}.mc{inner}"]} if inner else set())
+        elif key in ("second_moments", "principal_moments"):
+            own = {source for name, source in sources.items() if name.startswith(f"{owner}.")}
+        else:
+            own = {sources[f"{owner}.{key}"] if "low" in figure else "bound"}
+        assert figure["source"] == (own.pop() if len(own) == 1 else "mixed")
+    assert content["undetermined"] == list(identified.determination.undetermined)
+
+
+def test_yaml_and_result_have_the_same_figures(identified, ranges, tmp_path):
+    write_ranges(identified, tmp_path / "ranges.yaml")
+    text = (tmp_path / "ranges.yaml").read_text()
+    assert text == ranges_text(ranges)
+    read = yaml.safe_load(text)
+    assert read.keys() == ranges.keys()
+    wanted = dict(figures(ranges))
+    for at, figure in figures(read):
+        exact = wanted.pop(at)
+        assert figure.keys() == exact.keys()
+        for key, value in figure.items():  # 1e-05 would be text
+            is_text = isinstance(exact[key], str)
+            assert value == (exact[key] if is_text else pytest.approx(exact[key], rel=1e-5, abs=0))
+    assert not wanted
+    assert build_result(identified, {"estimator": {"name": "consistent"}})["ranges"] == ranges
