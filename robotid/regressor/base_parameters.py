@@ -24,6 +24,7 @@ __all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping", "structural_mapping"
 #: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
 _TIE = 1e-6  # share by which each column is shortened against the one before it
+_FAINTEST = 1e-12  # length of a column that is 0 at every state
 _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
 _SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
 
@@ -220,11 +221,16 @@ def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
 def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> BaseMapping:
     """Return the base parameters that any motion of a robot can show, always the same for it.
 
+    Further terms of single drives change nothing in those of the others: they are new ones, or, as
+    a torque that turns like gravity, in the sums of those that there are.
+
     Args:
         model: The robot.
         inertial_only: Whether to leave the drive terms out.
     """
     columns = model.layout.n_inertial if inertial_only else len(model.layout.names)
+    if model.layout.own and not inertial_only:
+        return _with_own_terms(model, structural_mapping(model.with_terms({})))
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))
     return base_mapping(
@@ -233,3 +239,30 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
         scales=model.layout.scales(model.length)[:columns],
         preference=model.layout.preference()[:columns],
     )
+
+
+def _with_own_terms(model: RobotModel, plain: BaseMapping) -> BaseMapping:
+    """Return the mapping of a robot with further drive terms, beside that without them."""
+    names = model.layout.names
+    place = [names.index(name) for name in plain.names]
+    own = np.setdiff1d(np.arange(len(names)), place)
+    kept = np.array(place)[plain.independent]
+    W = random_regressor(model, 2 * len(names) // model.n_rows + 20, np.random.default_rng(0))
+    Q, R = scipy.linalg.qr(W[:, kept], mode="economic")
+    size = np.maximum(np.linalg.norm(W[:, own], axis=0), _FAINTEST)
+    T = Q.T @ W[:, own] / size
+    S, order = scipy.linalg.qr(W[:, own] / size - Q @ T, mode="r", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(S)) > RANK_TOLERANCE))
+    first, rest = order[:rank], order[rank:]
+    # W_rest = W_kept A + W_first B
+    B = scipy.linalg.solve_triangular(S[:rank, :rank], S[:rank, rank:])
+    A = scipy.linalg.solve_triangular(R, T[:, rest] - T[:, first] @ B)
+    K = np.zeros((len(kept) + rank, len(names)))
+    K[: len(kept), place] = plain.K
+    K[len(kept) + np.arange(rank), own[first]] = 1.0
+    K[: len(kept), own[rest]] = np.where(np.abs(A) < _CLEAN, 0.0, A) * size[rest]
+    K[len(kept) :, own[rest]] = B * size[rest] / size[first][:, None]
+    independent = np.concatenate([kept, own[first]])
+    turn = np.argsort(independent)
+    pivots = np.append(plain.pivots, np.abs(np.diag(S)))
+    return BaseMapping(K[turn], independent[turn], names, pivots)

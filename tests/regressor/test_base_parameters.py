@@ -6,7 +6,8 @@ import pytest
 from robotid.exceptions import DataError
 from robotid.paper.planar_2r import urdf_text
 from robotid.regressor.base_parameters import base_mapping, structural_mapping
-from robotid.regressor.torque import random_regressor
+from robotid.regressor.torque import joint_torque_regressor, random_regressor
+from robotid.robot.drives import Cubic, Harmonic
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
@@ -137,3 +138,20 @@ def test_words_tell_what_stands_alone_in_sums_or_never():
         "in sums": ("l.m", "l.Ixx"),
         "never": ("l.Iyy",),
     }
+
+
+def test_further_terms_leave_the_base_parameters_of_the_others_as_they_are(rng):
+    plain = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+    wave = [Harmonic(order=1.0), Harmonic(order=1.0, is_sine=True), Harmonic(order=2.0)]
+    own = {"shoulder_pan_joint": wave[:1], "shoulder_lift_joint": wave, "elbow_joint": [Cubic()]}
+    model = plain.with_terms(own)
+    before, after = structural_mapping(plain), structural_mapping(model)
+    # a torque that turns with the first joint that gravity loads is in sums with what hangs on it
+    new = {"shoulder_pan_joint.cos1", "shoulder_lift_joint.cos2", "elbow_joint.cubic"}
+    assert set(after.base_names) == set(before.base_names) | new
+    told = dict(zip(after.base_names, after.expressions, strict=True))
+    for name, expression in zip(before.base_names, before.expressions, strict=True):
+        assert told[name].startswith(expression)
+    q, v, a = rng.uniform(-2, 2, (3, 50, 6))
+    W, pi = joint_torque_regressor(model, q, v, a), rng.standard_normal(len(model.layout.names))
+    np.testing.assert_allclose(W[:, after.independent] @ after.to_base(pi), W @ pi, atol=1e-9)
