@@ -74,6 +74,7 @@ def diagnose(
     Raises:
         SettingsError: If a setting does not fit a log.
     """
+    model = model.with_terms({})  # what a joint's own friction remembers is no log's fault
     findings: list[Finding] = []
     motions = [_examine_log(model, log, signals, findings) for log in (*fitted, *kept)]
     first = [motion for motion, _ in motions[: len(fitted)] if motion is not None]

@@ -9,6 +9,7 @@ from helpers.corruptions import NOISE, clean_log, robot
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.settings import SignalSettings
 from robotid.robot.bodies import link_places
+from robotid.robot.drives import FAMILIES
 from robotid.simulation.closed_loop import another_robot, simulate
 from robotid.simulation.motions import random_fourier
 
@@ -82,6 +83,13 @@ def arm_and_log():
     model = robot("ur5")
     pi = another_robot(model, np.random.default_rng(0))
     return model, *(clean_log(model, seed, pi=pi, duration=10.0) for seed in (0, 1))
+
+
+def test_joints_with_friction_of_their_own_are_examined_like_others(arm_and_log):
+    model, fitted, other = arm_and_log
+    own = model.with_terms({joint: FAMILIES["load"].make({}) for joint in model.joints})
+    found = [diagnose(m, [fitted], [other], SignalSettings()) for m in (model, own)]
+    assert found[0] == found[1]
 
 
 def test_a_load_is_named_beside_a_urdf_of_another_robot(arm_and_log):
