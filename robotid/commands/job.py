@@ -175,6 +175,11 @@ class Job(Settings):
         "whether the written URDF's <dynamics> also get the identified friction",
         at="output.dynamics",
     )
+    report: bool = setting(
+        True,
+        "whether report.html is written, which takes most of the time of a short log",
+        at="output.report",
+    )
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
     validation: tuple[LogEntry, ...] = setting((), "logs kept apart")
     ignore: tuple[str, ...] = setting(

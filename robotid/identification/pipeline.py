@@ -67,7 +67,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import prior_spread
 
-__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify"]
+__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify", "with_drives"]
 
 #: What may have determined a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
@@ -359,7 +359,7 @@ def conclude(
             "viscous), but more is stated; leave it out, or set dynamics = 'full'"
         )
     with _explained(found):
-        fit = _with_drives(recordings, choice, wanted)
+        fit = with_drives(recordings, choice, wanted)
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"
@@ -390,12 +390,21 @@ def _explained(found: Sequence[Finding]) -> Iterator[None]:
         raise
 
 
-def _with_drives(
+def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
     wanted: Mapping[str, Sequence[str] | None],
 ) -> Identification:
-    """Identify a robot's parameters, and the friction of its joints that the logs show."""
+    """Identify a robot's parameters, and the friction of its joints that the logs show.
+
+    Args:
+        recordings: The recordings.
+        choice: Which estimator.
+        wanted: Friction of each joint, as of ``wanted_families``.
+
+    Raises:
+        DataError, RankDeficientError, NotConvergedError: As of ``identify``.
+    """
     fit = _fitted(recordings, choice)
     drives = choose_drives(fit, wanted)
     own = {drive.joint: drive.terms for drive in drives if drive.terms}
