@@ -52,6 +52,7 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--velocity-delay": ("signals.velocity_delay", {"metavar": "S", "type": float}),
     "--friction": ("model.friction", {"metavar": "MODEL"}),
     "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
+    "--no-report": ("output.report", {"action": "store_const", "const": False}),
     "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
     "--time-unit": ("units.time", {"metavar": "UNIT"}),
     "--angle-unit": ("units.angle", {"metavar": "UNIT"}),

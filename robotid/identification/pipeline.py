@@ -15,12 +15,17 @@ from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.estimators import WLS, Consistent, Estimate
 from robotid.estimators.determination import Determination, base_spread, determine
 from robotid.estimators.estimator import Weighing
-from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
+from robotid.exceptions import (
+    DataError,
+    NotConvergedError,
+    RankDeficientError,
+    SettingsError,
+)
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.drive_choice import DriveChoice, choose_drives, wanted_families
-from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
+from robotid.identification.evaluation import Evaluation, evaluate_logs, hidden_joints, pool
 from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
@@ -279,6 +284,8 @@ class Identification:
             doubts=self.doubts,
             refitted=[e.recording.name for e in self.refitted],
             witness=self.witness,
+            is_static=self.model.is_static,
+            hidden=hidden_joints(self.model, self.fitted),
         )
 
 
@@ -346,6 +353,11 @@ def conclude(
     """
     model, is_robust = recordings.model, choice.is_robust
     wanted = wanted_families(friction, model.joints)
+    if model.is_static and any(wanted.values()):
+        raise SettingsError(
+            "dynamics is 'static', which has friction 'none' or 'viscous+coulomb' (without the "
+            "viscous), but more is stated; leave it out, or set dynamics = 'full'"
+        )
     with _explained(found):
         fit = with_drives(recordings, choice, wanted)
     sample = take_sample(fit)
@@ -559,6 +571,11 @@ def _run(
     recordings, before = ground.recordings, ground.before
     model, mapping = recordings.model, recordings.mapping
     estimator = make_estimator(choice, model, mapping, before)
+    if model.is_static and estimator.needs_mass:
+        raise SettingsError(
+            f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "
+            "not identify; choose another one, or dynamics = 'full'"
+        )
     if estimator.reads == "factors":
         return estimator.fit(ground.factors), estimator.in_cone, estimator.weighing
     estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))

@@ -235,7 +235,8 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
 ):
     job = tmp_path / "job.toml"
     job.write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "{wrong_sign}"\n'
+        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[output]\nreport = false\n'
+        f'[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
     assert main(words) == 1
@@ -243,7 +244,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
     assert result["verdict"]["status"] == "poor"
     assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
     assert "torque_sign" in [warning["code"] for warning in result["warnings"]]
-    words = ["identify", URDF, wrong_sign, *words[2:], "--estimator", "wls"]
+    words = ["identify", URDF, wrong_sign, *words[2:], "--estimator", "wls", "--no-report"]
     assert main([*words, "--ignore", "torque_sign"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert not any("opposite sign" in reason for reason in result["verdict"]["reasons"])
