@@ -86,7 +86,7 @@ def diagnose(
             findings += check_repeated_motion(first, motion, log.name)
         if probe is not None and mapping is not None:
             findings += check_payload_change(
-                model, mapping, moving, probe.motion, signals.min_velocity, log.name
+                model, mapping, moving, probe.motion, signals, log.name
             )
     if mapping is not None:
         names = ", ".join(log.name for log in fitted)

@@ -13,6 +13,7 @@ from robotid.doctor.sample import Probe
 from robotid.estimators.two_runs import payload_runs
 from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Trajectory
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Reduction, compress_stretches, join
 from robotid.regressor.used_rows import base_problem, row_mask
@@ -32,7 +33,6 @@ _CLEARLY = 1.5  # how many times more the logs leave if torques have other scale
 _ROWS = 2000  # of a motion: more say nothing new behind the filter
 _STRETCH = 0.4  # [s] longer than the correlation of noise
 _STRETCHES = 24
-_PER_SECOND = 3.0  # independent rows
 
 
 def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
@@ -78,7 +78,7 @@ def check_payload_change(
     mapping: BaseMapping,
     fitted: Sequence[Trajectory],
     kept: Trajectory,
-    min_velocity: float,
+    signals: SignalSettings,
     name: str,
 ) -> Iterator[Finding]:
     """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
@@ -91,11 +91,15 @@ def check_payload_change(
         mapping: Standard to base parameters.
         fitted: Motions that are fitted.
         kept: The motion that is kept apart.
-        min_velocity: Speed below which a row is not used [rad/s].
+        signals: How logs become trajectories.
         name: What its log is called.
     """
     first, second = (
-        [part for motion in some for part in _stretches(model, mapping, motion, min_velocity)]
+        [
+            part
+            for motion in some
+            for part in _stretches(model, mapping, motion, signals.min_velocity)
+        ]
         for some in (fitted, [kept])
     )
     layout, whole = model.layout, join([*first, *second])
@@ -110,7 +114,7 @@ def check_payload_change(
         model.standard_parameters(),
         prior_spread(model, whole.squares, whole.samples),
         (last, np.full(10, np.nan), size),
-        share=min(1.0, _PER_SECOND * seconds / whole.samples),
+        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / whole.samples),
     )
     found = runs.compare()
     mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))

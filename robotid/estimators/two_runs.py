@@ -81,8 +81,8 @@ class TwoRuns:
     def compare(self) -> Compared:
         """Fit both runs at once, and the unknown gains with them.
 
-        Standard errors come from the scatter of the stretches' scores; of fewer than 12 stretches,
-        rows count as independent by ``share``.
+        Standard errors come from the scatter of the stretches' scores, and are at least those of
+        rows that are independent by ``share``; of fewer than 12 stretches, they are these.
 
         Raises:
             NotConvergedError: If the gains do not settle.
@@ -180,7 +180,7 @@ class TwoRuns:
         """Noise of each joint's signal, shape (n,), never quite zero."""
         rows = np.maximum(self._logged.rows, 1)
         spent = len(self._whole) * np.array([len(own) for own in self._logged.columns])
-        freedom = np.maximum(rows - spent, _LEAST_FREEDOM * rows)
+        freedom = np.maximum(rows - spent / self.share, _LEAST_FREEDOM * rows)
         least = _FLOOR * np.sqrt(self._logged.torque_squares() / rows)
         noise: Array = np.maximum(np.sqrt(self._own_squares / freedom), least)
         return np.where(noise > 0, noise, 1.0)
@@ -262,7 +262,10 @@ class TwoRuns:
         found = scatter(stretches, solution, sigma, apart)
         meat, size = self.share**2 * found.meat, len(self.mean)
         meat[:size, :size] += self.precision
-        return bread @ meat @ bread, replace(found, bread=apart).freedom()
+        covariance = bread @ meat @ bread
+        # few stretches scatter less than they should by chance: never less than noise would
+        short = np.sqrt(np.maximum(np.diag(bread) / np.diag(covariance), 1.0))
+        return covariance * np.outer(short, short), replace(found, bread=apart).freedom()
 
 
 def payload_runs(
