@@ -31,7 +31,7 @@ def remember(model: RobotModel, trajectory: Trajectory) -> Trajectory:
     """
     if not model.layout.remembering:
         return trajectory
-    motion = drive_motion_along(model, replace(trajectory, memory=None))
+    motion = drive_motion_along(model, trajectory)
     return replace(trajectory, memory=remembered(model.layout, motion))
 
 
@@ -43,12 +43,13 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
 
     Args:
         model: The robot.
-        trajectory: N samples in order of time, without ``memory``.
+        trajectory: N samples in order of time.
 
     Returns:
         Arrays of shape (d, N).
     """
-    layout, m, pi = model.layout, trajectory, model.carried_by
+    layout, pi = model.layout, model.carried_by
+    m = replace(trajectory, memory=None)  # that of another reference, if it has one
     first = model.n_rows - len(model.joints)
     signs = friction_directions(layout, m.v, m.direction)
     begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0
