@@ -125,8 +125,8 @@ class Probe:
         still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
         layout = self.model.layout
-        coupled = layout.n_inertial + layout.n_own
-        return np.hstack([own, self.regressors.whole[:, j, coupled:]])
+        drives = self.regressors.whole[:, j, layout.n_inertial :]
+        return np.hstack([own, drives[:, layout.is_coupled]])
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion, computed anew.

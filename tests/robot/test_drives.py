@@ -144,9 +144,11 @@ def test_the_column_of_each_term_is_what_its_equation_says(model, term, rng):
     share = ratios / (ratios**2).sum(axis=1, keepdims=True)
     m = DriveMotion(*(z @ ratios.T for z in (x.q, x.v, x.a, x.v)), load @ share.T, 0 * x.v)
     if term.name == "counterbalance":  # k (L - L_0) dL/dq by a difference of the spring's energy
+
         def energy(q):
             where = [0.2 * np.cos(q - 0.4) - 0.6, 0.2 * np.sin(q - 0.4)]
             return 0.5 * (np.hypot(*where) - 0.3) ** 2
+
         expected = (energy(m.q + 1e-6) - energy(m.q - 1e-6)) / 2e-6
     else:
         expected = EXPECTED[term.name](m)
@@ -337,8 +339,17 @@ def test_a_late_torque_is_to_first_order_its_rate(rng):
     t = np.arange(600) / 200
     motion = random_fourier(model, rng)
     q, v, a = motion.evaluate(t)
-    x = Trajectory(t=t, q=q, v=v, a=a, tau=0 * q, joints=JOINTS, rate=200.0,
-                   segment=np.zeros(600, dtype=int), direction=np.tanh(v @ R[:3].T / 0.3))
+    x = Trajectory(
+        t=t,
+        q=q,
+        v=v,
+        a=a,
+        tau=0 * q,
+        joints=JOINTS,
+        rate=200.0,
+        segment=np.zeros(600, dtype=int),
+        direction=np.tanh(v @ R[:3].T / 0.3),
+    )
     with_lag = predict(model, [pi], remember(model, x))[0]
     punctual = replace(x, memory=np.zeros((600, 3)))
     on_time = predict(model, [pi], punctual)[0]
