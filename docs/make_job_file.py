@@ -7,7 +7,8 @@ from pathlib import Path
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
-from robotid.robot.drives import TERMS, friction_models
+from robotid.logs.transmission import Transmission
+from robotid.robot.drives import AUTO, FAMILIES, TERMS
 
 PAGE = Path(__file__).with_name("job_file.md")
 START = """# Job file
@@ -39,6 +40,12 @@ gains = { joint_1 = 14.87, joint_2 = 11.3 }
 name = "motor_2"
 ratios = { joint_1 = 1.0, joint_2 = 1.0 }
 
+[[transmission]]
+joints = ["joint_1", "joint_2"]
+motors = ["m1", "m2"]
+matrix = [[101.0, 0.0], [50.0, 50.0]]
+efficiency = [0.8, 0.7]
+
 [estimator]
 name = "consistent"
 robust = "tukey"
@@ -62,6 +69,7 @@ TABLES = {
     "log": LogSource,
     "units": LogUnits,
     "estimator.constraints": ConstraintSettings,
+    "[transmission]": Transmission,
     "[identification]": LogEntry,
 }
 
@@ -72,7 +80,7 @@ def page():
         key.at or field.name: (field, key)
         for field, key in keys(Job)
         if (key.at or field.name)
-        not in {*TABLES, "model", "estimator", "identification", "validation"}
+        not in {*TABLES, "model", "estimator", "transmission", "identification", "validation"}
     }
     tables = {}
     for at, (field, key) in own.items():
@@ -80,11 +88,13 @@ def page():
         tables.setdefault(table, []).append(row(name, field, key))
     parts = [START, "## Keys at the top\n", *listing(tables.pop(""))]
     for name, kind in TABLES.items():
-        title = "[[identification]]` and `[[validation]]" if name[0] == "[" else f"[{name}]"
-        parts += [f"\n## `{title}`\n", f"{kind.__doc__.splitlines()[0]}\n"]
+        title = f"[{name}]" + "` and `[[validation]]" * (kind is LogEntry)
+        about = kind.__doc__.partition("\n\nAttributes")[0].replace("\n    ", "\n")
+        parts += [f"\n## `{title}`\n", f"{about.strip()}\n"]
         parts += listing([row(key.at or field.name, field, key) for field, key in keys(kind)])
         if name == "signals":
-            parts += ["\n## `[model]`\n", "Which drive terms are identified.\n", *drive_terms()]
+            words = "What is identified, and with which drive terms.\n"
+            parts += ["\n## `[model]`\n", words, *drive_terms(tables.pop("model"))]
         if name == "units":
             for other, rows in tables.items():
                 parts += [f"\n## `[{other}]`\n", *listing(rows)]
@@ -115,15 +125,18 @@ def estimators():
         yield f"| `{name}` | {default} | {', '.join(owners)} | {words} |"
 
 
-def drive_terms():
-    """Return the lines on the terms of the drives."""
-    models = ", ".join(friction_models())
-    rows = [f'| `friction` | `"viscous+coulomb"` | Terms of the friction: {models} |']
+def drive_terms(rows):
+    """Return the lines on the terms of the drives, behind those of other keys."""
+    names = [name for name, term in TERMS.items() if term.is_friction]
+    words = (
+        f"{AUTO}: what held-out stretches of the fitted logs ask for, joint by joint; none; or "
+        f"some of these with + between them: {', '.join([*names, *FAMILIES])}"
+    )
+    rows += [f'| `friction` | `"{AUTO}"` | {words} |']
     for name, term in TERMS.items():
         if not term.is_friction:
             units = ", or ".join(term.units)
-            default = str(term.is_default).lower()
-            rows.append(f"| `{name}` | `{default}` | Whether it is identified [{units}] |")
+            rows.append(f"| `{name}` | `true` | Whether it is identified [{units}] |")
     return listing(rows)
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from robotid.export.result import load_result
     from robotid.export.sdf import write_sdf
     from robotid.export.urdf import write_urdf
+    from robotid.identification.payload_fit import identify_payload
     from robotid.identification.pipeline import Identification, identify
     from robotid.identification.settings import EstimatorSettings
     from robotid.logs.data import Log, Trajectory
@@ -41,6 +42,7 @@ __all__ = [
     "__version__",
     "check_logs",
     "identify",
+    "identify_payload",
     "inspect_urdf",
     "load_result",
     "read_job",
@@ -66,6 +68,7 @@ _HOMES = {
     "export.result": ["load_result"],
     "export.sdf": ["write_sdf"],
     "export.urdf": ["write_urdf"],
+    "identification.payload_fit": ["identify_payload"],
     "identification.pipeline": ["Identification", "identify"],
     "identification.settings": ["EstimatorSettings"],
     "logs.data": ["Log", "Trajectory"],

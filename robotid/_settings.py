@@ -206,7 +206,7 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
         )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
-        for required in ("log", "name", "ratios"):
+        for required in ("log", "name", "ratios", "matrix"):
             if required in schema and required not in item:
                 raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
 
@@ -271,8 +271,8 @@ def _is_table(kind: Any) -> TypeGuard[type[Settings]]:  # noqa: ANN401
 
 def _read_type(kind: Any) -> Any:  # noqa: ANN401
     """Return what a job file holds where a field is annotated so."""
-    if isinstance(kind, dict | list | tuple):
-        return kind
+    if isinstance(kind, dict | list | tuple | Entries):
+        return kind.copy() if isinstance(kind, dict) else kind  # other fields may join the table
     if _is_table(kind):
         return kind.schema()
     origin, inner = get_origin(kind), get_args(kind)

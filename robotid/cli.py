@@ -221,6 +221,21 @@ def _validate(options: argparse.Namespace) -> None:
     _show(validate_result(options.result, options.logs), options, "validate")
 
 
+def _payload(options: argparse.Namespace) -> None:
+    from robotid.commands.payload import is_result, measure_payload
+
+    if any(map(is_result, options.reference)):
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+    found = measure_payload(
+        job_from_flags(options),
+        options.reference,
+        links=options.link,
+        masses=options.mass,
+        find_gains=options.gains,
+    )
+    _show(found, options, "payload")
+
+
 def _compare(options: argparse.Namespace) -> None:
     from robotid.report.comparison import compare_results, write_comparison
 
@@ -261,6 +276,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "replay": ("play a log in the browser: robot, torques, what was identified", _replay),
     "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor),
     "validate": ("measure a result's prediction on other logs", _validate),
+    "payload": ("what hangs on a link: a log with it against one without", _payload),
     "compare": ("several results side by side", _compare),
     "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
     "convert": (

@@ -39,7 +39,9 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
     written = runpy.run_path(str(DOCS / "make_job_file.py"))["page"]()
     assert page == written, "run python docs/make_job_file.py"
     for key in Job.paths().keys() - {"model"}:
-        assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(("ident", "valid"))
+        assert f"| `{key.rpartition('.')[2]}` |" in page or key.startswith(
+            ("ident", "valid", "transm")
+        )
     text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
     job = job_from_settings(tomllib.loads(text), "job_file.md", tmp_path)
     assert job.estimator == EstimatorSettings(

@@ -155,6 +155,7 @@ def print_content(command: str, content: dict[str, Any]) -> None:
         "track": _print_track,
         "doctor": _print_findings,
         "validate": _print_validation,
+        "payload": _print_payload,
         "compare": _print_comparison,
         "export": _print_export,
         "convert": _print_conversion,
@@ -336,6 +337,42 @@ def _print_findings(content: dict[str, Any]) -> None:
         for finding in content["findings"]:
             if finding["severity"] == severity:
                 print(f"{severity}: {finding['code']}: {finding['message']}")
+
+
+def _print_payload(content: dict[str, Any]) -> None:
+    for found in content["payloads"]:
+        link, mass = found["link"], found["mass"]
+        known = not found["mass_std_error"]
+        low, high = found["mass_interval"]
+        print(f"payload on {link}")
+        print(
+            f"  mass {mass:.4f} kg"
+            + (", stated" if known else f" (95 % interval {low:.4f} to {high:.4f})")
+        )
+        if found["com"] is not None:
+            pairs = zip("xyz", found["com"], found["com_std_error"], strict=True)
+            words = ", ".join(f"{axis} {x:.4f} +- {error:.2g}" for axis, x, error in pairs)
+            print(f"  centre of mass in the frame of {link} [m]: {words}")
+        if found["inertia"] is not None:
+            about = {"its centre of mass": "inertia", f"the origin of {link}": "inertia_at_link"}
+            for where, key in about.items():
+                words = ", ".join(
+                    f"I{'xyz'[i]}{'xyz'[j]} {found[key][i][j]:.4g}"
+                    for i in range(3)
+                    for j in range(i, 3)
+                )
+                print(f"  inertia about {where}, axes of {link} [kg m^2]: {words}")
+            largest = max(max(row) for row in found["inertia_std_error"])
+            print(f"    standard errors up to {largest:.2g} kg m^2")
+        for name, reason in found["reasons"].items():
+            print(f"  {'centre of mass' if name == 'com' else name}: not determined; {reason}")
+    errors = content["relative_error_pct"].items()
+    print("torque left unexplained: " + ", ".join(f"{j} {e:.2g} %" for j, e in errors))
+    if "gains" in content:
+        print("\n[torque.gains]")
+        for joint, gain in content["gains"].items():
+            low, high = gain["interval"]
+            print(f"{joint} = {gain['gain']:.4g}  # 95 % interval {low:.4g} to {high:.4g}")
 
 
 def _print_export(done: dict[str, Any]) -> None:

@@ -52,6 +52,7 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--velocity-delay": ("signals.velocity_delay", {"metavar": "S", "type": float}),
     "--friction": ("model.friction", {"metavar": "MODEL"}),
     "--dynamics": ("output.dynamics", {"action": "store_const", "const": True}),
+    "--no-report": ("output.report", {"action": "store_const", "const": False}),
     "--ignore": ("doctor.ignore", {"metavar": "CODE", "action": "append"}),
     "--time-unit": ("units.time", {"metavar": "UNIT"}),
     "--angle-unit": ("units.angle", {"metavar": "UNIT"}),
@@ -124,6 +125,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             add("result", metavar="RESULT.json")
             add("logs", nargs="+", metavar="LOG")
             _add_json(parser)
+        case "payload":
+            _add_payload(parser)
         case "compare":
             add("results", nargs="+", metavar="RESULT.json")
             add("--out", metavar="FILE.html", help="page to write")
@@ -140,6 +143,23 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             add("--joints", metavar="A,B,...", help="joints to write; default: all")
             _add_settings(parser, _SOURCE)
             _add_json(parser)
+
+
+def _add_payload(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="URDF")
+    add("logs", nargs="+", metavar="LOG", help="logs with the payload")
+    words = "log without the payload, or a result.json or its folder; may be given again"
+    again: dict[str, Any] = {"action": "append", "default": []}
+    add("--reference", required=True, metavar="LOG | RESULT", help=words, action="append")
+    words = "link that it hangs on; default: the last moving one; may be given again"
+    add("--link", metavar="NAME", help=words, **again)
+    words = "its mass, if it is known; of several: LINK=KG"
+    add("--mass", metavar="KG", help=words, **again)
+    words = "find the gains of logged currents that no --gain states, from a known mass"
+    add("--gains", action="store_true", help=words)
+    _add_json(parser)
+    _add_settings(parser.add_argument_group("the logs, unless a RESULT says it"), _LOG)
 
 
 def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:

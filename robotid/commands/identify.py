@@ -1,6 +1,7 @@
 """A job from its files to the folder of results."""
 
 import logging
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ def run_job(
 ) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
-    Every file is made in a folder of its own first and put in place when all are complete.
+    A job may want no report, and an impossible result has no URDF. Every file is made in a folder
+    of its own first and put in place when all are complete.
 
     Args:
         job: What to do.
@@ -52,29 +54,31 @@ def run_job(
     model, target = job.model(), Path(folder)
     name = f"{Path(model.tree.path).stem}.identified.urdf"
     sidecar = str(Path(name).with_suffix(".drive.json"))
-    check_folder(target, ["result.json", "report.html", name, sidecar])
+    files = ["report.html", name, sidecar]
+    check_folder(target, ["result.json", *files])
     identification, checkpoint = _identify(job, model, target, plan)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
-        outputs = {"report": "report.html"}
+        outputs = {}
+        if job.report:
+            write_report(identification, partial / "report.html")
+            outputs["report"] = "report.html"
+            identification = replace(identification, report=str(target / "report.html"))
         if identification.has_urdf:
             write_urdf(
                 identification.model, identification.standard, partial / name, dynamics=job.dynamics
             )
             outputs |= {"urdf": name, "sidecar": sidecar}
-        write_report(identification, partial / "report.html")
         result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
-    if "urdf" not in outputs:
-        _remove_stale(target / name, target / sidecar)
-    identification = replace(identification, report=str(target / outputs["report"]))
+    _remove_stale(target / other for other in files if other not in outputs.values())
     if checkpoint is not None:
         checkpoint.remove()
     return identification, result
 
 
-def _remove_stale(*files: Path) -> None:
-    """Remove the URDF and sidecar that an earlier run left, for they are not of this result."""
+def _remove_stale(files: Iterable[Path]) -> None:
+    """Remove the files that an earlier run left, for they are not of this result."""
     for stale in files:
         if stale.exists():
             _log.warning("%s is of an earlier run and was removed: this one wrote none", stale)

@@ -16,8 +16,9 @@ from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
+from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.robot.drives import AUTO, DRIVE_TERMS, FAMILIES, TERMS, DriveTerm, term_from_dict
-from robotid.robot.parameters import Coupling
+from robotid.robot.parameters import DYNAMICS, Coupling
 
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
@@ -87,6 +88,11 @@ def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
     return [{"name": coupling.name, "ratios": dict(coupling.ratios)} for coupling in couplings]
 
 
+def _motors(gear: Transmission) -> list[Coupling]:
+    """Return the drives of a transmission's motors that turn with several joints."""
+    return [Coupling(joint, ratios, replaces=True) for joint, ratios in gear.shared.items()]
+
+
 @dataclass(frozen=True)
 class LogEntry(Settings):
     """One log of a job."""
@@ -126,6 +132,14 @@ class Job(Settings):
         load=_load_terms,
         dump=_dump_terms,
     )
+    model_dynamics: str = setting(
+        "full",
+        "full; or static, for logs of poses and slow sweeps: velocities and accelerations are not "
+        "used but for the sign of friction, and gravity (masses, first moments), Coulomb friction "
+        "and offsets are identified; the rest keeps the URDF's values",
+        at="model.dynamics",
+        among=DYNAMICS,
+    )
     drives: Mapping[str, tuple[str | DriveTerm, ...]] = setting(
         {},
         "further friction of single joints, by joint: names as of friction, whose shape is found, "
@@ -145,6 +159,9 @@ class Job(Settings):
         load=_load_couplings,
         dump=_dump_couplings,
     )
+    transmissions: tuple[Transmission, ...] = setting(
+        (), "motors and gears, where logs have columns of motors", at="transmission"
+    )
     columns: Mapping[str, str] = setting(
         {}, "column names in the logs that differ from the standard ones"
     )
@@ -157,6 +174,11 @@ class Job(Settings):
         False,
         "whether the written URDF's <dynamics> also get the identified friction",
         at="output.dynamics",
+    )
+    report: bool = setting(
+        True,
+        "whether report.html is written, which takes most of the time of a short log",
+        at="output.report",
     )
     identification: tuple[LogEntry, ...] = setting((), "logs to fit")
     validation: tuple[LogEntry, ...] = setting((), "logs kept apart")
@@ -178,6 +200,7 @@ class Job(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_transmissions(self.transmissions, self.joints)
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "
@@ -193,6 +216,8 @@ class Job(Settings):
         """
         from robotid.robot.model import RobotModel
 
+        gears = [gear for gear in self.transmissions if gear.matrix != "urdf"]
+        motors = [motor for gear in gears for motor in _motors(gear)]
         return RobotModel.from_urdf(
             self.urdf,
             joints=self.joints,
@@ -201,11 +226,12 @@ class Job(Settings):
             mimic=self.mimic,
             gravity=self.gravity,
             terms=[term for term in self.terms if term in TERMS],
-            couplings=self.couplings,
+            couplings=(*self.couplings, *motors),
             own_terms={
                 joint: [entry for entry in entries if isinstance(entry, DriveTerm)]
                 for joint, entries in self.drives.items()
             },
+            dynamics=self.model_dynamics,
             snap_angles=self.snap_angles,
         )
 
@@ -251,6 +277,7 @@ class Job(Settings):
             "units": self.units,
             "prismatic": tuple(model.layout.prismatic),
             "source": self.source,
+            "transmissions": [gear.stated(model.tree.reductions) for gear in self.transmissions],
         }
 
 

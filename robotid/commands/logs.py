@@ -33,7 +33,8 @@ def survey_logs(
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
     """Return the logs of each group of a job's, ready to be read.
 
-    They are kept in memory if all their files together have no more rows than may be; files of
+    They are kept in memory if all their files together have no more rows than may be, or if the
+    model is static; files of
     formats that are only read whole count as nothing. Otherwise each is cut into pieces of a fixed
     number of rows: an eighth of those in memory.
 
@@ -50,7 +51,7 @@ def survey_logs(
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
     opened = {path: _open(job, model, path) for path in paths}
     rows = sum(_count(found) for found in opened.values())
-    is_long = rows > job.rows_in_memory
+    is_long = rows > job.rows_in_memory and not model.is_static
     length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
 
     def survey(entries: Sequence[LogEntry]) -> tuple[SurveyedLog, ...]:

@@ -18,7 +18,12 @@ from robotid.export.result import (
     stated_witness,
 )
 from robotid.findings import Finding
-from robotid.identification.evaluation import Evaluation, evaluate_logs, shares_rows
+from robotid.identification.evaluation import (
+    Evaluation,
+    evaluate_logs,
+    hidden_joints,
+    shares_rows,
+)
 from robotid.identification.metrics import Metrics
 from robotid.identification.survey import SurveyedLog
 from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
@@ -116,6 +121,8 @@ def _verdict(
         doubts=list(dict.fromkeys(_doubts(job, model, stated, found, names, missing))),
         refitted=[e.recording.name for e in compress(evaluations, again)],
         witness=stated_witness(result),
+        is_static=model.is_static,
+        hidden=hidden_joints(model, evaluations),
     )
 
 

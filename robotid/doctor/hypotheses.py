@@ -61,8 +61,8 @@ def compensated(probe: Probe) -> tuple[Probe, Array]:
         The motion, and what no physics explains as shares of the variance of the torques as logged,
         shape (n,).
     """
-    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial]
-    whole = replace(probe, tau=probe.tau + np.tensordot(probe.gravity, probe.G, axes=1) @ pi)
+    weight = probe.loads() - probe.loads(np.zeros(3))
+    whole = replace(probe, tau=probe.tau + weight.sum(axis=2))
     size, logged = _variation(whole), _variation(probe)
     share = own_share(whole) * np.divide(size, logged, out=np.zeros_like(size), where=logged > 0)
     return whole, np.minimum(share, 1.0)
@@ -80,7 +80,7 @@ def unexplained(probe: Probe, gravity: Array | None = None) -> Array:
         sign as it is and reversed. 0 for a constant column.
     """
     n = len(probe.model.joints)
-    loads = _link_loads(probe, gravity)
+    loads = probe.loads(gravity)
     size = _variation(probe)
     share = np.zeros((n, n, 2))
     for k in range(n):
@@ -124,7 +124,7 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
     URDF's torque, of the velocity or of the acceleration on.
     """
     share, joints = own[:, 0].copy(), []
-    loads = _link_loads(probe, None)
+    loads = probe.loads()
     for j, tau in enumerate(probe.tau.T):
         if tau.min() < -_RINGING * tau.max() or share[j] < _POOR:
             continue
@@ -246,7 +246,7 @@ def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False
         gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
         any_load: Whether the last link may also have any mass more, and any centre of it.
     """
-    loads = _link_loads(probe, gravity)
+    loads = probe.loads(gravity)
     if any_load:
         last = probe.regressor(gravity)[:, :, -10:-6]
         loads = np.concatenate([loads, last, -last[:, :, 1:]], axis=2)
@@ -264,14 +264,6 @@ def _variation(probe: Probe) -> Array:
     is_constant = np.ptp(probe.tau, axis=0) <= _CONSTANT * np.abs(probe.tau).max(axis=0)
     size: Array = np.where(is_constant, 0.0, np.einsum("kn,kn->n", centred, centred))
     return size
-
-
-def _link_loads(probe: Probe, gravity: Array | None) -> Array:
-    """Return the torque that each link loads each joint with by the URDF, shape (N, n, bodies)."""
-    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial].reshape(-1, 10)
-    Y = probe.regressor(gravity)
-    loads: Array = np.einsum("knbi,bi->knb", Y.reshape(*Y.shape[:2], -1, 10), pi)
-    return loads
 
 
 def _compressed(X: Array, tau: Array) -> tuple[Array, Array]:

@@ -112,11 +112,9 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
-    pi = probe.model.standard_parameters()[: probe.model.layout.n_inertial].reshape(-1, 10)
-    bodies = len(pi)
-    Y = probe.regressor().reshape(N, n, bodies, 10)
-    links = np.einsum("knbi,bi->knb", Y, pi)
-    X = np.concatenate([links, Y[:, :, -1, :4], probe.tau[:, :, None]], axis=2)
+    links, last = probe.loads(), probe.regressor()[:, :, -10:-6]
+    bodies = links.shape[2]
+    X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0) if level is None else level
     told = (level > _CONSTANT * np.abs(probe.tau).max()) & (share < _EXPLAINED)
     R = np.zeros((n, bodies + 5, bodies + 5))

@@ -2,15 +2,24 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import scipy.special
 
 from robotid._typing import Array
-from robotid.doctor.hypotheses import own_share
 from robotid.doctor.loads import LoadModel, load_model
 from robotid.doctor.sample import Probe
+from robotid.estimators.two_runs import payload_runs
 from robotid.findings import Finding, listed, log_finding
+from robotid.logs.data import Trajectory
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.factors import Reduction, compress_stretches, join
+from robotid.regressor.used_rows import base_problem, row_mask
 from robotid.robot.bodies import link_places
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import payload_spread, prior_spread
 
 __all__ = ["check_payload_change", "check_unmounted_parts"]
 
@@ -18,10 +27,12 @@ _LIGHTER = 4.0  # drop of the misfit, of a factor 7 in likelihood, from which a 
 _ALIKE = 2.0  # misfits that differ by less are alike
 _LIGHT = 0.02  # of the arm's mass, below which a part is not missed
 _NO_LOAD = 1e-6  # [kg, kg m] spread of a payload that is left out
-_SURE = 3.0  # standard errors that a change of load has at least
-_NOTHING = 0.01  # ... and share of the arm's mass
-_CHANGED = 25.0  # drop of the misfit, as of five standard errors, that makes a load believable
-_FITS = 0.25  # in variances of its precision, that a torque may fit worse than by itself
+_CHANCE = 3e-7  # that a log without another load seems to have one, as of five standard errors
+_NOTHING = 0.01  # share of the arm's mass that a change of load has at least
+_CLEARLY = 1.5  # how many times more the logs leave if torques have other scales, not a load
+_ROWS = 2000  # of a motion: more say nothing new behind the filter
+_STRETCH = 0.4  # [s] longer than the correlation of noise
+_STRETCHES = 24
 
 
 def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Finding]:
@@ -62,50 +73,84 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
     yield log_finding(name, "unmounted_part", "warning", message, last, **evidence)
 
 
-def check_payload_change(fitted: Sequence[Probe], kept: Probe, name: str) -> Iterator[Finding]:
+def check_payload_change(
+    model: RobotModel,
+    mapping: BaseMapping,
+    fitted: Sequence[Trajectory],
+    kept: Trajectory,
+    signals: SignalSettings,
+    name: str,
+) -> Iterator[Finding]:
     """Yield a warning "payload_change" if a validation log has another load than the fitted ones.
 
-    Links and the load that all logs share are unknown, so that only the change counts.
+    Both are fitted at once, all links unknown, and a load in the last link that only the
+    validation log has. It is believed if it makes one robot of both.
 
     Args:
+        model: The robot.
+        mapping: Standard to base parameters.
         fitted: Motions that are fitted.
         kept: The motion that is kept apart.
+        signals: How logs become trajectories.
         name: What its log is called.
     """
-    models = [load_model(probe, own_share(probe, any_load=True)) for probe in (*fitted, kept)]
-    shared = len(models[-1].mean)
-    rows = [_rows(model, is_changed=model is models[-1]) for model in models]
-    spread = np.append(models[-1].spread, models[-1].spread[-4:])
-    mean = np.append(models[-1].mean, np.zeros(4))
-    prior = np.column_stack([np.eye(shared + 4), mean / spread])
-    X = np.vstack([*(part * np.append(spread, 1.0) for part in rows), prior])
-    R = np.asarray(np.linalg.qr(X, mode="r"))
-    left = R[-1, -1] ** 2
-    gain = float(np.sum(R[shared:-1, -1] ** 2))
-    expected = sum(model.expected for model in models)
-    if left - expected > _FITS * sum(model.independent for model in models) or gain < _CHANGED:
-        return
-    inverse = np.linalg.inv(R[:-1, :-1])
-    x, error = spread * (inverse @ R[:-1, -1]), spread * np.linalg.norm(inverse, axis=1)
-    mass, std_error = float(x[shared]), float(error[shared])
-    arm = float(np.sum(kept.model.standard_parameters()[: kept.model.layout.n_inertial : 10]))
-    if not max(_SURE * std_error, _NOTHING * arm) <= abs(mass) <= arm:
-        return  # nothing but where mass lies, as other errors of a model do; or no load of this arm
-    link = kept.model.layout.bodies[-1]
-    message = (
-        f"{link} carries {abs(mass):.2g} +- {std_error:.1g} kg {'more' if mass > 0 else 'less'} "
-        "than in the fitted logs: this log does not test the same robot; record it with the same "
-        "load, or fit it by itself"
+    first, second = (
+        [
+            part
+            for motion in some
+            for part in _stretches(model, mapping, motion, signals.min_velocity)
+        ]
+        for some in (fitted, [kept])
     )
-    evidence = {"mass": mass, "std_error": std_error, "gain": gain}
+    layout, whole = model.layout, join([*first, *second])
+    size = payload_spread(model)
+    last = mapping.K[:, layout.n_inertial - 10 : layout.n_inertial]
+    seconds = sum(float(np.ptp(motion.t)) for motion in (*fitted, kept))
+    runs = payload_runs(
+        first,
+        second,
+        layout,
+        mapping.K,
+        model.standard_parameters(),
+        prior_spread(model, whole.squares, whole.samples),
+        (last, np.full(10, np.nan), size),
+        share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / whole.samples),
+    )
+    found = runs.compare()
+    mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
+    reach = -float(scipy.special.stdtrit(found.freedom[-10], _CHANCE)) * error
+    if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:
+        return
+    left = runs.held_together(found.theta) - 1.0
+    by_scales = runs.held_by_scales(runs.D.shape[1] - 10) - 1.0
+    if _CLEARLY * left.mean() > by_scales.mean():
+        return  # the logs differ by something else
+    link = layout.bodies[-1]
+    message = (
+        f"{link} carries {abs(mass):.2g} +- {error:.1g} kg {'more' if mass > 0 else 'less'} "
+        "than in the fitted logs: this log does not test the same robot; record it with the same "
+        "load, or fit it by itself; robotid payload says more of the load"
+    )
+    evidence = {"mass": mass, "std_error": error}
     yield log_finding(name, "payload_change", "warning", message, link, **evidence)
 
 
-def _rows(model: LoadModel, *, is_changed: bool) -> Array:
-    """Return a log's rows of links, shared load, change of the load and torque, (N, c + 5)."""
-    rows = model.R.reshape(-1, model.R.shape[2])
-    change = rows[:, -5:-1] if is_changed else np.zeros((len(rows), 4))
-    return np.hstack([rows[:, :-1], change, rows[:, -1:]])
+def _stretches(
+    model: RobotModel, mapping: BaseMapping, motion: Trajectory, min_velocity: float
+) -> Iterator[Reduction]:
+    """Yield what stretches of some rows of a motion come down to."""
+    every = max(1, len(motion.t) // _ROWS)
+    own = ("t", "q", "v", "a", "tau", "segment", "direction")
+    values = {key: getattr(motion, key) for key in own}
+    kept: dict[str, Any] = {k: x if x is None else x[::every] for k, x in values.items()}
+    thin = replace(motion, **kept)
+    count = int(np.clip(np.ptp(thin.t) / _STRETCH, 1, _STRETCHES))
+    length = -(-len(thin.t) // count)
+    rows = row_mask(model, thin, min_velocity)
+    problem = base_problem(model, mapping, thin, rows, compiled=False)
+    for i, factors in enumerate(compress_stretches(problem, length)):
+        part = thin.part(i * length, (i + 1) * length)
+        yield Reduction(factors, part.squares, len(part.t))
 
 
 def _misfit_without_load(model: LoadModel) -> float:

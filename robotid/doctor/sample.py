@@ -1,6 +1,7 @@
 """A log's motion at a few hundred instants, with each part of its torque apart: for the doctor."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,11 +21,33 @@ _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its larges
 
 
 @dataclass(frozen=True, eq=False)
-class Probe:
-    """What a model says of a motion, linear in what it does not know.
+class _Regressors:
+    """The regressors of N instants, each made when it is first asked for."""
 
-    The inertial torque is ``(Y + sum_i gravity_i G_i) pi``, with Y of a robot without gravity and
-    G_i of one that stands still in a gravity of 1 m/s^2 along axis i.
+    model: RobotModel
+    q: Array
+    v: Array
+    a: Array
+
+    @cached_property
+    def whole(self) -> Array:
+        """In the gravity that the model states, all columns, shape (N, n, p)."""
+        return self._of(self.model, self.v, self.a)
+
+    @cached_property
+    def pulled(self) -> Array:
+        """At rest in a gravity of 1 m/s^2 along x, y and z, shape (3, N, n, 10 bodies)."""
+        still, size = np.zeros_like(self.v), self.model.layout.n_inertial
+        axes = [_in_gravity(self.model, axis) for axis in np.eye(3)]
+        return np.array([self._of(model, still, still)[:, :, :size] for model in axes])
+
+    def _of(self, model: RobotModel, v: Array, a: Array) -> Array:
+        return joint_torque_regressor(model, self.q, v, a).reshape(len(v), model.n_rows, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """What a model says of a motion, linear in what it does not know: masses and gravity.
 
     Attributes:
         model: The robot.
@@ -34,9 +57,7 @@ class Probe:
         v: Velocities, shape (N, n).
         a: Accelerations, shape (N, n).
         tau: Torques, shape (N, n) [N m or N].
-        Y: Regressor without gravity, shape (N, n, p).
-        G: Regressors of gravity alone along x, y and z, shape (3, N, n, p).
-        drives: What each coupled drive adds, shape (N, n, k).
+        regressors: The regressors of these instants.
     """
 
     model: RobotModel
@@ -46,9 +67,7 @@ class Probe:
     v: Array
     a: Array
     tau: Array
-    Y: Array
-    G: Array
-    drives: Array
+    regressors: _Regressors
 
     @property
     def gravity(self) -> Array:
@@ -56,14 +75,41 @@ class Probe:
         return np.array(self.model.pin_model.gravity.linear)
 
     def regressor(self, gravity: Array | None = None) -> Array:
-        """Return the inertial regressor in a gravity, shape (N, n, p).
+        """Return the inertial regressor in a gravity, shape (N, n, 10 bodies).
 
         Args:
             gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
         """
-        g = self.gravity if gravity is None else gravity
-        Y: Array = self.Y + np.tensordot(g, self.G, axes=1)
-        return Y
+        Y: Array = self.regressors.whole[:, :, : self.model.layout.n_inertial]
+        if gravity is None:
+            return Y
+        more: Array = np.tensordot(gravity - self.gravity, self.regressors.pulled, axes=1)
+        return Y + more
+
+    def loads(self, gravity: Array | None = None) -> Array:
+        """Return the torque that each link loads each joint with by the URDF, (N, n, bodies).
+
+        Args:
+            gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
+        """
+        if gravity is None:
+            return self._loads
+        more: Array = np.tensordot(gravity - self.gravity, self._pulls, axes=1)
+        return self._loads + more
+
+    @cached_property
+    def _loads(self) -> Array:
+        return self._by_link(self.regressor())
+
+    @cached_property
+    def _pulls(self) -> Array:
+        """The loads of links at rest, per m/s^2 of gravity along each axis, (3, N, n, bodies)."""
+        return self._by_link(self.regressors.pulled)
+
+    def _by_link(self, Y: Array) -> Array:
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
+        loads: Array = np.einsum("...bi,bi->...b", Y.reshape(*Y.shape[:-1], -1, 10), pi)
+        return loads
 
     def drive(self, j: int) -> Array:
         """Return what the drive of joint j may add: inertia, frictions, offset of either sign.
@@ -78,7 +124,9 @@ class Probe:
         least = _STILL * float(self.model.layout.drive_speeds[j])
         still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
-        return np.hstack([own, self.drives[:, j]])
+        layout = self.model.layout
+        drives = self.regressors.whole[:, j, layout.n_inertial :]
+        return np.hstack([own, drives[:, layout.is_coupled]])
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion, computed anew.
@@ -148,18 +196,7 @@ def _probe_at(model: RobotModel, motion: Trajectory, rows: Array) -> Probe:
 def _probe(
     model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
 ) -> Probe:
-    q, v, a = state
-    size = model.layout.n_inertial
-    shape = (len(q), model.n_rows, -1)
-    still = np.zeros_like(v)
-    whole = joint_torque_regressor(_in_gravity(model, np.zeros(3)), q, v, a).reshape(shape)
-    pulled = [_in_gravity(model, g) for g in np.eye(3)]
-    G = np.array([joint_torque_regressor(m, q, still, still).reshape(shape) for m in pulled])
-    own = model.layout.n_own
-    return Probe(
-        model, motion, rows, q, v, a, motion.tau[rows],
-        whole[:, :, :size], G[:, :, :, :size], whole[:, :, size + own :],
-    )  # fmt: skip
+    return Probe(model, motion, rows, *state, motion.tau[rows], _Regressors(model, *state))
 
 
 def _in_gravity(model: RobotModel, gravity: Array) -> RobotModel:

@@ -233,7 +233,7 @@ def _window(
     W = joint_torque_regressor(model, *state).reshape(len(coarse), len(model.joints), -1)
     W = low_pass(W, 1 / (step * every), signals)[inner]
     size = model.layout.n_inertial
-    coupled = W[:, :, size + model.layout.n_own :]
+    coupled = W[:, :, size:][:, :, model.layout.is_coupled]
     at = motion.t[coarse[inner]]
     turns = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
     slow = turns | (np.abs(v) < _SLOW)

@@ -138,7 +138,7 @@ def _condition(model: RobotModel, mapping: BaseMapping) -> float:
     columns = len(mapping.names)
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
-    return float(np.linalg.cond(W / np.linalg.norm(W, axis=0)))
+    return float(np.linalg.cond(np.linalg.qr(W / np.linalg.norm(W, axis=0), mode="r")))
 
 
 def _numbers(robot: ET.Element) -> Iterator[Finding]:

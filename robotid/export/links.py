@@ -1,7 +1,7 @@
 """An identified robot as simulators want it: where its links sit, how they move and look."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.tree import Joint
 from robotid.versions import __version__
 
-__all__ = ["WORLD", "Format", "SimulatedLink", "unstated_terms", "write_model"]
+__all__ = ["WORLD", "Format", "SimulatedLink", "own_drives", "unstated_terms", "write_model"]
 
 #: What simulators call the frame that does not move.
 WORLD = "world"
@@ -105,6 +105,8 @@ def write_model(
     inertials, meshes = _inertials(model, pi), set[str]()
     shapes = _shapes(model, to, [*([original] if original else []), model.tree.path], meshes)
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    if not to.has_couplings:
+        values = own_drives(model, values)
     top = build(_links(model, inertials, shapes), values)
     unstated = unstated_terms(model, pi, to.name, to.terms, has_couplings=to.has_couplings)
     names = listed(sorted(Path(mesh).name for mesh in meshes), _NAMED)
@@ -118,6 +120,17 @@ def write_model(
     ET.indent(top)
     write_text(ET.tostring(top, encoding="unicode") + "\n", target)
     return said
+
+
+def own_drives(model: RobotModel, values: Mapping[str, float]) -> dict[str, float]:
+    """Return parameters without those of drives that turn with several joints.
+
+    Args:
+        model: The robot.
+        values: Parameters by name.
+    """
+    shared = {coupling.name for coupling in model.layout.couplings}
+    return {name: x for name, x in values.items() if name.rpartition(".")[0] not in shared}
 
 
 def unstated_terms(
@@ -137,7 +150,8 @@ def unstated_terms(
     missing = [
         drive
         for (d, term), drive, value in drives
-        if value != 0.0 and not (term.name in terms and (has_couplings or d < len(layout.joints)))
+        if value != 0.0
+        and not (term.name in terms and (has_couplings or layout.drives[d] not in layout.couplings))
     ]
     sentence = f"{name} has no place for {listed(missing)}; the sidecar of the URDF has them"
     return [sentence] if missing else []

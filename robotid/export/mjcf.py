@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robotid._typing import Array
-from robotid.export.links import WORLD, Format, SimulatedLink, write_model
+from robotid.export.links import WORLD, Format, SimulatedLink, own_drives, write_model
 from robotid.export.urdf import numbers_text
 from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
@@ -94,11 +94,11 @@ def _mjcf(
         ET.SubElement(default, tag, _STIFF)
     for name, conduct in _GEOMS.items():
         ET.SubElement(ET.SubElement(default, "default", {"class": name}), "geom", conduct)
-    bodies = {WORLD: ET.SubElement(top, "worldbody")}
+    own, bodies = own_drives(model, values), {WORLD: ET.SubElement(top, "worldbody")}
     for link in links:
         at = {"name": link.name} | _pose(link.pose)
         bodies[link.name] = body = ET.SubElement(bodies[link.parent], "body", at)
-        _add_motion(body, link, values)
+        _add_motion(body, link, own)
         _add_geoms(body, link, assets)
     _add_drives(top, model, links, values)
     return top
@@ -166,7 +166,12 @@ def _add_drives(
         at = {"name": limits.name, "joint": limits.name}
         if 0.0 < limits.effort < np.inf:
             at["ctrlrange"] = numbers_text([-limits.effort, limits.effort])
-        offset = values.get(f"{limits.name}.{_OFFSET}", 0.0)  # does not reach the joint
+        offset = sum(  # does not reach the joint
+            ratio * values.get(f"{drive.name}.{_OFFSET}", 0.0)
+            for drive in model.layout.drives
+            for joint, ratio in drive.ratios
+            if joint == limits.name
+        )
         if offset:
             at |= {"biastype": "affine", "biasprm": numbers_text([-offset, 0.0, 0.0])}
         ET.SubElement(actuators, "general" if offset else "motor", at)

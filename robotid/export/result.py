@@ -23,6 +23,7 @@ from robotid.identification.evaluation import Evaluation
 from robotid.identification.pipeline import SOURCES, Identification
 from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
+from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
@@ -133,6 +134,7 @@ def build_result(
                 strict=True,
             )
         ],
+        "motors": _motors(identification, settings),
         "own_terms": model.options["own_terms"],
         "friction": {
             drive.joint: _friction(identification, drive) for drive in identification.drives
@@ -408,6 +410,25 @@ def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
         }
         for i in numbers
     ]
+
+
+def _motors(found: Identification, settings: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return gear ratio and inertia at the motor, armature / ratio^2, of drives behind gears."""
+    model, gears = found.model, dict[str, float]()
+    for table in settings.get("transmission", ()):
+        gears |= Transmission.from_dict(table).stated(model.tree.reductions).gears
+    drives = [
+        (model.layout.drives[d].name, value)
+        for (d, term), value in zip(
+            model.layout.drive_parameters, found.standard[model.layout.n_inertial :], strict=True
+        )
+        if term.is_inertia
+    ]
+    return {
+        name: {"gear": gears[name], "inertia": float(value) / gears[name] ** 2}
+        for name, value in drives
+        if name in gears
+    }
 
 
 def _consistency(found: Identification) -> dict[str, Any]:

@@ -45,10 +45,11 @@ _SHAPE = {
     "gravity": [NUMBER],
     "free_flyer": FLAG,
     "mimic": TEXT,
+    "dynamics?": TEXT,
     "terms": [TEXT],
     "own_terms?": {...: [TABLE]},
     "drives": {...: {...: NUMBER}},
-    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}}],
+    "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
     "lumped": TABLE,
 }
 _STATES = 64  # random states at which the written file must give the same torque
@@ -150,12 +151,16 @@ def load_identified(urdf: str | Path, sidecar: str | Path) -> tuple[RobotModel, 
             f"{found[:12]}..., wanted {facts['urdf_sha256'][:12]}...; restore the file, or write "
             "both again"
         )
-    couplings = [Coupling(c["name"], tuple(c["ratios"].items())) for c in facts["couplings"]]
+    couplings = [
+        Coupling(c["name"], tuple(c["ratios"].items()), c.get("replaces", False))
+        for c in facts["couplings"]
+    ]
     drives = {**facts["drives"], **{c["name"]: c for c in facts["couplings"]}}
     model = RobotModel.from_urdf(
         path,
         couplings=couplings,
         own_terms=terms_from_facts(facts.get("own_terms", {})),
+        dynamics=facts.get("dynamics", "full"),
         **{
             key: facts[key]
             for key in ("joints", "locked", "free_flyer", "mimic", "gravity", "terms")
@@ -186,15 +191,17 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
     """Return what a URDF has no place for: how the model is built from it, and the drives."""
     layout, first = model.layout, model.layout.n_inertial
     units = dict(zip(layout.names[first:], layout.units[first:], strict=True))
-    drives: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
+    values: dict[str, dict[str, float]] = {drive.name: {} for drive in layout.drives}
     for (d, term), value in zip(layout.drive_parameters, pi[first:], strict=True):
-        drives[layout.drives[d].name][term.name] = float(value)
+        values[layout.drives[d].name][term.name] = float(value)
+    own = [drive.name for drive in layout.drives if drive not in layout.couplings]
     return {
         **model.options,
-        "drives": {joint: drives[joint] for joint in layout.joints},
+        "drives": {name: values[name] for name in own},
         "couplings": [
             {"name": c.name, "ratios": {joint: float(ratio) for joint, ratio in c.ratios}}
-            | drives[c.name]
+            | ({"replaces": True} if c.replaces else {})
+            | values[c.name]
             for c in layout.couplings
         ],
         "lumped": _lumped(model, places),
@@ -328,10 +335,11 @@ def numbers_text(values: Iterable[float]) -> str:
 def _dynamics_edits(document: Document, model: RobotModel, pi: Array) -> list[Edit]:
     attributes = {name: term.dynamics for name, term in TERMS.items() if term.dynamics}
     values = dict(zip(model.layout.names, pi, strict=True))
+    shared = {coupling.name for coupling in model.layout.couplings}  # they load others, too
     edits: list[Edit] = []
     for joint in document.root.find_all("joint"):
         name, found = joint.attributes.get("name", ""), joint.find_all("dynamics")
-        if name not in model.joints:
+        if name not in model.joints or name in shared:
             continue
         names = {f"{name}.{term}": attribute for term, attribute in attributes.items()}
         new = {names[key]: numbers_text([values[key]]) for key in names if key in values}

@@ -466,7 +466,8 @@ def _with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, 
 def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
     """Return logarithms of where each shape is sought, shape (k, 2)."""
     bounds = [shape.within(drive.seen) for family in families for shape in family.shapes]
-    return np.log(np.reshape(bounds, (-1, 2)))
+    logs: Array = np.log(np.reshape(bounds, (-1, 2)))
+    return logs
 
 
 def _refined(

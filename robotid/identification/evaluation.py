@@ -19,7 +19,16 @@ from robotid.regressor.prediction import predict
 from robotid.robot.model import RobotModel
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["Evaluation", "Extent", "Recording", "evaluate_logs", "pool", "predict", "shares_rows"]
+__all__ = [
+    "Evaluation",
+    "Extent",
+    "Recording",
+    "evaluate_logs",
+    "hidden_joints",
+    "pool",
+    "predict",
+    "shares_rows",
+]
 
 _SHOWN = 10_000  # samples at the beginning, in the middle and at the end that are kept for plots
 _SAMPLED = 200  # rows spread over a log that are looked for in others
@@ -162,6 +171,28 @@ def pool(model: RobotModel, evaluations: Sequence[Evaluation], name: str) -> Met
     """
     together = reduce(TorqueSums.merge, [evaluation.sums[name] for evaluation in evaluations])
     return together.metrics(model.row_names, model.row_units)
+
+
+def hidden_joints(model: RobotModel, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
+    """Return joints of a static model whose torque changes less than the estimate leaves of it.
+
+    What friction holds where the robot stands hides the little that gravity does there.
+
+    Args:
+        model: The robot.
+        evaluations: The recordings.
+    """
+    if not model.is_static or not evaluations:
+        return ()
+    left = pool(model, evaluations, "estimate").per_joint
+    torque = np.vstack([e.torques["estimate"] for e in evaluations])
+    used = np.vstack([e.recording.mask for e in evaluations])
+    hidden = tuple(
+        row
+        for j, row in enumerate(model.row_names)
+        if row in left and np.std(torque[used[:, j], j]) <= left[row].rmse
+    )
+    return hidden if len(hidden) < len(left) else ()
 
 
 _Shown = tuple[Trajectory, Array, Mapping[str, Array]]  # motion, rows used, torques

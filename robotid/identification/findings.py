@@ -52,7 +52,7 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
         identification: What was found.
         sample: Rows of its recordings; None if they are too few to judge by.
     """
-    findings = []
+    findings = _static_findings(identification)
     known = identification.determination
     if known.groups:
         message = (
@@ -90,6 +90,42 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
             evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
             findings.append(Finding("constraint_costs", "warning", joint, message, evidence))
     return findings
+
+
+def _static_findings(identification: Identification) -> list[Finding]:
+    """Return what was used of the logs of a static model, and joints without their friction."""
+    if not identification.model.is_static:
+        return []
+    recordings = [e.recording for e in identification.fitted]
+    rows, samples = (
+        sum(getattr(r.extent, key) for r in recordings) for key in ("samples", "smooth")
+    )
+    message = (
+        f"the {rows} rows count as {samples} stands and slow stretches of a quarter of a "
+        "second; inertias about the centres of mass keep the URDF's values"
+    )
+    if still := _standing_drives(identification):
+        message += (
+            f". Stands do not show the Coulomb friction of {listed(still)}, which holds anything "
+            "between its bounds there: intervals have room for it. Add slow sweeps of these "
+            "joints, or leave it out with friction = 'none' in [model]; to halve what it does, "
+            "approach each pose from both sides"
+        )
+    evidence = {"rows": float(rows), "samples": float(samples)}
+    return [Finding("static", "note", "standard_parameters", message, evidence)]
+
+
+def _standing_drives(identification: Identification) -> list[str]:
+    """Return the drives whose friction has no direction in any row used, by name."""
+    layout, still = identification.model.layout, []
+    for d, (drive, ratios) in enumerate(zip(layout.drives, layout.drive_ratios, strict=True)):
+        motions = [(e.recording.trajectory, e.recording.mask) for e in identification.fitted]
+        shown = [
+            motion.direction is None or motion.direction[mask[:, ratios != 0].all(axis=1), d].any()
+            for motion, mask in motions
+        ]
+        still += [] if any(shown) else [drive.name]
+    return still
 
 
 def _drive_findings(identification: Identification) -> list[Finding]:

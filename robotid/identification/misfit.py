@@ -225,13 +225,15 @@ class Sample:
 
 
 def take_sample(identification: "Identification", *, is_steady: bool = True) -> Sample | None:
-    """Return rows spread over the recordings; None if there are too few to judge by.
+    """Return rows spread over the recordings; None if there are too few, or static ones.
 
     Args:
         identification: What was found.
         is_steady: Whether rows near reversals are left out, where a drive that sticks is smeared.
     """
     model, mapping = identification.model, identification.mapping
+    if model.is_static:
+        return None
     kept = [e for e in identification.validation if not e.is_refitted]
     rows, independent = _spread_rows(model, identification.fitted, kept)
     own = sum(map(len, rows[: len(identification.fitted)]))

@@ -15,12 +15,17 @@ from robotid.doctor.urdf_inertials import impossible_inertials
 from robotid.estimators import WLS, Consistent, Estimate
 from robotid.estimators.determination import Determination, base_spread, determine
 from robotid.estimators.estimator import Weighing
-from robotid.exceptions import DataError, NotConvergedError, RankDeficientError
+from robotid.exceptions import (
+    DataError,
+    NotConvergedError,
+    RankDeficientError,
+    SettingsError,
+)
 from robotid.findings import Finding
 from robotid.identification.bands import TorqueBand, torque_band
 from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.drive_choice import DriveChoice, choose_drives, wanted_families
-from robotid.identification.evaluation import Evaluation, evaluate_logs, pool
+from robotid.identification.evaluation import Evaluation, evaluate_logs, hidden_joints, pool
 from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
@@ -62,7 +67,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import prior_spread
 
-__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify"]
+__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify", "with_drives"]
 
 #: What may have determined a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
@@ -279,6 +284,8 @@ class Identification:
             doubts=self.doubts,
             refitted=[e.recording.name for e in self.refitted],
             witness=self.witness,
+            is_static=self.model.is_static,
+            hidden=hidden_joints(self.model, self.fitted),
         )
 
 
@@ -346,8 +353,13 @@ def conclude(
     """
     model, is_robust = recordings.model, choice.is_robust
     wanted = wanted_families(friction, model.joints)
+    if model.is_static and any(wanted.values()):
+        raise SettingsError(
+            "dynamics is 'static', which has friction 'none' or 'viscous+coulomb' (without the "
+            "viscous), but more is stated; leave it out, or set dynamics = 'full'"
+        )
     with _explained(found):
-        fit = _with_drives(recordings, choice, wanted)
+        fit = with_drives(recordings, choice, wanted)
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"
@@ -378,12 +390,21 @@ def _explained(found: Sequence[Finding]) -> Iterator[None]:
         raise
 
 
-def _with_drives(
+def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
     wanted: Mapping[str, Sequence[str] | None],
 ) -> Identification:
-    """Identify a robot's parameters, and the friction of its joints that the logs show."""
+    """Identify a robot's parameters, and the friction of its joints that the logs show.
+
+    Args:
+        recordings: The recordings.
+        choice: Which estimator.
+        wanted: Friction of each joint, as of ``wanted_families``.
+
+    Raises:
+        DataError, RankDeficientError, NotConvergedError: As of ``identify``.
+    """
     fit = _fitted(recordings, choice)
     drives = choose_drives(fit, wanted)
     own = {drive.joint: drive.terms for drive in drives if drive.terms}
@@ -550,6 +571,11 @@ def _run(
     recordings, before = ground.recordings, ground.before
     model, mapping = recordings.model, recordings.mapping
     estimator = make_estimator(choice, model, mapping, before)
+    if model.is_static and estimator.needs_mass:
+        raise SettingsError(
+            f"the estimator {choice.name!r} needs the mass matrix, which dynamics = 'static' does "
+            "not identify; choose another one, or dynamics = 'full'"
+        )
     if estimator.reads == "factors":
         return estimator.fit(ground.factors), estimator.in_cone, estimator.weighing
     estimate = estimator.fit(recordings.problem(with_mass=estimator.needs_mass))

@@ -147,6 +147,8 @@ class Recordings:
         """Yield what each stretch of a log in memory comes down to."""
         motion, count = self.fitted[k].whole.trajectory, -(-_STRETCHES // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
+        if self.model.is_static:  # means of stretches, behind no filter
+            shortest = 1
         length = max(-(-len(motion.t) // count), shortest)
         for i, factors in enumerate(compress_stretches(self._problem(k), length)):
             part = motion.part(i * length, (i + 1) * length)

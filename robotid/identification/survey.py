@@ -31,7 +31,7 @@ from robotid.regressor.columns import friction_speeds
 from robotid.regressor.factors import Reduction
 from robotid.regressor.memory import remember
 from robotid.regressor.rows import COMPILED, choose_engine
-from robotid.regressor.used_rows import base_problem, row_mask
+from robotid.regressor.used_rows import base_problem, row_mask, static_rows
 from robotid.robot.model import RobotModel
 from robotid.workers.pieces import Piece, Workload
 
@@ -117,7 +117,11 @@ class LogPiece:
         return self._kept if isinstance(self.header.source, Log) else self._read()
 
     def take(self, rows: Rows) -> None:
-        """Keep rows that were smoothed before, of a robot with the same friction speeds."""
+        """Keep rows that were smoothed before, of a robot with the same friction speeds.
+
+        Args:
+            rows: The rows.
+        """
         model = self.header.model
         motion = remember(model, replace(rows.trajectory, memory=None))
         mask = row_mask(model, motion, self.header.signals.min_velocity)
@@ -131,17 +135,20 @@ class LogPiece:
         header = self.header
         raw = header.read(*self.span, self.near)
         log = _unwrap(header.model, raw)
-        trajectory = process_stretches(
-            log,
-            self.stretches,
-            header.signals,
-            first=self.span[0],
-            own=slice(self.first, self.stop),
-            speeds=friction_speeds(header.model.layout),
-        )
-        trajectory = remember(header.model, trajectory)
         rows = slice(self.first - self.span[0], self.stop - self.span[0])
-        mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+        if header.model.is_static:
+            trajectory, mask = static_rows(header.model, log, header.signals)
+        else:
+            trajectory = process_stretches(
+                log,
+                self.stretches,
+                header.signals,
+                first=self.span[0],
+                own=slice(self.first, self.stop),
+                speeds=friction_speeds(header.model.layout),
+            )
+            mask = row_mask(header.model, trajectory, header.signals.min_velocity)
+        trajectory = remember(header.model, trajectory)
         return Rows(raw.q[rows], raw.tau[rows], trajectory, mask, (log.q != raw.q).any(axis=0))
 
 
@@ -302,6 +309,13 @@ class SurveyedLog:
 
     def too_short(self) -> DataError:
         """Return the error of a log without a stretch that is long enough."""
+        if self.model.is_static:
+            return DataError(
+                f"{self.path or 'log'}: no stretch of a quarter of a second is slow enough for "
+                "dynamics = 'static'; record poses that are held for a second or longer, or slow "
+                "motion at one speed, or set dynamics = 'full'",
+                code="too_short",
+            )
         return too_short(self.path or "log", len(self.stretches), self.signals)
 
     @cached_property
@@ -337,6 +351,11 @@ def hold_log(
         held: Positions of locked joints, if it has them, by name [rad or m].
     """
     count = len(log.t)
+    if model.is_static:  # means of stretches take the place of filters
+        signals = replace(
+            signals, cutoff=None, rate=None, velocity="differentiated",
+            acceleration="differentiated",
+        )  # fmt: skip
     return SurveyedLog(model, log, signals, log.t, 0, count, (log,), held or {}, count)
 
 

@@ -101,6 +101,12 @@ _HYPOTHESES = (
     "urdf_mismatch",
 )
 _REPEATED = "the motion kept apart is in a fitted log, too, so no prediction was tested"
+_STATIC = (
+    "static: gravity, offsets and friction that needs no speed were identified; inertias, armature "
+    "and viscous friction were not, and keep the URDF's values: the result holds for standing and "
+    "slow motion"
+)
+_HIDDEN = "gravity changes its torque less than friction does where it stands"
 # places that are no recording
 _OF_THE_FIT = ("all joints", "estimator", "recordings", "standard_parameters")
 
@@ -177,6 +183,8 @@ def judge(
     doubts: Sequence[Doubt] = (),
     refitted: Sequence[str] = (),
     witness: Witness | None = None,
+    is_static: bool = False,
+    hidden: Sequence[str] = (),
 ) -> Verdict:
     """Return the verdict on a result.
 
@@ -191,11 +199,16 @@ def judge(
         doubts: Why the result may be wrong however well it predicts.
         refitted: Kept recordings, by name, that are left out since they hold fitted rows.
         witness: What speaks for the scale of the result but the sensors.
+        is_static: Whether the model is.
+        hidden: Joints that are not evaluated, as of ``hidden_joints``.
 
     Returns:
         The verdict. Without a kept recording, or with a doubt, it is at best "usable"; so is that
         of a joint with a doubt, and that of all joints with one about all.
     """
+    identification = _without(identification, hidden)
+    validation = {name: _without(metrics, hidden) for name, metrics in validation.items()}
+    joints = [joint for joint in joints if joint not in hidden]
     moved = [joint for m in (identification, *validation.values()) for joint in m.per_joint]
     names = dict.fromkeys([*joints, *moved])
     found = {joint: _found_on(joint, identification, validation) for joint in names}
@@ -245,6 +258,10 @@ def judge(
         )
     if witness is not None and not witness.is_against:
         reasons.append(witness.message)
+    if hidden:
+        reasons.append(f"{listed(hidden)}: {_HIDDEN}: not evaluated")
+    reasons += [_STATIC] if is_static else []
+    per_joint |= {joint: JointVerdict("not evaluated", (_HIDDEN,)) for joint in hidden}
     return Verdict(status, tuple(reasons), per_joint, tuple(alarms), tuple(doubts))
 
 
@@ -362,6 +379,12 @@ def is_outvoted(finding: Finding) -> bool:
         finding: The finding; a position that jumps spoils the regressor.
     """
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
+
+
+def _without(metrics: Metrics, joints: Sequence[str]) -> Metrics:
+    """Return metrics without those of some joints."""
+    kept = {joint: m for joint, m in metrics.per_joint.items() if joint not in joints}
+    return replace(metrics, per_joint=kept)
 
 
 def _found_on(

@@ -1,7 +1,8 @@
 """Log files of every format: one row per sample and one column per quantity and joint.
 
 Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
-`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Aliases are read, too.
+`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Aliases are read, too. With a
+transmission, `qm_<motor>`, `taum_<motor>` [N m] and the like of the motors stand for those.
 """
 
 import difflib
@@ -18,6 +19,7 @@ from robotid.logs.data import Log, repeated, require_finite, require_increasing,
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
 from robotid.logs.table import Table, prefixes
+from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
 
 __all__ = ["LogLayout", "lay_out", "read_log", "write_log"]
@@ -38,6 +40,7 @@ def read_log(
     units: LogUnits = _SI,
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
+    transmissions: Sequence[Transmission] = (),
 ) -> Log:
     """Return the log in a file, in SI units; its notes tell what was ignored.
 
@@ -53,6 +56,7 @@ def read_log(
         units: Units of the file, if not SI.
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
+        transmissions: The motors and gears, where the file has columns of motors.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -60,8 +64,9 @@ def read_log(
         MissingDependencyError: If a package that reads the file is not installed.
     """
     layout, table = lay_out(
-        path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic, source=source
-    )
+        path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
+        source=source, transmissions=transmissions,
+    )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
     return log if start is None and end is None else log.window(start, end)
@@ -79,6 +84,8 @@ class LogLayout:
     prismatic: tuple[str, ...]  # names of joints that slide
     source: LogSource  # where in the file
     notes: tuple[str, ...]  # what the reader should know
+    motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are a motor's
+    gears: tuple[Transmission, ...]  # of the motors
 
     @property
     def wanted(self) -> list[str]:
@@ -107,11 +114,15 @@ class LogLayout:
             kind: np.stack([table[name] for name in names], axis=1)
             for kind, names in self.columns.items()
         }
-        if self.units.angle == "deg":
-            radians = [1.0 if joint in self.prismatic else np.pi / 180 for joint in self.joints]
-            turned = [kind for kind in ("q", "dq", "ddq") if kind in values]
-            values |= {kind: values[kind] * radians for kind in turned}
+        slides = np.isin(self.joints, self.prismatic)
         values["tau"] = values["tau"] * np.array(self.factors)
+        for kind, is_motor in self.motors.items():
+            if kind not in values:
+                continue
+            if self.units.angle == "deg" and kind != "tau":
+                is_length = slides & ~np.array(is_motor)
+                values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
+            values[kind] = self._of_joints(kind, values[kind])
         t = self.stamps(values["time"][:, 0])
         for kind, array in values.items():
             names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
@@ -129,6 +140,22 @@ class LogLayout:
             notes=self.notes,
         )
 
+    def _of_joints(self, kind: str, values: Array) -> Array:
+        """Return values of joints: those of motors, in their places, through their gears."""
+        if not any(self.motors[kind]):
+            return values
+        values = values.copy()
+        for gear in self.gears:
+            places = [self.joints.index(joint) for joint in gear.joints]
+            if not self.motors[kind][places[0]]:
+                continue
+            own = values[:, places].T
+            moved = gear.to_torque @ own if kind == "tau" else np.linalg.solve(gear.T, own)
+            if kind == "q" and gear.offset:
+                moved += np.array(gear.offset)[:, None]
+            values[:, places] = moved.T
+        return values
+
 
 def lay_out(
     path: str | Path,
@@ -139,6 +166,7 @@ def lay_out(
     units: LogUnits = _SI,
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
+    transmissions: Sequence[Transmission] = (),
 ) -> tuple[LogLayout, Table]:
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
@@ -150,6 +178,7 @@ def lay_out(
         units: As of ``read_log``.
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
+        transmissions: As of ``read_log``.
 
     Raises:
         DataError: If the file does not hold what is wanted.
@@ -160,9 +189,12 @@ def lay_out(
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
     opened = open_table(file, source)
+    check_transmissions(transmissions, joints)
+    gears = tuple(transmissions)
     finder = _Finder(
-        file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, [*opened.notes]
-    )
+        file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, gears,
+        [*opened.notes],
+    )  # fmt: skip
     found = finder.find_all()  # names of columns by kind
     layout = LogLayout(
         path=str(file),
@@ -173,6 +205,8 @@ def lay_out(
         prismatic=tuple(prismatic),
         source=source,
         notes=tuple(finder.notes),
+        motors={kind: finder.of_motors(kind) for kind in _NOUNS},
+        gears=gears,
     )
     return layout, opened
 
@@ -208,6 +242,7 @@ class _Finder:
     joints: tuple[str, ...]
     gains: Mapping[str, float]
     source: LogSource
+    gears: tuple[Transmission, ...]
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
@@ -216,8 +251,11 @@ class _Finder:
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
-            "q": [self._find_of("q", joint) or self._missing("q", joint) for joint in self.joints],
-            "tau": [self._find_torque(joint) for joint in self.joints],
+            "q": [column or self._missing(*at) for at, column in self._each("q")],
+            "tau": [
+                self._find_torque(self.joints[j], is_motor)
+                for j, is_motor in enumerate(self.of_motors("tau"))
+            ],
         }
         found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
         extra = [name for name in self.names if name not in self.seen]
@@ -231,8 +269,57 @@ class _Finder:
 
     def factors(self, torques: Sequence[str]) -> tuple[float, ...]:
         """Return what makes each of n columns a torque: a current's gain, or 1."""
-        currents = {self._find_of("current", joint): joint for joint in self.joints}
+        currents = {
+            self._find_of(kind, name): name
+            for kind, names in (("current", self.joints), ("currentm", self.motors.values()))
+            for name in names
+        }
         return tuple(float(self.gains[currents[n]]) if n in currents else 1.0 for n in torques)
+
+    @property
+    def motors(self) -> dict[str, str]:
+        """The motor in the place of each joint that has one, by joint."""
+        return {
+            joint: motor
+            for gear in self.gears
+            for joint, motor in zip(gear.joints, gear.names, strict=True)
+        }
+
+    def of_motors(self, kind: str) -> tuple[bool, ...]:
+        """Return of which joints a quantity is read at the motor in their place.
+
+        Args:
+            kind: "q", "dq", "ddq" or "tau".
+
+        Raises:
+            DataError: If joints of one transmission have it at the motors and at the joints.
+        """
+        kinds = ("tau", "current") if kind == "tau" else (kind,)
+        turned = set[str]()
+        for gear in self.gears:
+            at_motors, at_joints = (
+                [found for name in names for k in kinds if (found := self._find_of(k + m, name))]
+                for m, names in (("m", gear.names), ("", gear.joints))
+            )
+            if at_motors and at_joints:
+                raise DataError(
+                    f"{self.where} has {at_motors[0]!r} of a motor and {at_joints[0]!r} of a joint "
+                    f"that it drives, two {_NOUNS[kind].partition(' ')[0]} columns of one "
+                    "transmission; remove one side, or the [[transmission]] that reads the motors"
+                )
+            turned.update(gear.joints if at_motors else ())
+        return tuple(joint in turned for joint in self.joints)
+
+    def _each(self, kind: str) -> list[tuple[tuple[str, str], str | None]]:
+        """Return the column of one quantity of each joint, or of the motor in its place.
+
+        Each behind its kind, "q" or "qm", and the name of joint or motor.
+        """
+        places = [
+            (f"{kind}m", self.motors[joint]) if is_motor else (kind, joint)
+            for joint, is_motor in zip(self.joints, self.of_motors(kind), strict=True)
+        ]
+        return [(at, self._find_of(*at)) for at in places]
 
     def _check_arguments(self) -> None:
         """Refuse names twice in the file, and gains and columns of what is not read."""
@@ -246,7 +333,8 @@ class _Finder:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
         for joint in self.source.joints:
             self._require_read(joint, "log.joints renames")
-        known = ["time", *(f"{kind}_{joint}" for kind in prefixes() for joint in self.joints)]
+        names = dict.fromkeys([*self.joints, *self.motors.values()])
+        known = ["time", *(f"{kind}_{name}" for kind in prefixes() for name in names)]
         for standard, name in self.columns.items():
             if standard not in known:
                 raise SettingsError(
@@ -260,7 +348,7 @@ class _Finder:
                 )
 
     def _require_read(self, joint: str, what: str) -> None:
-        if joint not in self.joints:
+        if joint not in (*self.joints, *self.motors.values()):
             raise SettingsError(
                 f"{self.where}: {what} {joint!r}, which is not among the joints read: "
                 f"{listed(self.joints)}{suggestion(joint, self.joints)}"
@@ -288,9 +376,10 @@ class _Finder:
         """Return the name of a joint in the file."""
         return self.source.joints.get(joint, joint)
 
-    def _find_torque(self, joint: str) -> str:
-        """Return the column of a joint's torque, or of its current if that has a gain."""
-        tau, current = self._find_of("tau", joint), self._find_of("current", joint)
+    def _find_torque(self, joint: str, is_motor: bool) -> str:
+        """Return the column of a joint's or its motor's torque, or current if that has a gain."""
+        m, joint = ("m", self.motors[joint]) if is_motor else ("", joint)
+        tau, current = self._find_of(f"tau{m}", joint), self._find_of(f"current{m}", joint)
         has_gain = joint in self.gains
         if tau and current:
             used, unused = (current, tau) if has_gain else (tau, current)
@@ -307,13 +396,13 @@ class _Finder:
                 f"CLI --gain {joint}=...)",
                 code="missing_gain",
             )
-        return tau or current or self._missing("tau", joint)
+        return tau or current or self._missing(f"tau{m}", joint)
 
     def _find_optional(self, kind: str) -> list[str]:
         """Return the columns of a quantity that every joint has; none if some joint lacks it."""
-        found = {joint: self._find_of(kind, joint) for joint in self.joints}
-        names = [name for name in found.values() if name]
-        without = [joint for joint, name in found.items() if not name]
+        found = self._each(kind)
+        names = [name for _, name in found if name]
+        without = [joint for (_, joint), name in found if not name]
         if names and without:
             self.notes.append(f"{listed(names)} ignored: {listed(without)} have no {_NOUNS[kind]}")
         return [] if without else names
@@ -321,7 +410,7 @@ class _Finder:
     def _missing(self, kind: str, joint: str) -> str:
         """Refuse a file without a column, naming those of its kind and the nearest."""
         standard = f"{kind}_{joint}" if joint else kind
-        noun = f"{_NOUNS[kind]} columns" if joint else "columns"
+        noun = f"{_NOUNS[kind.removesuffix('m')]} columns" if joint else "columns"
         known, named = prefixes(self.source.effort), self._named(joint)
         starts = (*known.get(kind, ("",)), *(known["current"] if kind == "tau" else ()))
         others = {self._named(other) for other in self.joints}
@@ -335,8 +424,15 @@ class _Finder:
         near = repr(ends[nearest[0]]) if nearest else "..."
         hint = f"Did you mean {near}? " if nearest else ""
         sought = f"{kind}_{named}" if joint else kind
-        stood = f"; if {joint!r} stood still, leave it out of joints and lock it" if joint else ""
-        stood += self._how_to_lock() if joint else ""
+        stood = ""
+        if joint in self.joints and kind in _NOUNS:
+            stood = f"; if {joint!r} stood still, leave it out of joints and lock it"
+            stood += self._how_to_lock()
+        if at_motors := [name for name in self.names if name.startswith(f"{kind}m_")]:
+            stood = (
+                f". Columns of motors, as {at_motors[0]}, need the gears: [[transmission]] with "
+                "joints and matrix"
+            )
         raise DataError(
             f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
             f"Rename it, or pass columns={{{standard!r}: {near}}}{stood}",

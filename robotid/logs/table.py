@@ -29,6 +29,7 @@ _PREFIXES = {
     "ddq": ("ddq_", "acceleration_", "qdd_"),
     "tau": ("tau_", "effort_", "torque_"),
     "current": ("current_", "i_"),
+    **{f"{kind}m": (f"{kind}m_",) for kind in ("q", "dq", "ddq", "tau", "current")},  # motors'
 }
 
 

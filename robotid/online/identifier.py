@@ -53,12 +53,14 @@ class OnlineIdentifier:
         names: Names of the base parameters.
 
     Raises:
-        DataError: If the base floats; later, by ``reading``, ``compared`` and ``estimate``, until
-            the robot has moved enough for a first estimate.
+        DataError: If the base floats or the model is static; later, by ``reading``, ``compared``
+            and ``estimate``, until the robot has moved enough for a first estimate.
         SettingsError: If the cut-off is not below half the rate.
     """
 
     def __init__(self, model: RobotModel, settings: OnlineSettings | None = None) -> None:
+        if model.is_static:
+            raise DataError("an online identification needs a model with dynamics = 'full'")
         self.model, self.settings = model, settings or OnlineSettings()
         s = self.settings
         self.mapping = structural_mapping(model)

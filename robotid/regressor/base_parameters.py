@@ -182,13 +182,14 @@ def base_mapping(
         raise DataError("W must be finite and not all zero")
     magnitude = np.ones(len(names)) if scales is None else scales
     R = scipy.linalg.qr(W * magnitude, mode="r", overwrite_a=True, check_finite=False)[0]
-    order, pivots = _pivot(R[: len(names)])
+    R = R[: len(names)]  # the rest is 0
+    order, pivots = _pivot(R)
     rank = int(np.sum(pivots > rtol * pivots[0]))
     if preference is not None:
-        order, _ = _pivot(R[: len(names)] * preference)
+        order, _ = _pivot(R * preference)
     independent, dependent = np.sort(order[:rank]), np.sort(order[rank:])
-    Q1, R1 = scipy.linalg.qr(R[:, independent], mode="economic")
-    X = scipy.linalg.solve_triangular(R1, Q1.T @ R[:, dependent])  # (b, p - b), scaled columns
+    triangle = scipy.linalg.qr(R[:, np.append(independent, dependent)], mode="r")[0][:rank]
+    X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled, (b, p - b)
     X[np.abs(X) < _CLEAN] = 0.0
     K = np.zeros((rank, len(names)))
     K[:, independent] = np.eye(rank)

@@ -33,6 +33,7 @@ __all__ = [
     "join",
     "join_stretches",
     "merge",
+    "triangle_of",
 ]
 
 ItemT = TypeVar("ItemT")
@@ -78,7 +79,7 @@ class Factors:
         for triangle, own in zip(self.triangles, self.columns, strict=True):
             kept.append(np.flatnonzero(np.isin(columns, own)))
             places = np.append(np.searchsorted(own, columns[kept[-1]]), len(own))
-            triangles.append(_triangle(triangle[:, places]))
+            triangles.append(triangle_of(triangle[:, places]))
         names = tuple(self.names[i] for i in columns)
         return Factors(tuple(triangles), tuple(kept), self.rows, names)
 
@@ -432,8 +433,12 @@ def _fold_part(source: RowSource, start: int) -> list[Array]:
     return [triangle.R for triangle in triangles]
 
 
-def _triangle(rows: Array) -> Array:
-    """Return the square upper triangular factor R of rows (m, k), padded with zeros if m < k."""
+def triangle_of(rows: Array) -> Array:
+    """Return the square upper triangular factor R of rows, padded with zeros if m < k.
+
+    Args:
+        rows: Rows, shape (m, k).
+    """
     k = rows.shape[1]
     if len(rows) == 0:
         return np.zeros((k, k))

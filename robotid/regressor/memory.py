@@ -43,12 +43,13 @@ def drive_motion_along(model: RobotModel, trajectory: Trajectory) -> DriveMotion
 
     Args:
         model: The robot.
-        trajectory: N samples in order of time; its ``memory`` is not read.
+        trajectory: N samples in order of time.
 
     Returns:
         Arrays of shape (d, N).
     """
-    layout, m, pi = model.layout, replace(trajectory, memory=None), model.carried_by
+    layout, pi = model.layout, model.carried_by
+    m = replace(trajectory, memory=None)  # that of another reference, if it has one
     first = model.n_rows - len(model.joints)
     signs = friction_directions(layout, m.v, m.direction)
     begins = np.diff(m.segment, prepend=m.segment[:1] - 1) != 0

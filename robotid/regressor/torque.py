@@ -234,6 +234,8 @@ def build_problem(
 def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) -> Array:
     """Return the regressor at random states, shape (N n_rows, p): what any motion can excite.
 
+    Of a static model, the states have no speed but for the direction of friction.
+
     The states are scaled to the robot: speeds sqrt(g / length), accelerations g / length, so that
     gravity and inertia weigh alike on a finger and on a crane.
 
@@ -260,9 +262,11 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
         v = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate, v])
         a = np.hstack([rng.uniform(-1, 1, (samples, 6)) * linear * rate**2, a])
     kept = len(model.layout.remembering)  # loads and pasts are any, whatever the state
-    return joint_torque_regressor(
-        model, q, v, a, memory=rng.uniform(-1, 1, (samples, kept)) if kept else None
-    )
+    memory = rng.uniform(-1, 1, (samples, kept)) if kept else None
+    signs = friction_directions(model.layout, v, None)
+    if model.is_static:
+        v, a = 0.0 * v, 0.0 * a
+    return joint_torque_regressor(model, q, v, a, signs, memory)
 
 
 def _write_drives(

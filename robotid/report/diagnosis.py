@@ -46,6 +46,8 @@ def residual_section(found: Identification) -> str:
         found: The identification.
     """
     evaluation = _shown(found)
+    if found.model.is_static:
+        return "<p>Stands and slow stretches are no signal that has a spectrum.</p>\n"
     figures = "".join(
         _residual_figure(evaluation, row, name, unit)
         for row, (name, unit) in enumerate(
@@ -84,7 +86,8 @@ def drive_figures(found: Identification) -> str:
             f"gain that much by chance.</p>\n{choice}"
         )
     curves = ""
-    if not all(term.is_inertia for _, term in layout.drive_parameters):
+    is_static = found.model.is_static  # it knows no speeds
+    if not is_static and not all(term.is_inertia for _, term in layout.drive_parameters):
         curves = (
             "<h3>Friction against speed</h3>\n<p>Torque that inertia, gravity and armature leave, "
             f"on {escape(_shown(found).recording.name)}, and the friction and offset identified. "

@@ -1,13 +1,20 @@
 """Which link's mass is in which body: links joined by fixed or locked joints are one body."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
+from robotid.exceptions import ModelError
+from robotid.findings import listed
 from robotid.robot.model import RobotModel
-from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.robot.parameters import (
+    inertial_from_pseudo_inertia,
+    pseudo_inertia,
+    pseudo_inertia_basis,
+)
 from robotid.robot.tree import Inertial
 
 __all__ = [
@@ -16,6 +23,7 @@ __all__ = [
     "held_parameters",
     "inertial_parameters",
     "link_places",
+    "link_transfer",
     "principal_moments",
 ]
 
@@ -52,8 +60,7 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
     arriving = {joint.child: joint for joint in model.tree.joints}
     places = []
     for link in model.tree.links:
-        frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
-        body = frame.parentJoint - 1
+        body, transfer = link_transfer(model, link)
         role, at = "moved", link
         while at in arriving and (body < 0 or at != model.layout.bodies[body]):
             joint = arriving[at]
@@ -62,12 +69,35 @@ def link_places(model: RobotModel) -> tuple[LinkPlace, ...]:
         inertial = model.tree.inertials.get(link)
         parameters = np.zeros(10)
         if inertial is not None:
-            # a pseudo-inertia moves with a homogeneous matrix H as H J H^T, massless links too
-            (J,) = pseudo_inertia(inertial_parameters(inertial))
-            H = frame.placement.homogeneous
-            parameters = inertial_from_pseudo_inertia(H @ J @ H.T)
+            parameters = transfer @ inertial_parameters(inertial)
         places.append(LinkPlace(link, body, role, parameters))
     return tuple(places)
+
+
+def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
+    """Return what of the model a mass in a link's frame adds to.
+
+    Args:
+        model: The robot.
+        link: Name of a link of its URDF.
+
+    Returns:
+        Index of its body in ``layout.bodies``, -1 if it is fixed to the world; and the map from
+        inertial parameters in the link's frame to those in the body's, shape (10, 10).
+
+    Raises:
+        ModelError: If the URDF has no such link.
+    """
+    if link not in model.tree.links:
+        raise ModelError(
+            f"link {link!r} is not in {Path(model.tree.path).name}; links: "
+            f"{listed(model.tree.links, 30)}"
+        )
+    frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
+    # a pseudo-inertia moves with a homogeneous matrix H as H J H^T, massless links too
+    H = frame.placement.homogeneous
+    moved = [inertial_from_pseudo_inertia(H @ B @ H.T) for B in pseudo_inertia_basis()]
+    return frame.parentJoint - 1, np.column_stack(moved)
 
 
 def held_parameters(model: RobotModel) -> Array:

@@ -1,5 +1,6 @@
 """Robots of the installed package example-robot-data, found by file name."""
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from robotid.findings import listed
 __all__ = ["example_urdf", "example_urdfs"]
 
 
+@cache
 def example_urdfs() -> tuple[Path, ...]:
     """Return the paths of every URDF of example-robot-data, sorted.
 

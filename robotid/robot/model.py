@@ -12,11 +12,11 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
-from robotid.exceptions import DataError, ModelError
+from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
-from robotid.robot.drives import DRIVE_TERMS, DriveTerm
+from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveMotion, DriveTerm
 from robotid.robot.native_messages import caught_messages
-from robotid.robot.parameters import Coupling, ParameterLayout
+from robotid.robot.parameters import DYNAMICS, Coupling, ParameterLayout
 from robotid.robot.tree import Joint, Tree, read_tree
 from robotid.robot.urdf_text import LARGEST
 
@@ -48,6 +48,8 @@ class RobotModel:
         mimic: How mimic joints are treated: "independent" or "coupled".
         reference: Standard parameters by which torques that drive terms depend on are reckoned,
             the load of a gear among them, shape (p,); None: those of the URDF.
+        dynamics: "full", or "static": of logs of poses and slow motion, velocities and
+            accelerations are not used but for the sign of friction.
     """
 
     tree: Tree
@@ -59,6 +61,7 @@ class RobotModel:
     locked: Mapping[str, float]
     mimic: str
     reference: Array | None = None
+    dynamics: str = "full"
 
     def __repr__(self) -> str:
         return (
@@ -79,6 +82,7 @@ class RobotModel:
         terms: Sequence[str] = DRIVE_TERMS,
         couplings: Sequence[Coupling] = (),
         own_terms: Mapping[str, Sequence[DriveTerm]] = MappingProxyType({}),
+        dynamics: str = "full",
         snap_angles: bool = False,
     ) -> "RobotModel":
         """Read a robot from a URDF. Meshes are not needed.
@@ -96,6 +100,7 @@ class RobotModel:
             terms: Drive terms that are parameters, a subset of armature, viscous, coulomb, offset.
             couplings: Drives that turn with several joints.
             own_terms: Further terms of single drives, by name of the joint or coupling.
+            dynamics: "full"; or "static" for gravity alone, with terms that act without speed.
             snap_angles: Whether angles of joints that the file rounds, 3.1416, become the multiple
                 of pi/12 that they round; see ``exact_angle`` for which are taken as rounded.
 
@@ -110,6 +115,15 @@ class RobotModel:
         tree = tree.snapped() if snap_angles else tree
         if mimic not in ("independent", "coupled"):
             raise ModelError(f"mimic is {mimic!r}, wanted 'independent' or 'coupled'")
+        if dynamics not in DYNAMICS:
+            raise ModelError(f"dynamics is {dynamics!r}, wanted one of {listed(DYNAMICS)}")
+        if dynamics == "static":
+            _check_pull(gravity)
+            terms = [x for x in terms if x not in TERMS or _acts_at_rest(TERMS[x])]
+            own_terms = {
+                name: [term for term in own if _acts_at_rest(term)]
+                for name, own in own_terms.items()
+            }
         if not (tree.movable or free_flyer):
             raise ModelError(
                 f"{Path(tree.path).name}: robot {tree.name!r} has no movable joint, so there is "
@@ -136,7 +150,8 @@ class RobotModel:
             strokes={j.name: j.upper - j.lower for j in slides if j.has_limits},
             own={name: tuple(terms) for name, terms in own_terms.items() if terms},
         )
-        return cls(tree, reduced, layout, G, shift, free_flyer, MappingProxyType(positions), mimic)
+        held = MappingProxyType(positions)
+        return cls(tree, reduced, layout, G, shift, free_flyer, held, mimic, dynamics=dynamics)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "locked": dict(self.locked)}
@@ -154,11 +169,17 @@ class RobotModel:
             "gravity": [float(g) for g in self.pin_model.gravity.linear],
             "free_flyer": self.free_flyer,
             "mimic": self.mimic,
+            "dynamics": self.dynamics,
             "terms": list(self.layout.terms),
             "own_terms": {
                 name: [term.to_dict() for term in terms] for name, terms in self.layout.own.items()
             },
         }
+
+    @property
+    def is_static(self) -> bool:
+        """Whether only what stands and slow motion show is identified."""
+        return self.dynamics == "static"
 
     @property
     def name(self) -> str:
@@ -314,6 +335,18 @@ class RobotModel:
         drive = np.zeros((self.n_rows, len(self.layout.drive_names)), dtype=bool)
         drive[self.n_rows - len(self.joints) :] = self.layout.drive_loads != 0.0
         return np.hstack([inertial, drive])
+
+
+def _acts_at_rest(term: DriveTerm) -> bool:
+    """Return whether a term acts at the speed 0, in the direction of friction or without one."""
+    still, one = np.zeros(2), np.array([0.5, 1.0])
+    slow = DriveMotion(q=one, v=still, a=still, direction=one, load=one, rate=still)
+    return bool(term.column(slow).any())
+
+
+def _check_pull(gravity: Sequence[float]) -> None:
+    if not np.any(_gravity(gravity)):
+        raise SettingsError("dynamics is 'static', but gravity is 0: nothing would load the joints")
 
 
 def _inertia(values: Array) -> pin.Inertia:

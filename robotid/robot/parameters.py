@@ -13,6 +13,7 @@ from robotid.robot.drives import DRIVE_TERMS, TERMS, DriveTerm
 from robotid.robot.urdf_text import LARGEST
 
 __all__ = [
+    "DYNAMICS",
     "INERTIAL_TERMS",
     "PAPER_TERMS",
     "Coupling",
@@ -23,6 +24,8 @@ __all__ = [
     "to_paper_order",
 ]
 
+#: What of the dynamics is identified: all, or what stands and slow motion show.
+DYNAMICS = ("full", "static")
 #: Inertial parameters of one body in Pinocchio's order; inertia about the joint frame.
 INERTIAL_TERMS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 #: The same ten in the paper's order (9).
@@ -39,10 +42,13 @@ class Coupling:
     Attributes:
         name: Name of the drive, used in parameter names.
         ratios: Pairs of joint name and ratio [-].
+        replaces: Whether it stands in the place of the own drive of the joint whose name it has,
+            with an offset then; if not, it is beside those of the joints.
     """
 
     name: str
     ratios: tuple[tuple[str, float], ...]
+    replaces: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class ParameterLayout:
     """Which standard parameters a model has, and in which order.
 
     Ten inertial parameters per body, then the drive terms joint by joint, then those of each
-    coupling (which has no offset of its own).
+    coupling (which has no offset of its own, unless it replaces the drive of a joint).
 
     Attributes:
         bodies: Names of the bodies, one per movable joint (and one for a floating base).
@@ -75,7 +81,9 @@ class ParameterLayout:
         if unknown:
             raise SettingsError(f"unknown drive terms {listed(unknown)}; known: {listed(TERMS)}")
         for coupling in self.couplings:
-            missing = [joint for joint, _ in coupling.ratios if joint not in self.joints]
+            named = [joint for joint, _ in coupling.ratios]
+            named += [coupling.name] if coupling.replaces else []
+            missing = [joint for joint in named if joint not in self.joints]
             if missing:
                 raise SettingsError(
                     f"coupling {coupling.name!r} names the joints {listed(missing)}, which are "
@@ -87,9 +95,10 @@ class ParameterLayout:
                         f"coupling {coupling.name!r}: the ratio of joint {joint!r} is {ratio!r}, "
                         f"wanted a number within +-{LARGEST:g} [-]"
                     )
-            if coupling.name in self.joints:
+            if sum(drive.name == coupling.name for drive in self.drives) > 1:
                 raise SettingsError(
-                    f"coupling {coupling.name!r} has the name of a joint; give it another name"
+                    f"coupling {coupling.name!r} has the name of a joint or of another drive; give "
+                    "it another name"
                 )
         strangers = [name for name in self.own if name not in {d.name for d in self.drives}]
         if strangers:
@@ -105,18 +114,18 @@ class ParameterLayout:
 
     @property
     def coupling_terms(self) -> tuple[str, ...]:
-        """Drive terms of a coupling: those of a joint without the offset."""
+        """Drive terms of a coupling beside the joints' drives: those without the offset."""
         return tuple(term for term in self.terms if TERMS[term].is_shared)
-
-    @property
-    def n_own(self) -> int:
-        """Number of drive parameters of the joints' own drives, which come before the others."""
-        return sum(d < len(self.joints) for d, _ in self.drive_parameters)
 
     @cached_property
     def drives(self) -> tuple[Coupling, ...]:
-        """The drives: one per joint, which turns with it alone, then the couplings."""
-        return (*(Coupling(joint, ((joint, 1.0),)) for joint in self.joints), *self.couplings)
+        """The drives: one per joint, which turns with it alone, then the couplings.
+
+        A coupling that replaces the drive of a joint stands in its place.
+        """
+        instead = {c.name: c for c in self.couplings if c.replaces}
+        own = [instead.get(joint, Coupling(joint, ((joint, 1.0),))) for joint in self.joints]
+        return (*own, *(coupling for coupling in self.couplings if not coupling.replaces))
 
     @cached_property
     def drive_ratios(self) -> Array:
@@ -146,7 +155,8 @@ class ParameterLayout:
     @cached_property
     def drive_parameters(self) -> tuple[tuple[int, DriveTerm], ...]:
         """Which of ``drives`` each drive parameter belongs to, and its term."""
-        shared = [self.terms] * len(self.joints) + [self.coupling_terms] * len(self.couplings)
+        beside = len(self.drives) - len(self.joints)
+        shared = [self.terms] * len(self.joints) + [self.coupling_terms] * beside
         return tuple(
             (d, term)
             for d, (drive, names) in enumerate(zip(self.drives, shared, strict=True))
@@ -162,6 +172,12 @@ class ParameterLayout:
     def follows_direction(self) -> bool:
         """Whether a term holds the direction of friction."""
         return any(term.follows_direction for _, term in self.drive_parameters)
+
+    @cached_property
+    def is_coupled(self) -> Array:
+        """Which drive parameters are friction or inertia of a coupling, flags, shape (k,), bool."""
+        owned = [(self.drives[d] in self.couplings, term) for d, term in self.drive_parameters]
+        return np.array([is_shared and term.is_shared for is_shared, term in owned], dtype=bool)
 
     @cached_property
     def drive_loads(self) -> Array:

@@ -8,7 +8,7 @@ from robotid.robot.mass_matrix import carried_inertia
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 
-__all__ = ["prior_spread"]
+__all__ = ["payload_spread", "prior_spread"]
 
 _SMALLEST_MASS = 0.1  # of the mean mass: a link may be that wrong even if its URDF says 0
 _SMALLEST_RADIUS = 0.1  # of the robot's length: the same for a link's size
@@ -32,6 +32,19 @@ def prior_spread(model: RobotModel, squares: Array, samples: int) -> Array:
     """
     rms = np.sqrt(squares / max(samples, 1))
     return np.concatenate([_inertial_spread(model), _drive_spread(model, rms)])
+
+
+def payload_spread(model: RobotModel) -> Array:
+    """Return how large the parameters of a payload may plausibly be, shape (10,).
+
+    Those of the robot's mass at the distance of its longest link.
+
+    Args:
+        model: The robot, with the URDF's parameters.
+    """
+    masses = model.standard_parameters()[: model.layout.n_inertial : 10]
+    mass, radius = max(float(np.abs(masses).sum()), 1e-3), model.length
+    return mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
 
 
 def _inertial_spread(model: RobotModel) -> Array:

@@ -133,6 +133,29 @@ class Tree:
         return tuple(joint for joint in self.joints if joint.is_movable)
 
     @property
+    def reductions(self) -> dict[str, float]:
+        """Gear ratios that a ``<transmission>`` of one joint and one actuator states, by joint.
+
+        Raises:
+            ModelError: If one is no number.
+        """
+        found = {}
+        for element in self.robot.findall("transmission"):
+            joints, actuators = element.findall("joint"), element.findall("actuator")
+            texts = {(x.text or "").strip() for x in element.iter("mechanicalReduction")}
+            if not len(joints) == len(actuators) == len(texts) == 1:
+                continue
+            name, (text,) = joints[0].get("name", ""), texts
+            try:
+                found[name] = float(text)
+            except ValueError as error:
+                raise ModelError(
+                    f"{Path(self.path).name}: the mechanicalReduction of joint {name!r} is "
+                    f"{text!r}, wanted a number"
+                ) from error
+        return found
+
+    @property
     def xml(self) -> str:
         """A URDF with nothing but the links, inertials and joints, its numbers as read here."""
         minimal = ET.Element("robot", name=self.name)

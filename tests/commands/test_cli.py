@@ -1,6 +1,8 @@
 """The command line as a user meets it: files in, files out, exit codes and messages."""
 
+import io
 import json
+from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
@@ -117,14 +119,41 @@ def test_the_written_urdf_holds_the_identified_masses(identified):
     )
 
 
-def test_friction_goes_into_the_urdf_where_asked(logs, tmp_path, capsys):
-    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path), "--json"]
-    assert main([*words, "--dynamics"]) == 0
-    result = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def alone(logs, tmp_path_factory):
+    """What is printed of one log without another to validate on, and the folder written."""
+    out, printed, said = tmp_path_factory.mktemp("alone"), io.StringIO(), io.StringIO()
+    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(out), "--json"]
+    with redirect_stdout(printed), redirect_stderr(said):
+        assert main([*words, "--dynamics", "--no-report"]) == 0
+    assert said.getvalue() == ""
+    return json.loads(printed.getvalue()), out
+
+
+def test_friction_goes_into_the_urdf_where_asked(alone):
+    result, out = alone
     value = {p["name"]: p["value"] for p in result["drive_parameters"]}
-    text = (tmp_path / result["outputs"]["urdf"]).read_text()
+    text = (out / result["outputs"]["urdf"]).read_text()
     assert f'damping="{value["elbow_joint.viscous"]!r}"' in text
     assert f'friction="{value["elbow_joint.coulomb"]!r}"' in text
+
+
+def test_json_prints_one_object_and_nothing_else(alone):
+    result, out = alone
+    assert result == json.loads((out / "result.json").read_text())
+
+
+def test_no_report_is_written_where_none_is_wanted(alone):
+    result, out = alone
+    assert set(result["outputs"]) == {"urdf", "sidecar"}
+    written = {path.name for path in out.iterdir()}
+    assert written == {"result.json", *result["outputs"].values()}
+
+
+def test_without_validation_the_verdict_is_not_good(alone):
+    result, _ = alone
+    assert result["verdict"]["status"] == "usable"
+    assert "no validation log given" in str(result["verdict"]["reasons"])
 
 
 def test_wls_result_without_a_urdf_can_be_validated(logs, tmp_path, capsys):
@@ -133,7 +162,7 @@ def test_wls_result_without_a_urdf_can_be_validated(logs, tmp_path, capsys):
     model = RobotModel.from_urdf(URDF)
     noisy = exact_log(model, truth(model), np.random.default_rng(1), noise=80 * NOISE)
     write_log(noisy, tmp_path / "noisy.csv")
-    words = ["identify", URDF, str(tmp_path / "noisy.csv"), "--estimator", "wls"]
+    words = ["identify", URDF, str(tmp_path / "noisy.csv"), "--estimator", "wls", "--no-report"]
     assert main([*words, "--out", str(out), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert "urdf" not in result["outputs"]
@@ -142,24 +171,10 @@ def test_wls_result_without_a_urdf_can_be_validated(logs, tmp_path, capsys):
     assert "result.json" in json.loads(capsys.readouterr().out)["predicted_with"]
 
 
-def test_json_prints_one_object_and_nothing_else(logs, tmp_path, capsys):
-    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path / "out"), "--json"]
-    assert main(words) == 0
-    printed = capsys.readouterr()
-    assert json.loads(printed.out) == json.loads((tmp_path / "out" / "result.json").read_text())
-    assert printed.err == ""
-
-
-def test_without_validation_the_verdict_is_not_good(logs, tmp_path, capsys):
-    assert main(["identify", URDF, str(logs / "fit.csv"), "--out", str(tmp_path)]) == 0
-    out = capsys.readouterr().out
-    assert "verdict: usable" in out
-    assert "no validation log given" in out
-
-
 def test_a_log_validated_on_itself_is_named(logs, tmp_path, capsys):
     log = str(logs / "fit.csv")
-    assert main(["identify", URDF, log, "--validate", log, "--out", str(tmp_path), "--json"]) == 0
+    words = ["identify", URDF, log, "--validate", log, "--out", str(tmp_path), "--json"]
+    assert main([*words, "--no-report"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert "validation_was_fitted" in [warning["code"] for warning in result["warnings"]]
     assert result["verdict"]["status"] != "good"
@@ -172,12 +187,13 @@ def test_joints_left_to_stand_at_zero_are_named(logs, tmp_path, capsys):
     log = exact_log(model, truth(model), np.random.default_rng(0), samples=800)
     write_log(log, tmp_path / "panda.csv")
     words = ["identify", urdf, str(tmp_path / "panda.csv"), "--joints", ",".join(arm)]
-    assert main([*words, "--out", str(tmp_path / "out"), "--json"]) == 0
+    words += ["--estimator", "wls", "--no-report", "--out", str(tmp_path / "out"), "--json"]
+    assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
     (warning,) = [w for w in result["warnings"] if w["code"] == "locked_at_zero"]
     assert "panda_finger_joint1" in warning["message"]
     stated = ["--lock", "panda_finger_joint1=0.0", "--lock", "panda_finger_joint2=0.0"]
-    assert main([*words, *stated, "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert main([*words, *stated]) == 0
     codes = [w["code"] for w in json.loads(capsys.readouterr().out)["warnings"]]
     assert "locked_at_zero" not in codes
 
@@ -257,6 +273,7 @@ def test_a_bad_log_is_refused_by_name_and_nothing_is_written(
 def test_a_stated_unit_overrides_the_suspicion(logs, tmp_path, capsys):
     path = spoil(logs, tmp_path, lambda lines, _: degrees(lines))
     words = ["identify", URDF, str(path), "--out", str(tmp_path / "out"), "--json"]
+    words += ["--estimator", "wls", "--no-report"]
     assert main([*words, "--angle-unit", "deg"]) == 0
     base = json.loads(capsys.readouterr().out)["base_parameters"]
     assert main(["identify", URDF, str(logs / "fit.csv"), *words[3:]]) == 0
@@ -286,7 +303,7 @@ def test_a_job_file_states_its_logs_itself(logs, tmp_path, capsys):
     job = tmp_path / "job.toml"
     job.write_text(
         f'urdf = "{URDF}"\n[[identification]]\nlog = "{logs / "fit.csv"}"\n'
-        f'[[validation]]\nlog = "{logs / "keep.csv"}"\n'
+        f'[[validation]]\nlog = "{logs / "keep.csv"}"\n[output]\nreport = false\n'
     )
     assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
     assert "verdict: good" in capsys.readouterr().out
@@ -302,6 +319,7 @@ def test_rounded_angles_are_named_and_snapped_where_asked(tmp_path, rng, capsys)
     pi = truth(model)
     write_log(exact_log(model, pi, rng, samples=400), tmp_path / "log.csv")
     words = ["identify", str(source), str(tmp_path / "log.csv"), "--estimator", "wls", "--json"]
+    words.append("--no-report")
     # the directions that rounding adds carry WLS away, to links that weigh less than nothing
     assert main([*words, "--out", str(tmp_path / "plain")]) == 1
     plain = json.loads(capsys.readouterr().out)
@@ -362,14 +380,16 @@ def test_nothing_stays_behind_when_a_run_fails_late(logs, tmp_path, monkeypatch)
 
     monkeypatch.setattr(robotid.commands.identify, "write_json", broken)
     out = tmp_path / "out"
-    assert main(["identify", URDF, str(logs / "fit.csv"), "--out", str(out)]) == 1
+    words = ["identify", URDF, str(logs / "fit.csv"), "--out", str(out), "--estimator", "wls"]
+    assert main(words) == 1
     assert list(out.iterdir()) == []
 
 
 def test_a_result_can_be_validated_from_any_folder(logs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(logs)
     out = tmp_path / "out"
-    assert main(["identify", URDF, "fit.csv", "--out", str(out), "--estimator", "wls"]) == 0
+    words = ["identify", URDF, "fit.csv", "--out", str(out), "--estimator", "wls", "--no-report"]
+    assert main(words) == 0
     monkeypatch.chdir(tmp_path)
     assert main(["validate", "out/result.json", str(logs / "keep.csv")]) == 0
     assert "predicted with" in capsys.readouterr().out

@@ -156,7 +156,7 @@ def test_a_job_reads_a_bag_and_its_result_validates_on_it(tmp_path, ur5, rng, ca
     (tmp_path / "job.toml").write_text(
         f'urdf = "{example_urdf("ur5_robot.urdf")}"\n'
         f'[log]\ntopic = "/arm"\njoints = {{ {mapping} }}\nstamp = "header"\neffort = "torque"\n'
-        '[estimator]\nname = "wls"\n'
+        '[estimator]\nname = "wls"\n[output]\nreport = false\n'
         '[[identification]]\nlog = "bag"\n'
     )
     out = tmp_path / "out"

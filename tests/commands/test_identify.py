@@ -35,18 +35,18 @@ def test_the_error_of_a_robot_at_rest_carries_what_the_doctor_found(ur5, rng, tm
     assert lines[1].startswith("  doctor: warning: ")
 
 
-def test_an_earlier_urdf_does_not_stay_beside_a_result_that_has_none(ur5, rng, tmp_path, caplog):
+def test_files_of_an_earlier_run_do_not_stay_beside_a_new_result(ur5, rng, tmp_path, caplog):
     log = exact_log(ur5, truth(ur5), rng, samples=1000, rate=100.0, noise=1.0)
     write_log(log, tmp_path / "run.csv")
     job = Job(Path(ur5.tree.path), identification=(LogEntry(tmp_path / "run.csv"),))
     out = tmp_path / "out"
     _, result = run_job(replace(job, estimator=EstimatorSettings(draws=0)), out)
-    written = [out / result["outputs"][key] for key in ("urdf", "sidecar")]
+    written = [out / result["outputs"][key] for key in ("urdf", "sidecar", "report")]
     assert all(path.exists() for path in written)
     noisy = replace(log, tau=log.tau + 30.0 * rng.standard_normal(log.tau.shape))
     write_log(noisy, tmp_path / "run.csv")
-    _, result = run_job(replace(job, estimator=EstimatorSettings(name="wls")), out)
-    assert set(result["outputs"]) == {"report"}
+    _, result = run_job(replace(job, estimator=EstimatorSettings("wls"), report=False), out)
+    assert result["outputs"] == {}
     assert not any(path.exists() for path in written)
     assert "is of an earlier run and was removed" in caplog.text
 
@@ -59,6 +59,7 @@ def test_each_log_is_hashed_once_and_opened_once(ur5, rng, tmp_path, monkeypatch
     job = Job(
         Path(ur5.tree.path),
         estimator=EstimatorSettings("wls"),
+        report=False,
         identification=(LogEntry(tmp_path / "run.csv"),),
         validation=tuple(entries),
     )
@@ -102,6 +103,7 @@ def test_an_inertia_that_no_body_can_have_is_named_and_a_negative_mass_is_refuse
     write_log(log, tmp_path / "log.csv")
     text, urdf = Path(ur5.tree.path).read_text(), tmp_path / "robot.urdf"
     command = ["identify", str(urdf), str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]
+    command.append("--no-report")
     urdf.write_text(text.replace('mass value="2.275"', 'mass value="-2.275"', 1))
     assert main(command) == 1
     assert "link 'forearm_link': inertial mass is -2.275 kg" in capsys.readouterr().err
@@ -133,7 +135,7 @@ def logs(ur5, rng, tmp_path):
 def test_a_result_of_reversed_torques_is_no_urdf_and_exit_code_1(ur5, logs, tmp_path, capsys):
     logs(lambda log: replace(log, tau=-log.tau))
     files = [ur5.tree.path, str(tmp_path / "run.csv"), "--validate", str(tmp_path / "kept.csv")]
-    command = ["identify", *files, "--out", str(tmp_path / "out"), "--json"]
+    command = ["identify", *files, "--out", str(tmp_path / "out"), "--json", "--no-report"]
     assert main(command) == 1
     result = json.loads(capsys.readouterr().out)
     assert "urdf" not in result["outputs"]
@@ -153,7 +155,7 @@ def test_a_result_of_reversed_torques_is_no_urdf_and_exit_code_1(ur5, logs, tmp_
 def test_the_unit_of_the_torque_off_by_a_thousand_is_no_urdf(ur5, logs, tmp_path):
     logs(lambda log: replace(log, tau=1000.0 * log.tau))
     files = [ur5.tree.path, str(tmp_path / "run.csv"), "--out", str(tmp_path / "out")]
-    assert main(["identify", *files]) == 1  # judged or not even solved
+    assert main(["identify", *files, "--no-report"]) == 1  # judged or not even solved
     assert not list(tmp_path.glob("out/*.urdf"))
 
 
@@ -166,15 +168,17 @@ def test_python_says_what_the_command_line_says(ur5, logs, tmp_path, delay):
 
     run, kept = logs(late)
     entries = tuple(LogEntry(tmp_path / name) for name in ("run.csv", "kept.csv"))
-    job = Job(Path(ur5.tree.path), identification=entries[:1], validation=entries[1:])
+    settings = {"identification": entries[:1], "validation": entries[1:], "report": False}
+    job = Job(Path(ur5.tree.path), **settings, estimator=EstimatorSettings("wls"))
     shell = run_job(job, tmp_path / "out")[0].verdict
     named = [replace(log, path=name) for log, name in ((run, "run.csv"), (kept, "kept.csv"))]
-    python = identify(ur5, named[:1], validation=named[1:]).verdict
+    logs = {"logs": named[:1], "validation": named[1:], "estimator": "wls"}
+    python = identify(ur5, **logs).verdict
     assert {doubt.code for doubt in python.doubts} == ({"torque_delay"} if delay else set())
     assert python.status == shell.status
     assert python.doubts == shell.doubts
-    blind = identify(ur5, named[:1], validation=named[1:], doctor=False)
-    known = identify(ur5, named[:1], validation=named[1:], ignore=["torque_delay"])
+    blind = identify(ur5, **logs, doctor=False)
+    known = identify(ur5, **logs, ignore=["torque_delay"])
     assert "torque_delay" not in {doubt.code for doubt in (*blind.doubts, *known.doubts)}
     assert (known.findings != blind.findings) == (delay > 0)
     with pytest.raises(SettingsError, match="ignore names 'late'"):

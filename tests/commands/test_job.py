@@ -5,7 +5,7 @@ import pytest
 from robotid.commands.job import Job, job_from_settings, read_job
 from robotid.exceptions import SettingsError
 from robotid.logs.settings import LogSource
-from robotid.robot.drives import DRIVE_TERMS
+from robotid.robot.drives import AUTO, DRIVE_TERMS
 from robotid.robot.model import GRAVITY
 from robotid.robot.parameters import Coupling
 
@@ -46,6 +46,12 @@ time = "ms"
 name = "motor"
 ratios = { a = 1, b = -1.0 }
 
+[[transmission]]
+joints = ["a", "b"]
+motors = ["m", "n"]
+matrix = [[32, 0], [45, 45]]
+efficiency = [0.9, 1.0]
+
 [estimator]
 name = "wls"
 
@@ -80,6 +86,9 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.units.time == "ms"
     assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
+    (gear,) = job.transmissions
+    assert (gear.motors, gear.efficiency) == (("m", "n"), (0.9, 1.0))
+    assert gear.T.tolist() == [[32.0, 0.0], [45.0, 45.0]]
     assert job.estimator.name == "wls"
     assert job.dynamics is True
     (entry,) = job.identification
@@ -113,7 +122,9 @@ WRONG = {
     "true for a number": ("rate = 200.0", "rate = true", "signals.rate is True, wanted a number"),
     "cutoff true": ("cutoff = 8.0", "cutoff = true", "cutoff is true, wanted a frequency [Hz]"),
     "negative cutoff": ("cutoff = 8.0", "cutoff = -8.0", "cutoff is -8.0, wanted 0.001 to 1e6"),
-    "friction model": ('"viscous"', '"stribeck"', "friction is 'stribeck', wanted one of"),
+    "friction model": (
+        '"viscous"', '"stribek"', "friction is 'stribek', wanted auto, none, or some of viscous",
+    ),
     "estimator": ('"wls"', '"magic"', "estimator is 'magic', wanted one of"),
     "gain": ("a = 14.87", 'a = "14.87"', "gains.a is '14.87', wanted a number"),
     "one bracket": ("[[validation]]", "[validation]", "wanted tables written as [[validation]]"),
@@ -134,6 +145,10 @@ WRONG = {
     "gain infinite": ("a = 14.87", "a = inf", "gains.a is inf, wanted a number"),
     "ratio": ("a = 1, b", "a = true, b", "ratios.a is True, wanted a number"),
     "column": ("[signals]", "columns = { tau_a = 2 }\n[signals]", "columns.tau_a is 2, wanted"),
+    "no matrix": ("matrix = [[32, 0], [45, 45]]", "", "a [[transmission]] has no key 'matrix'"),
+    "matrix of text": ("[45, 45]]", '["a", 45]]', "matrix is [[32, 0], ['a', 45]], wanted"),
+    "singular": ("[45, 45]]", "[45, 0]]", "matrix [[32, 0], [45, 0]] is singular"),
+    "motor twice": ('["m", "n"]', '["m", "m"]', "motors names m twice"),
     "ignore": ("[output]", "[doctor]\nignore = [1]\n[output]", "ignore[0] is 1, wanted"),
     "ignore text": ("[output]", '[doctor]\nignore = "a"\n[output]', "ignore is 'a', wanted a list"),
     "rate too high": ("rate = 200.0", "rate = 1e9", "rate is 1000000000.0, wanted 0.001 to 1e6"),
@@ -175,4 +190,4 @@ def test_a_missing_job_file_is_named(tmp_path):
 def test_gravity_and_drive_terms_default_to_those_of_the_model():
     job = Job(urdf=Path("robot.urdf"))
     assert job.gravity == GRAVITY
-    assert job.terms == DRIVE_TERMS
+    assert job.terms == (*DRIVE_TERMS, AUTO)

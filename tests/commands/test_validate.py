@@ -30,6 +30,7 @@ def made(ur5, tmp_path_factory):
         "urdf": str(example_urdf("ur5_robot.urdf")),
         "identification": [{"log": "run.csv"}],
         "estimator": {"prior_weight": 1.0, "draws": 0},
+        "output": {"report": False},
     }
     run_job(job_from_settings(table, "job.toml", tmp_path), tmp_path / "out")
     return tmp_path, first, other

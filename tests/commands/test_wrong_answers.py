@@ -60,6 +60,7 @@ class Workplace:
             "urdf": str(URDF),
             "identification": [{"log": str(log)}],
             "validation": [{"log": str(path)} for path in kept],
+            "output": {"report": False},
             **settings,
         }
         job = job_from_settings(table, "job.toml", self.folder)

@@ -190,7 +190,9 @@ def test_ur10e_carries_a_load_and_moves_one_joint_at_a_time(recordings, monkeypa
     assert loaded.evidence["mass"] == pytest.approx(2.805, abs=3 * loaded.evidence["std_error"])
     assert "ident_20200219_14harm.parquet" not in payload
     (change,) = [f for f in findings if f.code == "payload_change"]
-    assert change.evidence["mass"] == pytest.approx(-2.805, abs=3 * change.evidence["std_error"])
+    # 2.805 kg; the stated gains make it 9 % more, as `robotid payload` weighs it
+    assert change.evidence["mass"] == pytest.approx(-3.06, abs=3 * change.evidence["std_error"])
+    assert change.evidence["std_error"] < 0.05
     assert "repeated_motion" in loud(findings)  # the same motion with and without the load
     single = examine(whole(recordings, monkeypatch, "ur10e", "jointwise_2"))
     still = {f.where.split(": ")[1] for f in single if f.code in ("static_joint", "hardly_moves")}
@@ -235,7 +237,8 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
 ):
     job = tmp_path / "job.toml"
     job.write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "{wrong_sign}"\n'
+        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[output]\nreport = false\n'
+        f'[[identification]]\nlog = "{wrong_sign}"\n'
     )
     words = ["identify", str(job), "--out", str(tmp_path / "out"), "--json"]
     assert main(words) == 1
@@ -243,7 +246,7 @@ def test_what_makes_a_result_wrong_leads_its_verdict_unless_it_is_ignored(
     assert result["verdict"]["status"] == "poor"
     assert "the torque of elbow_joint has the opposite sign" in result["verdict"]["reasons"][0]
     assert "torque_sign" in [warning["code"] for warning in result["warnings"]]
-    words = ["identify", URDF, wrong_sign, *words[2:], "--estimator", "wls"]
+    words = ["identify", URDF, wrong_sign, *words[2:], "--estimator", "wls", "--no-report"]
     assert main([*words, "--ignore", "torque_sign"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert not any("opposite sign" in reason for reason in result["verdict"]["reasons"])

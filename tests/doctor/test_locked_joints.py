@@ -33,6 +33,7 @@ def job(ur5, rng, tmp_path):
             joints=ur5.joints[:-1],
             locked={} if stated is None else {HELD: stated},
             identification=(LogEntry(tmp_path / "run.csv"),),
+            report=False,
             **options,
         )
 
@@ -52,7 +53,7 @@ def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated, s
 
 
 def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):
-    moving = job(0.0, still=False)
+    moving = job(0.0, still=False, estimator=EstimatorSettings("wls"))
     (finding,) = found(moving)
     assert finding.evidence["range"] > 0.1
     assert "identify wrist_3_joint, too" in finding.message

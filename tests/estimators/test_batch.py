@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
 from helpers.estimation import NOISE, Case, still_wrist
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, TLS, WLS
 from robotid.estimators.batch import mixed_tls
 from robotid.exceptions import DataError, RankDeficientError
-from robotid.identification.pipeline import EstimatorSettings, identify
+from robotid.identification.pipeline import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress
 from robotid.regressor.problem import Problem

@@ -24,7 +24,8 @@ def written(tmp_path_factory):
         log = exact_log(model, truth(model), rng, samples=800, noise=0.1)
         robotid.write_log(log, folder / f"{name}.csv")
     (folder / "job.toml").write_text(
-        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[[identification]]\nlog = "first.csv"\n'
+        f'urdf = "{URDF}"\n[estimator]\ndraws = 0\n[output]\nreport = false\n'
+        '[[identification]]\nlog = "first.csv"\n'
         '[[validation]]\nlog = "second.csv"\n'
     )
     found, _ = robotid.run_job(robotid.read_job(folder / "job.toml"), folder / "out")

@@ -55,6 +55,16 @@ def test_the_structure_counts_parameters(result, identified):
     }
 
 
+def test_drives_behind_gears_have_their_inertia_at_the_motor(identified):
+    gears = {"joints": list(identified.model.joints[:2]), "matrix": [-100.0, 50.0]}
+    motors = build_result(identified, {"transmission": [gears]})["motors"]
+    armature = dict(zip(identified.model.layout.names, identified.standard, strict=True))
+    for joint, ratio in zip(gears["joints"], gears["matrix"], strict=True):
+        inertia = armature[f"{joint}.armature"] / ratio**2
+        assert motors.pop(joint) == {"gear": ratio, "inertia": pytest.approx(inertia)}
+    assert motors == {}
+
+
 def finite(value, rel=1e-6):
     """Return what result.json has for a figure: none where it has no end."""
     return pytest.approx(value, rel=rel) if np.isfinite(value) else None

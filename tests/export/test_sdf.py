@@ -94,7 +94,8 @@ def test_mass_matrix_and_forces_are_pinocchios(name, tmp_path):
             apart = [state.columns[joint] for joint, _ in model.layout.couplings[0].ratios]
             M, state.M = np.delete(M, apart, axis=0), np.delete(state.M, apart, axis=0)
             force, state.tau = np.delete(force, apart), np.delete(state.tau, apart)
-            assert "motor.armature, motor.viscous, motor.coulomb" in notes[0]
+            drive = model.layout.couplings[0].name
+            assert f"{drive}.armature, {drive}.viscous, {drive}.coulomb" in notes[0]
         np.testing.assert_allclose(M, state.M, atol=1e-9 * largest, rtol=0)
         np.testing.assert_allclose(force, state.tau, atol=1e-9 * abs(state.tau).max(), rtol=0)
 

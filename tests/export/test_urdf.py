@@ -95,6 +95,9 @@ OPTIONS = {
     "floating, locked": dict(free_flyer=True, locked={"elbow": -0.4}),
     "few terms, tilted": dict(terms=["viscous"], gravity=(1.0, -2.0, -9.0)),
     "coupled": dict(couplings=[Coupling("motor", (("shoulder", 1.0), ("elbow", -0.5)))]),
+    "transmission": dict(
+        couplings=[Coupling("elbow", (("shoulder", 1.0), ("elbow", -0.5)), replaces=True)]
+    ),
 }
 
 

@@ -1,5 +1,6 @@
 """Robots that simulators are given, and what Pinocchio says of their dynamics."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,9 @@ SIMULATED = {
     "planar": ("planar_2r.urdf", {}),
     "arm": ("ur10_robot.urdf", {"gravity": (1.0, -2.0, -9.0)}),
     "coupled drives": ("ur10_robot.urdf", {"couplings": (WRIST,)}),
+    "shared motor": (
+        "ur10_robot.urdf", {"couplings": (replace(WRIST, name="wrist_3_joint", replaces=True),)}
+    ),
     "fingers that slide": ("panda.urdf", {"mimic": "coupled"}),
     "continuous joints": ("double_pendulum_continuous.urdf", {}),
     "locked in the middle": (

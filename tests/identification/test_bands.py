@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.export.result import build_result
 from robotid.identification.bands import TorqueBand, torque_band
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor

@@ -1,10 +1,10 @@
 from dataclasses import replace
 
 import numpy as np
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 from scipy.optimize import lsq_linear
 
-from robotid.identification.pipeline import identify
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
 

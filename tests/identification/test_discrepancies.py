@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.fitting import identify
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
 from robotid.identification.discrepancies import discrepancy_findings
-from robotid.identification.pipeline import identify
+from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -24,6 +25,12 @@ def model():
     return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
 
 
+def fitted(model, logs):
+    """Return what is found of a log and one kept apart, at a weight of the prior that is stated."""
+    settings = EstimatorSettings(prior_weight=1.0)
+    return identify(model, logs[:1], validation=logs[1:], estimator=settings)
+
+
 def found(model, change, robot="ur5_robot.urdf", turn=None):
     """Return the findings on logs of a robot near its URDF that a change spoilt alike."""
     arm, logs = build(replace(ROBOTS["ur5"], urdf=str(robot)), (3,), turn=turn), []
@@ -33,7 +40,7 @@ def found(model, change, robot="ur5_robot.urdf", turn=None):
         run = measured(run, "usual", np.random.default_rng([4, part]))
         log = Log(run.t, run.q, run.tau, model.joints, run.v, path=f"run{part}.csv")
         logs.append(change(log))
-    identification = identify(model, logs[:1], validation=logs[1:], doctor=False)
+    identification = fitted(model, logs)
     findings = discrepancy_findings(identification)
     doubted = {doubt.code for doubt in identification.doubts}
     assert {finding.code for finding in findings} <= doubted
@@ -56,7 +63,7 @@ def test_nothing_is_said_of_a_robot_that_only_weighs_differently(model):
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
     logs = [log_with(model, 3, effect, part=part) for part in (0, 1)]
-    assert discrepancy_findings(identify(model, logs[:1], validation=logs[1:], doctor=False)) == []
+    assert discrepancy_findings(fitted(model, logs)) == []
 
 
 # sizes are of first order: those of large faults are off by a quarter

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.information import information
-from robotid.identification.pipeline import identify
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 

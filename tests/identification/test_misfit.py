@@ -27,9 +27,24 @@ from robotid.robot.model import RobotModel
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
 
 
+def fitted(model, logs, **settings):
+    """Return what is found of a log and one kept apart, by the fit of plain friction alone."""
+    plain = {"doctor": False, "friction": "viscous+coulomb", **settings}
+    return identify(model, logs[:1], validation=logs[1:], **plain)
+
+
 def identified(model, seed, effect=None, joint=0, **options):
-    fitted, kept = (log_with(model, seed, effect, joint, part=k, **options) for k in (0, 1))
-    return identify(model, [fitted], validation=[kept])
+    return fitted(model, [log_with(model, seed, effect, joint, part=k, **options) for k in (0, 1)])
+
+
+def misfits(found):
+    return find_misfits(misfit.take_sample(found))
+
+
+@pytest.fixture(scope="module")
+def clean(ur5):
+    """The robot of seed 1 whose drives have nothing beside their model."""
+    return identified(ur5, 1)
 
 
 def rmse(found, joint):
@@ -41,18 +56,20 @@ def rmse(found, joint):
     [("stribeck", 2), ("saturating", 0), ("load", 1), ("periodic", 3), ("ripple", 2), ("spring", 2),
      ("counterbalance", 4), ("windup", 1), ("drift", 5)],
 )  # fmt: skip
-def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, effect, joint):
+def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, clean, effect, joint):
     found = identified(ur5, 1, effect, joint)
     name = ur5.joints[joint]
     # what is left without the effect is the noise: the rest is its share
-    clean = identified(ur5, 1)
     share = 1.0 - (rmse(clean, name) / rmse(found, name)) ** 2
-    first, *others = find_misfits(found)
+    first, *others = misfits(found)
     assert (first.joint, first.term.code) == (name, EFFECTS[effect].code)
     assert first.share == pytest.approx(share, abs=0.15)
     assert first.confirmed > 0.4 * share
     assert all(other.joint == name and other.share < 0.1 * first.share for other in others)
-    assert find_misfits(clean) == ()
+
+
+def test_nothing_is_named_where_nothing_is_missing(clean):
+    assert misfits(clean) == ()
 
 
 @pytest.mark.parametrize(
@@ -60,7 +77,7 @@ def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, effect, 
     [("load", 1, 0.1, "N m per N m of load"), ("spring", 2, None, "N m/rad")],
 )
 def test_the_size_holds_the_truth(ur5, effect, joint, size, unit):
-    (found,) = find_misfits(identified(ur5, 2, effect, joint))
+    (found,) = misfits(identified(ur5, 2, effect, joint))
     if size is None:  # 0.3 of the usual torque per radian
         t, q, v, load = np.zeros((4, 1))
         log, clean = (log_with(ur5, 2, e, joint, noise=0.0) for e in (effect, None))
@@ -78,7 +95,7 @@ def test_the_size_of_several_columns_is_their_torque(ur5):
     """A torque that no base parameter explains is seen as it was added, root mean square."""
     log, clean = (log_with(ur5, 1, effect, 2, noise=0.0) for effect in ("periodic", None))
     added = np.sqrt(np.mean((log.tau - clean.tau)[:, 2] ** 2))
-    (found,) = find_misfits(identified(ur5, 1, "periodic", 2))
+    (found,) = misfits(identified(ur5, 1, "periodic", 2))
     # gravity explains a part of a slow harmonic
     assert 0.6 * added < found.size < 1.05 * added
     assert (found.unit, found.std_error < 0.05 * added) == ("N m rms", True)
@@ -87,7 +104,7 @@ def test_the_size_of_several_columns_is_their_torque(ur5):
 def test_coulomb_friction_that_was_left_out_is_asked_for(ur5):
     model = RobotModel.from_urdf(ur5.tree.path, terms=("armature", "viscous", "offset"))
     logs = [log_with(ur5, 1, part=k) for k in (0, 1)]
-    found = misfit_findings(identify(model, logs[:1], validation=logs[1:]))
+    found = misfit_findings(fitted(model, logs))
     assert {finding.where for finding in found if finding.severity == "warning"} == set(ur5.joints)
     for finding in found:
         assert (finding.code, finding.evidence["share_pct"] > 50) == ("friction_shape", True)
@@ -96,7 +113,7 @@ def test_coulomb_friction_that_was_left_out_is_asked_for(ur5):
 
 @pytest.mark.parametrize("memory", [0, 30, 100])
 def test_noise_of_any_colour_is_no_term(ur5, memory):
-    assert find_misfits(identified(ur5, 5, noise=0.03, memory=memory)) == ()
+    assert misfits(identified(ur5, 5, noise=0.03, memory=memory)) == ()
 
 
 def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(ur5):
@@ -157,6 +174,7 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
         "urdf": ur5.tree.path,
         "identification": [{"log": str(paths[0])}],
         "validation": [{"log": str(paths[1])}],
+        "output": {"report": False},
     }
     found, result = run_job(job_from_settings(table, "job", tmp_path), tmp_path / "out")
     (named,) = [f for f in result["warnings"] if f["code"] == "friction_shape"]
@@ -201,8 +219,12 @@ def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, 
     logs = [log_with(ur5, seed, effect, 1, part=k, size=size) for k in (0, 1)]
     guesses = check_logs(ur5, logs[:1], validation=logs[1:])
     assert guess in {finding.code for finding in guesses}
-    found = identify(ur5, logs[:1], validation=logs[1:])
-    said = {f.code for f in settled(guesses, fit_findings(found)) if f.severity != "note"}
+    found = fitted(ur5, logs)
+    said = {
+        f.code
+        for f in settled(guesses, fit_findings(found, misfit.take_sample(found)))
+        if f.severity != "note"
+    }
     assert EFFECTS[effect].code in said
     assert not said & {"urdf_mismatch", "current_for_torque", "unexplained_torque"}
 
@@ -217,10 +239,10 @@ def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
         "validation": [{"log": "kept.csv"}],
     }
     job = job_from_settings(table, "job", tmp_path)
-    fitted, kept = survey_logs(job, ur5, job.identification, job.validation)
-    recordings = Recordings(ur5, structural_mapping(ur5), fitted, kept)
+    surveyed = survey_logs(job, ur5, job.identification, job.validation)
+    recordings = Recordings(ur5, structural_mapping(ur5), *surveyed)
     assert not recordings.is_held
-    (found,) = find_misfits(conclude(recordings, EstimatorSettings("wls")))
+    (found,) = misfits(conclude(recordings, EstimatorSettings("wls")))
     assert (found.joint, found.term.code) == (LIFT, "load_friction")
     assert found.size == pytest.approx(0.1, abs=0.01)
 
@@ -228,9 +250,8 @@ def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
 def test_a_log_too_short_to_judge_by_is_not_judged(ur5):
     log = log_with(ur5, 1, "spring", 2, duration=8.0)
     signals = SignalSettings(cutoff=2.0)
-    found = identify(ur5, [log], signals=signals)
-    assert find_misfits(found) == ()
-    assert len(find_misfits(identify(ur5, [log]))) == 1
+    assert misfits(fitted(ur5, [log], signals=signals)) == ()
+    assert len(misfits(fitted(ur5, [log]))) == 1
 
 
 def test_real_drives_have_the_terms_that_others_measured_on_them(recordings, monkeypatch):
@@ -240,13 +261,15 @@ def test_real_drives_have_the_terms_that_others_measured_on_them(recordings, mon
         job = read_job(ROOT / "tests" / "jobs" / f"{name}.toml")
         for couplings in (job.couplings, ())[: 2 if name == "tx40" else 1]:
             model = replace(job, couplings=couplings).model()
-            logs = [
+            fit, kept = (
                 [job.read(entry, model) for entry in some]
                 for some in (job.identification, job.validation)
-            ]
-            found = identify(model, logs[0], validation=logs[1], signals=job.signals)
+            )
+            found = identify(
+                model, fit, validation=kept, signals=job.signals, doctor=False, friction={}
+            )
             key = name if couplings == job.couplings else f"{name} uncoupled"
-            said[key] = {(m.joint, m.term.code): m for m in find_misfits(found) if m.matters}
+            said[key] = {(m.joint, m.term.code): m for m in misfits(found) if m.matters}
     load = {joint: said["ur10e"][joint, "load_friction"] for joint in (LIFT, ELBOW)}
     for term in load.values():  # mu of six fits of two robots: 0.064 to 0.081
         assert 0.06 < term.size < 0.085

@@ -2,12 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import batch
 from robotid.exceptions import DataError, NotConvergedError, RankDeficientError, SettingsError
 from robotid.identification import pipeline
-from robotid.identification.pipeline import EstimatorSettings, identify
+from robotid.identification.pipeline import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.mass_matrix import MassMatrixCheck

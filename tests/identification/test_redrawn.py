@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.estimation import EXACT, NOISE
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.cone_programme import Programme
 from robotid.estimators.consistent.cones import Cone, nearest, svec, unsvec
 from robotid.exceptions import NotConvergedError, SettingsError
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
@@ -45,7 +45,22 @@ def test_the_nearest_point_of_the_orthant_is_the_positive_part(rng):
     cone = Cone(np.eye(6), np.zeros(6), np.zeros((0, 6)), np.zeros(0), ("bound x",) * 6)
     found, failures = nearest(points, cone)
     assert failures == []
-    np.testing.assert_allclose(found, np.maximum(points, 0.0), atol=2e-3)
+    np.testing.assert_allclose(found, np.maximum(points, 0.0), rtol=1e-14, atol=1e-14)
+
+
+def test_the_active_rows_and_clarabel_find_the_same_nearest_points(rng):
+    # a thin cone, where many rows hold a point at once; beside them a matrix that never binds
+    G, points = rng.standard_normal((30, 12)), 10.0 * rng.standard_normal((10, 12))
+    G[:, 0] = np.abs(G[:, 0]) + 1.0
+    rows = Cone(G, np.full(30, -0.5), np.zeros((0, 12)), np.zeros(0), ("bound x",) * 30)
+    loose = {"S": 1e-5 * np.eye(10, 12), "s": svec(np.eye(4)), "labels": (*rows.labels, "one x")}
+    held = replace(rows, **loose)
+    (exact, none), (rough, _) = nearest(points, rows), nearest(points, held)
+    assert none == []
+    np.testing.assert_allclose(exact, rough, atol=1e-2)
+    assert min(rows.slack(point).min() for point in exact) > -1e-10
+    both = replace(rows, G=np.vstack([G, -G[:1]]), h=np.append(rows.h, -0.5))
+    assert nearest(points, both) == (pytest.approx(np.zeros((0, 12))), ["PrimalInfeasible"] * 10)
 
 
 def test_the_nearest_matrix_has_the_positive_eigenvalues(rng):
@@ -58,7 +73,7 @@ def test_the_nearest_matrix_has_the_positive_eigenvalues(rng):
     np.testing.assert_allclose(unsvec(found.reshape(-1)), clipped, atol=5e-3)
 
 
-@pytest.mark.parametrize(("meat_over_bread", "pull"), [(1.0, 1.0), (9.0, 1.0), (1.0, 0.25)])
+@pytest.mark.parametrize(("meat_over_bread", "pull"), [(1.0, 1.0), (9.0, 0.25)])
 def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread, pull):
     rows = information(inside, rng, 1.0)
     R = rows[:, :-1]
@@ -102,8 +117,6 @@ def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
     assert 0.4 < np.median(ratio) < 1.0
     assert ratio.max() < 1.4
     assert found.errors.freedom.max() < 64
-    again = identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(**BOUND))
-    np.testing.assert_array_equal(again.standard_error, found.standard_error)
 
 
 def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, monkeypatch):
@@ -126,9 +139,10 @@ def test_fits_that_are_not_solved_are_counted_and_many_are_refused(ur5, rng, mon
 
 def test_a_log_of_few_stretches_is_redrawn_by_the_filters_share(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, samples=300, noise=NOISE)
-    found = identify(ur5, [log], estimator=EstimatorSettings(**BOUND))
+    found, again = (identify(ur5, [log], estimator=EstimatorSettings(**BOUND)) for _ in range(2))
     assert "only" in found.errors.method
     assert "fits to redrawn data" in found.errors.method
+    np.testing.assert_array_equal(again.standard_error, found.standard_error)
 
 
 def test_a_handful_of_draws_is_refused():

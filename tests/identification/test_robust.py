@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.exceptions import SettingsError
-from robotid.identification.pipeline import conclude, identify
+from robotid.identification.pipeline import conclude
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import LOSSES, loss_slope, loss_weight
 from robotid.identification.settings import EstimatorSettings
@@ -136,7 +137,7 @@ def test_standard_errors_of_a_robust_fit_allow_for_its_loss_of_efficiency(ur5):
     pi = truth(ur5)
     signals = SignalSettings(cutoff=None, trim=0.0)
     errors, reported = [], []
-    for seed in range(25):
+    for seed in range(12):
         log = exact_log(ur5, pi, np.random.default_rng([5, seed]), samples=400, noise=NOISE)
         estimator = EstimatorSettings("wls", robust="huber")
         found = identify(ur5, [log], signals=signals, estimator=estimator)

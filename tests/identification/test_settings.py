@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.identify import run_job
@@ -12,7 +13,6 @@ from robotid.commands.job import LogEntry, job_from_settings, read_job
 from robotid.estimators.consistent.cones import SOLVERS
 from robotid.estimators.consistent.penalties import METRICS
 from robotid.exceptions import SettingsError
-from robotid.identification.pipeline import identify
 from robotid.identification.robust import LOSSES
 from robotid.identification.settings import ESTIMATORS, EstimatorSettings, RecursiveSettings
 from robotid.logs.read import write_log

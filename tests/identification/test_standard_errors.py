@@ -4,17 +4,13 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import OLS, WLS
+from robotid.estimators.stretches import quantile, scatter
 from robotid.exceptions import DataError
-from robotid.identification.pipeline import identify
-from robotid.identification.standard_errors import (
-    measured_errors,
-    quantile,
-    scatter,
-    with_wls_errors,
-)
+from robotid.identification.standard_errors import measured_errors, with_wls_errors
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.factors import compress, merge
 from robotid.regressor.problem import Problem

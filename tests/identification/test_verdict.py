@@ -268,6 +268,7 @@ def run(ur5, tmp_path):
             "validation": [{"log": "kept.csv"}],
             "estimator": {"prior_weight": 1.0, "draws": 0, **settings},
             "doctor": {"ignore": list(ignore)},
+            "output": {"report": False},
         }
         out = tmp_path / "out"
         found, result = run_job(job_from_settings(table, "job.toml", tmp_path), out)

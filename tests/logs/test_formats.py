@@ -7,6 +7,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.recorders import (
     StoragePlugin,
     messages_of,
@@ -21,7 +22,6 @@ from helpers.synthetic import exact_log, truth
 from mcap.writer import Writer as McapLibraryWriter
 
 from robotid.exceptions import DataError, MissingDependencyError, SettingsError
-from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.read import read_log, write_log

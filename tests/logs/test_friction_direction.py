@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 from scipy.signal import butter, sosfiltfilt
 
 from robotid.exceptions import DataError
 from robotid.identification.bands import torque_band
-from robotid.identification.pipeline import conclude, identify
+from robotid.identification.pipeline import conclude
 from robotid.identification.recordings import Recordings
 from robotid.identification.settings import EstimatorSettings
 from robotid.identification.survey import hold_log

@@ -4,6 +4,8 @@ import pytest
 
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
+from robotid.logs.transmission import Transmission
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.problem import Sample, concatenate, shuffled
 from robotid.regressor.torque import (
     InstantRegressor,
@@ -90,6 +92,31 @@ def test_a_coupled_drive_loads_every_joint_it_turns_with(ur5, rng):
     np.testing.assert_allclose(column["motor.coulomb"][:, 5], 0.5 * np.sign(w))
     # the power the drive takes is that of its own friction: tau . v = Fv w^2
     np.testing.assert_allclose(np.sum(column["motor.viscous"] * v, axis=1), w**2)
+
+
+def test_drives_of_a_transmission_are_what_its_motors_take(ur5, rng):
+    T = np.array([[120.0, 0.0], [80.0, -60.0]])  # motor speeds w_m = T v
+    wrist = dict(joints=ur5.joints[4:], motors=("m5", "m6"))
+    ((joint, ratios),) = Transmission(**wrist, matrix=T.tolist()).shared.items()
+    motor = Coupling(joint, ratios, replaces=True)
+    model = RobotModel.from_urdf(ur5.tree.path, couplings=(motor,))
+    own, gear = rng.uniform(0.1, 1.0, (2, 4)), np.array([120.0, 80.0])  # at the motors
+    pi = model.standard_parameters()
+    # inertia and viscous friction are seen through the square of the gear ratio
+    pi[-8:] = (own * gear[:, None] ** [2, 2, 1, 1]).ravel()
+    assert model.layout.names[-8:] == tuple(
+        f"{joint}.{term}" for joint in ur5.joints[4:] for term in model.layout.terms
+    )
+    q, v, a = states(model, rng, samples=5)
+    w, dw = v[:, 4:] @ T.T, a[:, 4:] @ T.T
+    tau_m = own[:, 0] * dw + own[:, 1] * w + own[:, 2] * np.sign(w) + own[:, 3]
+    bodies = np.where(np.arange(len(pi)) < len(pi) - 8, pi, 0.0)
+    W = joint_torque_regressor(model, q, v, a)
+    np.testing.assert_allclose((W @ (pi - bodies)).reshape(-1, 6)[:, 4:], tau_m @ T, rtol=1e-12)
+    instant = InstantRegressor(model, np.arange(len(pi)))
+    np.testing.assert_allclose(instant(q[0], v[0], a[0]), W[:6], atol=1e-12)
+    # every offset and friction is told from the others, as without a transmission
+    assert len(structural_mapping(model).K) == len(structural_mapping(ur5).K)
 
 
 @pytest.mark.parametrize("free_flyer", [False, True])

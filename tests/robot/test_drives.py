@@ -421,3 +421,13 @@ def test_a_hook_that_only_slow_motion_shows_is_a_base_parameter():
     own = {joint: [Stribeck(speed=0.02, seen=(0.03, 0.4))] for joint in JOINTS}
     model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms=own)
     assert {f"{joint}.stribeck" for joint in JOINTS} <= set(structural_mapping(model).base_names)
+
+
+def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(rng, monkeypatch):
+    monkeypatch.setattr(prediction, "_START", 10**9)  # by rows, which check the memory
+    path, own = example_urdf("ur5_robot.urdf"), {"elbow_joint": [LoadFriction(), Lag()]}
+    model = RobotModel.from_urdf(path, joints=JOINTS, own_terms=own)
+    x, other = states(rng), model.with_reference(truth(model))
+    again = remember(other, remember(model, x))
+    np.testing.assert_array_equal(again.memory, remember(other, x).memory)
+    assert np.abs(again.memory - remember(model, x).memory).max() > 0.1

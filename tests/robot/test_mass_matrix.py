@@ -1,12 +1,12 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.cones import SOLVERS
 from robotid.export.result import build_result
 from robotid.identification.findings import consistency_findings
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor

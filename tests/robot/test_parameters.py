@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -61,6 +63,19 @@ def test_names_and_units_follow_the_layout():
     assert unit["slide.coulomb"] == "N"
     assert "motor.offset" not in unit
     assert layout.is_nonnegative().sum() == 3 * 3
+
+
+def test_a_coupling_may_stand_in_the_place_of_a_joints_own_drive():
+    motor = Coupling("elbow", (("elbow", 1.0), ("wrist", -0.5)), replaces=True)
+    layout = ParameterLayout(("a", "b"), ("elbow", "wrist"), couplings=(motor,))
+    terms = ("armature", "viscous", "coulomb", "offset")
+    assert layout.drive_names == tuple(f"{n}.{t}" for n in layout.joints for t in terms)
+    np.testing.assert_array_equal(layout.drive_ratios, [[1.0, -0.5], [0.0, 1.0]])
+    np.testing.assert_array_equal(layout.is_coupled, [True] * 3 + [False] * 5)
+    with pytest.raises(SettingsError, match=r"coupling 'elbow' has the name of a joint or of"):
+        replace(layout, couplings=(replace(motor, replaces=False),))
+    with pytest.raises(SettingsError, match=r"coupling 'hip' names the joints hip, which are not"):
+        replace(layout, couplings=(replace(motor, name="hip"),))
 
 
 def test_a_coupling_of_an_unknown_joint_is_refused():

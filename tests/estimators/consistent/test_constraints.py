@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.estimation import EXACT, NOISE, Case, consistent
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.constraints import Constraints, slabs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.identification.fitting import make_constraints
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import ConstraintSettings, EstimatorSettings
 from robotid.regressor.factors import compress
 from robotid.robot.geometry import body_boxes

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.estimation import EXACT, NOISE, Case, consistent
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators.consistent.constraints import Constraints
@@ -17,7 +18,6 @@ from robotid.estimators.consistent.log_cholesky import (
     to_log_cholesky,
 )
 from robotid.exceptions import SettingsError
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.regressor.factors import compress
 from robotid.robot.geometry import body_boxes

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import scipy.stats
 from helpers.estimation import EXACT, NOISE, Case, consistent
+from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.weighting import choose_weight, held_out_errors, log_evidence
 from robotid.exceptions import DataError, SettingsError
-from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping

@@ -1,0 +1,134 @@
+"""Payloads from two runs: logs with them, and logs or a result without."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from robotid._files import file_sha256
+from robotid.commands.job import Job, LogEntry, job_from_settings
+from robotid.commands.logs import survey_logs
+from robotid.exceptions import DataError, SettingsError
+from robotid.export.result import load_result
+from robotid.findings import listed
+from robotid.identification.drive_choice import wanted_families
+from robotid.identification.payload_fit import fit_payloads
+from robotid.identification.pipeline import with_drives
+from robotid.identification.recordings import Recordings
+from robotid.identification.settings import ConsistentSettings
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.drives import DriveTerm
+from robotid.robot.model import RobotModel
+
+__all__ = ["is_result", "measure_payload", "stated_masses"]
+
+
+def is_result(path: str | Path) -> bool:
+    """Return whether a reference is a result, or its folder, and no log.
+
+    Args:
+        path: The reference.
+    """
+    return Path(path).suffix == ".json" or (Path(path) / "result.json").is_file()
+
+
+def stated_masses(words: Sequence[str], links: Sequence[str]) -> dict[str, float]:
+    """Return the known mass of each payload, by link [kg].
+
+    Args:
+        words: "2.8" for the only link, or "tool0=2.8".
+        links: The links that are named; "" stands for the one that is not.
+
+    Raises:
+        SettingsError: If a mass is no number, or it is not said of which link.
+    """
+    masses = {}
+    for word in words:
+        link, _, number = word.rpartition("=")
+        if not link and len(links) > 1:
+            raise SettingsError(
+                f"--mass {word}: of which of the links {listed(links)}? Write --mass LINK=KG"
+            )
+        try:
+            masses[link or next(iter(links), "")] = float(number)
+        except ValueError as error:
+            raise SettingsError(f"--mass {word!r}: wanted KG or LINK=KG") from error
+    return masses
+
+
+def measure_payload(
+    job: Job,
+    references: Sequence[str],
+    *,
+    links: Sequence[str] = (),
+    masses: Sequence[str] = (),
+    find_gains: bool = False,
+) -> dict[str, Any]:
+    """Identify what hangs on links in the logs of a job and not in the references.
+
+    Args:
+        job: The logs with the payloads, and how logs are read.
+        references: Logs without them; or one result, whose logs are read again as it says.
+        links: Links that the payloads hang on; the last moving one if empty.
+        masses: Masses that are known, as of ``stated_masses``.
+        find_gains: Whether the gains that the job does not state are found, too.
+
+    Returns:
+        What ``robotid payload --json`` prints.
+
+    Raises:
+        DataError: If a log cannot be used, the logs of a result are gone, or the motion does not
+            show a mass.
+        ModelError: If the URDF cannot be used, or a link is not in it.
+        SettingsError: If settings do not fit.
+    """
+    entries = [LogEntry(Path(path)) for path in references]
+    if any(map(is_result, references)):
+        if len(references) > 1:
+            raise SettingsError(f"one result is a reference by itself; found {listed(references)}")
+        job, entries = _of_result(job, references[0])
+    model = job.model()
+    unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
+    job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
+    links = tuple(links) or model.layout.bodies[-1:]
+    surveyed = survey_logs(job, model, job.identification, entries)
+    mapping = structural_mapping(model)
+    loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)
+    known = stated_masses(masses, links)
+    found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
+    gains = {joint: gain.value for joint, gain in found.gains.items()}
+    own = _chosen_terms(replace(job, gains={**job.gains, **gains}), model, entries)
+    if own:
+        loaded, reference = (run.with_model(model.with_terms(own)) for run in (loaded, reference))
+        found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
+    return found.to_dict()
+
+
+def _chosen_terms(
+    job: Job, model: RobotModel, entries: Sequence[LogEntry]
+) -> Mapping[str, tuple[DriveTerm, ...]]:
+    """Return the friction that the reference shows beside viscous and Coulomb's, by drive."""
+    if not any(job.friction.values()):
+        return {}
+    (surveyed,) = survey_logs(job, model, entries)
+    reference = Recordings(model, structural_mapping(model), surveyed)
+    choice = ConsistentSettings(prior_weight=1.0, draws=0)
+    return with_drives(
+        reference, choice, wanted_families(job.friction, model.joints)
+    ).model.layout.own
+
+
+def _of_result(job: Job, path: str) -> tuple[Job, list[LogEntry]]:
+    """Return the job with the settings of a result, and the logs that this one fitted."""
+    result = load_result(path).content
+    settings = {key: value for key, value in result["settings"].items() if value != {}}
+    stated = job_from_settings(settings, Path(path).name, Path())
+    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    for entry in stated.identification:
+        if not entry.path.exists() or file_sha256(entry.path) not in hashes:
+            raise DataError(
+                f"{entry.path}, which {path} was fitted to, is not there any more or was changed; "
+                "give a log without the payload instead: --reference LOG"
+            )
+    wanted = replace(stated, urdf=job.urdf, identification=job.identification)
+    return wanted, list(stated.identification)

@@ -1,0 +1,108 @@
+"""How much the scores of stretches scatter: errors of least squares on coloured noise.
+
+The score of a stretch, W_s^T (tau_s - W_s theta), scatters as the noise makes it, whatever its
+colour, if the stretch is longer than the correlation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.regressor.factors import Factors
+
+__all__ = ["FEWEST_STRETCHES", "Scatter", "quantile", "scatter"]
+
+#: Fewer stretches do not show how much their scores scatter.
+FEWEST_STRETCHES = 12
+_OWN = 0.95  # leverage above which a stretch fits a direction alone, and shows no scatter in it
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """How much the scores of s stretches scatter about zero, over c parameters."""
+
+    meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all stretches
+    bread: Array  # (c, c), covariance of the parameters if rows were independent
+    inflation: float  # mean ratio of the scatter to that of independent rows [-]
+    factors: Array  # (s, c, c), factors R_s of the weighted rows of each stretch
+    adjusted: Array  # (s, c, c), the same behind the correction for their leverage
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the parameters, shape (c, c)."""
+        sandwich: Array = self.bread @ self.meat @ self.bread
+        return sandwich
+
+    def freedom(self) -> Array:
+        """Return the degrees of freedom of each parameter's variance, shape (c,), at least 1.
+
+        References:
+            Bell, McCaffrey (2002), Bias reduction in standard errors for linear regression with
+            multi-stage samples, section 4.
+        """
+        R, bread = self.factors, self.bread
+        loads = self.adjusted @ bread  # (s, c, c): column l is a_s of parameter l
+        back = np.einsum("sij,sil->lsj", R, loads, optimize=True)  # R_s^T a_s
+        freedom = np.empty(len(bread))
+        for k, Z in enumerate(back):
+            # of independent noise: covariances of the stretches' contributions to the parameter
+            gram = np.diag((loads[:, :, k] ** 2).sum(axis=1)) - Z @ bread @ Z.T
+            freedom[k] = np.trace(gram) ** 2 / max(float((gram**2).sum()), 1e-300)
+        return np.maximum(freedom, 1.0)
+
+
+def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Array) -> Scatter:
+    """Return how much the scores of stretches scatter.
+
+    The residual of a stretch that had a say in the fit is smaller than its noise; it is enlarged
+    by (I - leverage)^-1/2, which is exact for independent rows (known as CR2). Directions that one
+    stretch alone determines show nothing; they get the mean scatter of all others.
+
+    Args:
+        stretches: Factors of contiguous stretches, at least 12, each longer than the correlation of
+            the residuals.
+        theta: Estimate, shape (c,).
+        sigma: Noise level per joint that weighted the rows, shape (n,) [N m or N].
+        bread: Covariance of the parameters if rows were independent, shape (c, c).
+
+    Raises:
+        DataError: If there are fewer than 12 stretches.
+
+    References:
+        Bell, McCaffrey (2002), as above; Liang, Zeger (1986), Longitudinal data analysis using
+        generalized linear models.
+    """
+    if len(stretches) < FEWEST_STRETCHES:
+        raise DataError(
+            f"{len(stretches)} stretches do not show how much their scores scatter; wanted at "
+            f"least {FEWEST_STRETCHES}: fit longer logs"
+        )
+    c = len(theta)
+    weighted = np.array([stretch.weighted(sigma) for stretch in stretches])
+    R, u = weighted[:, :c, :c], weighted[:, :c, c] - weighted[:, :c, :c] @ theta
+    leverage, V = np.linalg.eigh(R @ bread @ R.transpose(0, 2, 1))
+    kept = np.clip(1.0 - leverage, 0.0, 1.0)  # share of its own noise that a residual still shows
+    gain = 1.0 / np.sqrt(np.maximum(kept, 1.0 - _OWN))
+    along = gain * np.einsum("sij,si->sj", V, u)
+    # each eigenvector counts by the weight it has in the fit
+    inflation = float((leverage * along**2).sum() / (leverage * gain**2 * kept).sum())
+    adjusted = V @ (gain[:, :, None] * (V.transpose(0, 2, 1) @ R))
+    scores = np.einsum("sij,si->sj", V.transpose(0, 2, 1) @ R, along)
+    missing = np.sqrt(np.maximum(1.0 - gain**2 * kept, 0.0))[:, :, None]
+    alone = (missing * (V.transpose(0, 2, 1) @ R)).reshape(-1, c)
+    meat = scores.T @ scores + inflation * (alone.T @ alone)
+    return Scatter(meat, bread, inflation, R, adjusted)
+
+
+def quantile(freedom: Array) -> Array:
+    """Return how many standard errors a two-sided 95 % interval reaches, shape (c,).
+
+    Args:
+        freedom: Degrees of freedom of each standard error, in Student's distribution, shape (c,).
+    """
+    reach: Array = scipy.special.stdtrit(freedom, 0.975)
+    return reach

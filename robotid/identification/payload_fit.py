@@ -1,0 +1,477 @@
+"""What hangs on a link: a run with it against a run without, and gains from a known mass."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators import Consistent, Constraints, Estimate
+from robotid.estimators.stretches import quantile
+from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
+from robotid.exceptions import DataError, NotConvergedError, SettingsError
+from robotid.findings import listed
+from robotid.identification.recordings import Recordings
+from robotid.identification.survey import hold_log
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.factors import join
+from robotid.robot.bodies import link_transfer
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import (
+    ParameterLayout,
+)
+from robotid.robot.prior import payload_spread, prior_spread
+
+__all__ = ["Gain", "Payload", "PayloadFit", "fit_payloads", "identify_payload"]
+
+_SURE = 3.0  # standard errors that a mass has at least
+_MASS = 0.3  # largest standard error of a mass that counts as determined, of that mass,
+_NOTHING = 0.05  # ... or of this share of the robot's
+_COM = 0.05  # ... of a centre of mass, of the robot's length
+_INERTIA = 0.3  # ... of an inertia about it, of the mean principal moment
+_SAME = 1e-3  # of the largest: a column of a link that motion shows that little is not shown
+_MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
+_SETTLED = 1e-4  # relative change of the parameters at which it is
+_FREE = 1e-9  # weight of the prior in the fit that keeps a payload possible: none
+
+
+@dataclass(frozen=True, eq=False)
+class Payload:
+    """What hangs on a link, in the link's own frame.
+
+    Attributes:
+        link: The link.
+        mass: Mass [kg].
+        mass_std_error: Its standard error [kg]; 0 if it was known.
+        mass_interval: 95 % interval of it, shape (2,) [kg].
+        com: Centre of mass, shape (3,) [m].
+        com_std_error: Its standard errors, shape (3,) [m].
+        inertia: Inertia about the centre of mass, axes of the link, shape (3, 3) [kg m^2].
+        inertia_std_error: Its standard errors, shape (3, 3) [kg m^2].
+        reasons: Why some of "com" and "inertia" are not determined, by name.
+    """
+
+    link: str
+    mass: float
+    mass_std_error: float
+    mass_interval: Array
+    com: Array
+    com_std_error: Array
+    inertia: Array
+    inertia_std_error: Array
+    reasons: Mapping[str, str]
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Which of "mass", "com" and "inertia" the motion determines."""
+        return tuple(name for name in ("mass", "com", "inertia") if name not in self.reasons)
+
+    @property
+    def inertia_at_link(self) -> Array:
+        """Inertia about the origin of the link's frame, shape (3, 3) [kg m^2]."""
+        c = self.com
+        inertia: Array = self.inertia + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+        return inertia
+
+    @property
+    def parameters(self) -> Array:
+        """The ten inertial parameters in the link's frame, shape (10,)."""
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia_at_link.tolist()
+        return np.array([self.mass, *(self.mass * self.com), xx, xy, yy, xz, yz, zz])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values; what is not determined is None."""
+        values = {
+            "mass": self.mass,
+            "mass_std_error": self.mass_std_error,
+            "mass_interval": self.mass_interval.tolist(),
+        }
+        for name in ("com", "inertia"):
+            for key in (name, f"{name}_std_error"):
+                values[key] = getattr(self, key).tolist() if name in self.determined else None
+        if "inertia" in self.determined:
+            values["inertia_at_link"] = self.inertia_at_link.tolist()
+        return {
+            "link": self.link,
+            **values,
+            "determined": list(self.determined),
+            "reasons": dict(self.reasons),
+        }
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Torque per current of a joint.
+
+    Attributes:
+        value: The gain [N m/A or N/A].
+        std_error: Its standard error [same].
+        interval: 95 % interval [same].
+    """
+
+    value: float
+    std_error: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadFit:
+    """Payloads, and gains that a known one tells.
+
+    Attributes:
+        model: The robot.
+        payloads: One per link.
+        gains: Gains that were unknown, by joint.
+        names: Names of the base parameters of the robot without payloads.
+        base: Base parameters, shape (b,), SI units.
+        base_error: Their standard errors, shape (b,), with what is not known of the gains.
+        unexplained: Share of each joint's torque that the fit leaves, shape (n,) [-].
+    """
+
+    model: RobotModel
+    payloads: tuple[Payload, ...]
+    gains: Mapping[str, Gain]
+    names: tuple[str, ...]
+    base: Array
+    base_error: Array
+    unexplained: Array
+
+    def __getitem__(self, link: str) -> Payload:
+        return next(payload for payload in self.payloads if payload.link == link)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as ``robotid payload --json`` prints them."""
+        content: dict[str, Any] = {
+            "robot": self.model.name,
+            "payloads": [payload.to_dict() for payload in self.payloads],
+            "relative_error_pct": dict(
+                zip(self.model.row_names, (100 * self.unexplained).tolist(), strict=True)
+            ),
+        }
+        if self.gains:
+            rows = zip(self.names, self.base.tolist(), self.base_error.tolist(), strict=True)
+            content["gains"] = {
+                j: {"gain": g.value, "std_error": g.std_error, "interval": list(g.interval)}
+                for j, g in self.gains.items()
+            }
+            content["base_parameters"] = [
+                {"name": name, "value": value, "std_error": error} for name, value, error in rows
+            ]
+        return content
+
+
+def identify_payload(
+    model: RobotModel,
+    logs: Sequence[Log],
+    reference: Sequence[Log],
+    *,
+    links: Sequence[str] = (),
+    masses: Mapping[str, float] | None = None,
+    unknown_gains: Sequence[str] = (),
+    signals: SignalSettings | None = None,
+) -> PayloadFit:
+    """Identify what hangs on links in some logs and not in others.
+
+    Both runs are fitted at once: they share all but the payloads' ten parameters each and the
+    friction and offsets of the drives, which change with load and temperature.
+
+    Args:
+        model: The robot, from its URDF.
+        logs: Recordings with the payloads.
+        reference: Recordings without them; whatever both have counts to the robot.
+        links: Links that the payloads hang on, which may be fixed to a moving one; the last
+            moving link if empty.
+        masses: Masses that are known, by link [kg].
+        unknown_gains: Joints whose ``tau`` in the logs is a current of unknown gain. A known mass,
+            or a joint whose gain is known, sets their scale.
+        signals: How logs become trajectories; the defaults if None.
+
+    Returns:
+        The payloads, each with intervals, physically possible, and the gains.
+
+    Raises:
+        DataError: If a log cannot be used, or the motion does not show a mass.
+        ModelError: If a link is not in the URDF.
+        SettingsError: If links or gains do not fit the robot.
+        NotConvergedError: If a solver fails.
+    """
+    settings, mapping = signals or SignalSettings(), structural_mapping(model)
+    loaded, without = (
+        Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
+        for some in (logs, reference)
+    )
+    links = links or model.layout.bodies[-1:]
+    return fit_payloads(
+        loaded, without, links=links, masses=masses or {}, unknown_gains=unknown_gains
+    )
+
+
+def fit_payloads(
+    loaded: Recordings,
+    reference: Recordings,
+    *,
+    links: Sequence[str],
+    masses: Mapping[str, float],
+    unknown_gains: Sequence[str] = (),
+) -> PayloadFit:
+    """Identify payloads from recordings, in memory or not; see ``identify_payload``.
+
+    Args:
+        loaded: Recordings with the payloads.
+        reference: Recordings without them.
+        links: Links that they hang on.
+        masses: Masses that are known, by link [kg].
+        unknown_gains: Joints whose torque column is a current of unknown gain.
+
+    Raises:
+        DataError, ModelError, SettingsError, NotConvergedError: As of ``identify_payload``.
+    """
+    if not loaded.model.layout.remembering:
+        return _fit(loaded, reference, links, masses, unknown_gains)
+    # gears are loaded by the bodies that are sought
+    bodies, before = loaded.model.standard_parameters(), np.inf
+    payload = np.zeros_like(bodies)
+    for _ in range(_MOST_LOADS):
+        ground, other = (
+            run.with_model(run.model.with_reference(pi))
+            for run, pi in ((reference, bodies), (loaded, bodies + payload))
+        )
+        found = _fit(other, ground, links, masses, unknown_gains)
+        size = float(np.linalg.norm(found.base))
+        if abs(size - before) < _SETTLED * size:
+            return found
+        bodies, payload = _loads(found, ground)
+        before = size
+    raise NotConvergedError(
+        f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
+        "'viscous+coulomb', or record motion that determines more",
+        "max_iterations",
+    )
+
+
+def _fit(
+    loaded: Recordings,
+    reference: Recordings,
+    links: Sequence[str],
+    masses: Mapping[str, float],
+    unknown_gains: Sequence[str],
+) -> PayloadFit:
+    """Fit two runs whose gears are loaded as their models say."""
+    model = loaded.model
+    columns = _payload_columns(model, loaded.mapping.K, links)
+    _check_known(model, links, masses, unknown_gains)
+    known = np.full(10 * len(links), np.nan)
+    known[[10 * links.index(link) for link in masses]] = list(masses.values())
+    first, second = reference.reduce(), loaded.reduce()
+    whole = join([*first, *second])
+    runs = payload_runs(
+        first,
+        second,
+        model.layout,
+        loaded.mapping.K,
+        model.standard_parameters(),
+        prior_spread(model, whole.squares, whole.samples),
+        (columns, known, np.tile(payload_spread(model), len(links))),
+        share=min(loaded.share, reference.share),
+        unknown=[model.joints.index(joint) for joint in unknown_gains],
+    )
+    found = runs.compare()
+    x, C, freedom = _payload_parameters(found, known)
+    for k, link in enumerate(links):
+        _check_mass(model, link, x[10 * k], np.sqrt(C[10 * k, 10 * k]), link in masses)
+    possible = _possible(model, links, x, C, masses)
+    payloads = tuple(
+        _payload(model, link, possible[part], C[part, part], freedom[part])
+        for k, link in enumerate(links)
+        for part in [slice(10 * k, 10 * k + 10)]
+    )
+    b = len(runs.known)
+    return PayloadFit(
+        model,
+        payloads,
+        _gains(model, runs, found),
+        loaded.mapping.base_names,
+        found.theta[:b],
+        np.sqrt(np.diag(found.covariance)[:b]),
+        found.unexplained,
+    )
+
+
+def _loads(found: PayloadFit, reference: Recordings) -> tuple[Array, Array]:
+    """Return what loads the gears: the robot's standard parameters, and what payloads add."""
+    model = reference.model
+    bodies = reference.mapping.to_standard(found.base, model.standard_parameters())
+    added = np.zeros_like(bodies)
+    for payload in found.payloads:
+        body, transfer = link_transfer(model, payload.link)
+        added[10 * body : 10 * body + 10] += transfer @ payload.parameters
+    return bodies, added
+
+
+def _payload_columns(model: RobotModel, K: Array, links: Sequence[str]) -> Array:
+    """Return what the ten parameters of each payload add to the base parameters, (b, 10 links)."""
+    columns, bodies = [], dict[int, str]()
+    for link in links:
+        body, transfer = link_transfer(model, link)
+        if body < 0:
+            raise SettingsError(f"{link} does not move: no torque shows what hangs on it")
+        if body in bodies:
+            raise SettingsError(
+                f"{bodies[body]} and {link} belong to one moving body, {model.layout.bodies[body]}:"
+                " no torque tells their payloads apart; name one of them"
+            )
+        bodies[body] = link
+        own = K[:, 10 * body : 10 * body + 10] @ transfer
+        if np.abs(own[:, 0]).max(initial=0.0) < _SAME * np.abs(own).max(initial=1e-300):
+            raise DataError(
+                f"no motion shows the mass of what hangs on {link}: no joint lifts or accelerates "
+                "it; weigh it"
+            )
+        columns.append(own)
+    return np.hstack(columns)
+
+
+def _check_known(
+    model: RobotModel, links: Sequence[str], masses: Mapping[str, float], gains: Sequence[str]
+) -> None:
+    for link, mass in masses.items():
+        if link not in links:
+            raise SettingsError(
+                f"a mass of {link} is stated, but the payloads hang on {listed(links)}; name the "
+                "link among them"
+            )
+        if not 0 < mass < 1e6:
+            raise SettingsError(f"the mass of the payload on {link} is {mass:g} kg, wanted > 0")
+    unknown = [joint for joint in gains if joint not in model.joints]
+    if unknown:
+        raise SettingsError(
+            f"gains of {listed(unknown)} are wanted, which are not identified; joints: "
+            f"{listed(model.joints)}"
+        )
+    if len(gains) == len(model.joints) and not masses:
+        raise SettingsError(
+            "all gains are unknown and no mass is known: nothing sets their scale; state the mass "
+            "of the payload, or the gain of one joint that bears it"
+        )
+
+
+def _payload_parameters(found: Compared, known: Array) -> tuple[Array, Array, Array]:
+    """Return all ten parameters of each payload, their covariance and degrees of freedom."""
+    x, C = np.nan_to_num(known), np.zeros((len(known), len(known)))
+    freedom, free = np.full(len(known), np.inf), np.flatnonzero(np.isnan(known))
+    at = slice(len(found.theta) - len(free), len(found.theta))
+    x[free], freedom[free] = found.theta[at], found.freedom[at]
+    C[np.ix_(free, free)] = found.covariance[at, at]
+    return x, C, freedom
+
+
+def _check_mass(model: RobotModel, link: str, mass: float, error: float, is_known: bool) -> None:
+    """Refuse a mass that the motion does not show, and runs that are the wrong way round."""
+    if is_known:
+        return
+    arm = payload_spread(model)[0]
+    if error > _MASS * max(abs(mass), _NOTHING * arm):
+        raise DataError(
+            f"the motion does not show the mass of what hangs on {link}: {mass:.3g} +- "
+            f"{error:.2g} kg; record poses and motions in which gravity on it loads other joints "
+            "in turn, with the payload and without it"
+        )
+    if mass < -_SURE * error:
+        raise DataError(
+            f"{link} carries {-mass:.3g} +- {error:.2g} kg less than in the reference: the "
+            "reference has the payload; swap the two"
+        )
+
+
+def _possible(
+    model: RobotModel, links: Sequence[str], x: Array, C: Array, masses: Mapping[str, float]
+) -> Array:
+    """Return the physically possible parameters nearest to x in the metric of its covariance."""
+    mass = np.maximum(np.abs(x[::10]), _NOTHING * payload_spread(model)[0])
+    radius = model.length
+    unit = np.array([1.0, *[radius] * 3, *[radius**2] * 6])
+    scale = (mass[:, None] * unit).reshape(-1)
+    ball = mass[:, None] * np.array([1.0, 0, 0, 0, *radius**2 * np.array([1.0, 0, 1, 0, 0, 1])])
+    stated = {link: (masses[link], masses[link]) for link in links if link in masses}
+    count = len(x)
+    fit = Consistent(
+        layout=ParameterLayout(tuple(links), (), ()),
+        K=np.eye(count),
+        prior=ball.reshape(-1),
+        prior_std=scale,
+        margin=_FREE,
+        prior_weight=_FREE,
+        constraints=Constraints(mass=stated),
+    )
+    # what is known exactly has no covariance, and is held by its constraint
+    exact = np.diag(np.where(np.diag(C) == 0, scale**2, 0.0))
+    names = fit.layout.names
+    start = Estimate(x, C + exact, names, np.ones(1), count, 1.0, (), True, 0, "two runs")
+    return fit.project(start).theta
+
+
+def _payload(model: RobotModel, link: str, x: Array, C: Array, freedom: Array) -> Payload:
+    """Return a payload from its ten parameters; errors of the rest by first order."""
+    step = 1e-20  # of a derivative along the imaginary axis: exact
+    shown = _about_com(x)
+    J = np.column_stack([_about_com(x + 1j * step * e).imag / step for e in np.eye(10)])
+    errors = np.sqrt(np.maximum(np.diag(J @ C @ J.T), 0.0))
+    mass, error, reach = float(x[0]), float(np.sqrt(C[0, 0])), float(quantile(freedom[:1])[0])
+    com, com_error = shown[:3], errors[:3]
+    inertia, inertia_error = _matrix(shown[3:]), _matrix(errors[3:])
+    moment, largest = float(np.trace(inertia)) / 3, float(inertia_error.max())
+    reasons = {}
+    if com_error.max() > _COM * model.length:
+        reasons["com"] = (
+            f"its standard error would be {com_error.max():.2g} m; record poses of {link} about "
+            "all axes"
+        )
+    if largest > _INERTIA * moment:
+        reasons["inertia"] = (
+            f"the motion turns {link} too little: an inertia about the centre of mass of about "
+            f"{moment:.2g} kg m^2 would have a standard error of {largest:.2g}; record fast turns "
+            "of the joints next to it, about all axes"
+        )
+    if error > 0 and mass < _SURE * error:
+        words = f"nothing hangs on {link} that can be told from 0 kg"
+        reasons = dict.fromkeys(("com", "inertia"), words)
+    return Payload(
+        link,
+        mass,
+        error,
+        np.array([mass - reach * error, mass + reach * error]),
+        com.real,
+        com_error,
+        inertia,
+        inertia_error,
+        reasons,
+    )
+
+
+def _about_com(x: Array) -> Array:
+    """Return centre of mass and inertia about it, xx xy yy xz yz zz, of ten parameters, (9,)."""
+    m, mc = x[0], x[1:4]
+    steiner = (mc @ mc * np.eye(3) - np.outer(mc, mc)) / m
+    i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
+    return np.concatenate([mc / m, x[4:] - steiner[i, j]])
+
+
+def _matrix(entries: Array) -> Array:
+    """Return the symmetric matrix of xx xy yy xz yz zz, shape (3, 3)."""
+    xx, xy, yy, xz, yz, zz = entries.tolist()
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _gains(model: RobotModel, runs: TwoRuns, found: Compared) -> dict[str, Gain]:
+    first = len(found.theta)
+    error = np.sqrt(np.diag(found.covariance)[first:])  # of the logarithm
+    reach = quantile(found.freedom[first:]) * error
+    gains = {}
+    for k, j in enumerate(runs.unknown):
+        value = float(found.gain[j])
+        ends = sorted((value * np.exp([-reach[k], reach[k]])).tolist())
+        gains[model.joints[j]] = Gain(value, abs(value) * float(error[k]), (ends[0], ends[1]))
+    return gains

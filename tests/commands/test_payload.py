@@ -1,0 +1,113 @@
+"""`robotid payload`: from files to what controllers ask for."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.synthetic import exact_log, truth
+
+from robotid.cli import main
+from robotid.commands.identify import run_job
+from robotid.commands.job import job_from_settings
+from robotid.commands.payload import stated_masses
+from robotid.exceptions import SettingsError
+from robotid.logs.formats import write_columns
+from robotid.logs.read import write_log
+from robotid.robot.bodies import link_transfer
+from robotid.robot.examples import example_urdf
+
+LOAD = np.array([2.0, 0.04, 0.06, 0.2, 0.06, 0.0, 0.06, 0.0, 0.0, 0.03])
+GAINS = np.array([14.0, 13.0, 11.0, 9.0, 8.0, 7.0])
+NOISE = np.array([0.3, 0.4, 0.2, 0.04, 0.03, 0.02])  # [N m]
+ARM = str(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="module")
+def files(ur5, tmp_path_factory):
+    """Logs without and with a load on tool0, as torques and as currents, and a result."""
+    folder = tmp_path_factory.mktemp("payload")
+    pi, (body, transfer) = truth(ur5), link_transfer(ur5, "tool0")
+    loaded = pi.copy()
+    loaded[10 * body : 10 * body + 10] += transfer @ LOAD
+    rng = np.random.default_rng(0)
+    for name, x in {"bare": pi, "loaded": loaded}.items():
+        log = exact_log(ur5, x, rng, samples=1000, rate=100.0, noise=NOISE)
+        log = replace(log, v=None, a=None)
+        write_log(log, folder / f"{name}.csv")
+        columns = {"time": log.t}
+        for j, joint in enumerate(ur5.joints):
+            columns[f"q_{joint}"] = log.q[:, j]
+            columns[f"current_{joint}"] = log.tau[:, j] / GAINS[j]
+        write_columns(columns, folder / f"{name}_currents.csv")
+    table = {"urdf": ARM, "identification": [{"log": "bare.csv"}], "estimator": {"name": "wls"}}
+    run_job(job_from_settings(table, "job.toml", folder), folder / "out")
+    return folder
+
+
+def asked(capsys, *words, code=0):
+    assert main(["payload", ARM, *map(str, words)]) == code
+    printed = capsys.readouterr()
+    return printed.out if code == 0 else printed.err
+
+
+def test_a_log_and_a_result_are_references_alike(files, capsys):
+    found = [
+        json.loads(asked(capsys, files / "loaded.csv", "--reference", files / reference,
+                         "--link", "tool0", "--json"))
+        for reference in ("bare.csv", "out", "out/result.json")
+    ]  # fmt: skip
+    assert found[0] == found[1] == found[2]
+    (payload,) = found[0]["payloads"]
+    assert payload["link"] == "tool0"
+    assert payload["mass"] == pytest.approx(2.0, abs=4 * payload["mass_std_error"])
+    assert payload["mass_std_error"] < 0.05
+    error = np.array(payload["com"]) - LOAD[1:4] / LOAD[0]
+    assert (np.abs(error) < 4 * np.array(payload["com_std_error"])).all()
+    assert "gains" not in found[0]
+
+
+def test_the_text_says_what_a_controller_asks_for(files, capsys):
+    said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
+                 "--mass", "2")  # fmt: skip
+    assert said.startswith("payload on tool0\n  mass 2.0000 kg, stated\n")
+    assert "centre of mass in the frame of tool0 [m]: x 0.0" in said
+    assert "inertia about the origin of tool0, axes of tool0 [kg m^2]: Ixx 0.0" in said
+    assert "inertia about its centre of mass, axes of tool0" in said
+
+
+def test_gains_come_from_a_known_mass(files, capsys, ur5):
+    words = [files / "loaded_currents.csv", "--reference", files / "bare_currents.csv", "--link",
+             "tool0", "--mass", "tool0=2", "--gains"]  # fmt: skip
+    found = json.loads(asked(capsys, *words, "--json"))
+    assert list(found["gains"]) == list(ur5.joints)
+    for gain, true in zip(found["gains"].values(), GAINS, strict=True):
+        assert gain["gain"] == pytest.approx(true, abs=4 * gain["std_error"])
+        assert gain["std_error"] < 0.05 * true
+    assert all(entry["std_error"] > 0 for entry in found["base_parameters"])
+    said = asked(capsys, *words)
+    assert "[torque.gains]\nshoulder_pan_joint = 1" in said
+    stated = f"{ur5.joints[0]}={GAINS[0]}"
+    some = json.loads(asked(capsys, *words, "--gain", stated, "--json"))
+    assert list(some["gains"]) == list(ur5.joints[1:])
+
+
+def test_what_is_missing_is_named(files, capsys):
+    loaded, bare = files / "loaded.csv", files / "bare.csv"
+    said = asked(capsys, bare, "--reference", loaded, "--link", "tool0", code=1)
+    assert "less than in the reference" in said
+    said = asked(capsys, loaded, "--reference", files / "out", "--cutoff", "5", code=2)
+    assert "a RESULT says how its logs are read; leave out ['cutoff']" in said
+    said = asked(capsys, loaded, "--reference", files / "out", "--reference", bare, code=2)
+    assert "one result is a reference by itself" in said
+    said = asked(capsys, loaded, "--reference", bare, "--mass", "heavy", code=2)
+    assert "--mass 'heavy': wanted KG or LINK=KG" in said
+    with pytest.raises(SettingsError, match=r"of which of the links a, b\?"):
+        stated_masses(["2"], ["a", "b"])
+    content = bare.read_bytes()
+    try:
+        bare.write_bytes(content + b"\n")
+        said = asked(capsys, loaded, "--reference", files / "out", code=1)
+    finally:
+        bare.write_bytes(content)
+    assert "is not there any more or was changed; give a log without the payload" in said

@@ -1,0 +1,197 @@
+"""Gravity, Coulomb friction and offsets of poses and slow sweeps."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.synthetic import truth
+
+from robotid.commands.identify import run_job
+from robotid.commands.job import read_job
+from robotid.commands.validate import validate_result
+from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.export.result import load_result
+from robotid.identification.pipeline import EstimatorSettings, identify
+from robotid.logs.data import Log
+from robotid.logs.read import write_log
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import resolve
+from robotid.online.identifier import OnlineIdentifier
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.used_rows import static_rows
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+ROBOTS = {"panda": [f"panda_joint{i}" for i in range(1, 8)], "ur10_robot": None}
+
+
+def robot(name, **options):
+    return RobotModel.from_urdf(example_urdf(f"{name}.urdf"), joints=ROBOTS[name], **options)
+
+
+def reach(model):
+    return np.array([[max(j.lower, -2.5), min(j.upper, 2.5)] for j in model.limits]).T
+
+
+def poses(full, pi, rng, count=60, rows=20):
+    """A log of poses, 20 s apart, each held against friction of unknown direction."""
+    q = rng.uniform(*reach(full), (count, len(full.joints)))
+    still, held = np.zeros_like(q), rng.uniform(-1, 1, q.shape)
+    tau = (joint_torque_regressor(full, q, still, still, held) @ pi).reshape(q.shape)
+    t = (20.0 * np.arange(count)[:, None] + np.arange(rows) / 100).ravel()
+    q, tau = (np.repeat(x, rows, axis=0) for x in (q, tau))
+    q, tau = (x + s * rng.standard_normal(x.shape) for x, s in ((q, 2e-5), (tau, 0.3)))
+    return Log(t=t, q=q, tau=tau, joints=full.joints)
+
+
+def sweep(full, pi, rng, legs=12, speed=0.03, rate=40.0):
+    """A log of straight lines between random points, all dynamics but viscous friction in it."""
+    via = rng.uniform(*reach(full), (legs, len(full.joints)))
+    parts = []
+    for a, b in pairwise(via):
+        rows = int(np.abs(b - a).max() / speed * rate)
+        parts.append(a + np.arange(rows)[:, None] / rows * (b - a))
+    q = np.concatenate(parts)
+    t = np.arange(len(q)) / rate
+    v = np.gradient(q, t, axis=0)
+    pi = np.where([n.endswith("viscous") for n in full.layout.names], 0.0, pi)
+    tau = (joint_torque_regressor(full, q, v, 0 * v) @ pi).reshape(q.shape)
+    q, tau = (x + s * rng.standard_normal(x.shape) for x, s in ((q, 2e-5), (tau, 0.3)))
+    return Log(t=t, q=q, tau=tau, joints=full.joints)
+
+
+def own(full, static, pi):
+    """The truth in the parameters of the static model."""
+    values = dict(zip(full.layout.names, pi, strict=True))
+    return np.array([values[name] for name in static.layout.names])
+
+
+def gravity(model, pi, q):
+    bodies = model.with_parameters(pi)
+    data = bodies.pin_model.createData()
+    rows = [pin.computeGeneralizedGravity(bodies.pin_model, data, x) for x in q]
+    return np.array(rows)
+
+
+CASES = {"poses": (poses, ("offset",), 0.02), "sweeps": (sweep, None, 0.002)}
+
+
+@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_gravity_is_found_with_true_intervals(name, kind, rng):
+    record, terms, near = CASES[kind]
+    full = robot(name)
+    static = robot(name, dynamics="static", **({} if terms is None else {"terms": terms}))
+    pi = truth(full)
+    found = identify(static, [record(full, pi, rng)], validation=[record(full, pi, rng)])
+    beta = found.mapping.to_base(own(full, static, pi))
+    low, high = found.base_interval.T
+    assert np.mean((low <= beta) & (beta <= high)) >= 0.85  # 95 % of 16 to 26, by chance
+    assert (np.abs(found.base - beta) <= 2 * (high - low)).all()
+    q = static.configurations(rng.uniform(-2, 2, (50, len(static.joints))))
+    wanted, given = gravity(full, pi, q), gravity(static, found.standard, q)
+    size = np.sqrt(np.mean(wanted**2, axis=0))
+    assert np.sqrt(np.mean((given - wanted) ** 2, axis=0)).max() < near * size.max()
+    assert found.is_consistent
+    assert found.verdict.status in ("good", "usable")
+    assert found.verdict.reasons[-1].startswith("static: gravity, offsets and friction that needs")
+    (note,) = [f for f in found.findings if f.code == "static"]
+    count = note.evidence["samples"]
+    assert count == 60 if kind == "poses" else count > 500
+
+
+def test_what_gravity_shows_is_what_stands_can_show():
+    full, static = robot("panda"), robot("panda", dynamics="static")
+    assert static.layout.terms == ("coulomb", "offset")
+    inertial = structural_mapping(static, inertial_only=True)
+    used = np.array(static.layout.inertial_names)[(inertial.K != 0).any(axis=0)]
+    assert {name.rsplit(".", 1)[1] for name in used} == {"m", "mcx", "mcy", "mcz"}
+    # as many as gravity's columns are independent at random poses
+    q = np.random.default_rng(0).uniform(-2, 2, (60, 7))
+    W = joint_torque_regressor(full, q, 0 * q, 0 * q)[:, : full.layout.n_inertial]
+    assert len(inertial.K) == np.linalg.matrix_rank(W, tol=1e-9)
+    assert len(structural_mapping(static).K) == len(inertial.K) + 2 * 7
+
+
+def test_inertias_about_the_centres_of_mass_are_the_urdfs(rng):
+    full, static = robot("panda"), robot("panda", dynamics="static", terms=("offset",))
+    found = identify(static, [poses(full, truth(full), rng)])
+    models = static.pin_model, static.with_parameters(found.standard).pin_model
+    before, after = ([model.inertias[i] for i in (2, 3, 4)] for model in models)
+    assert max(abs(b.mass / a.mass - 1) for a, b in zip(after, before, strict=True)) > 0.03
+    for a, b in zip(after, before, strict=True):
+        np.testing.assert_allclose(a.inertia, b.inertia, atol=0.05 * np.trace(b.inertia))
+
+
+def test_poses_leave_coulomb_friction_open_and_say_so(rng):
+    full, static = robot("panda"), robot("panda", dynamics="static")
+    found = identify(static, [poses(full, truth(full), rng)])
+    open_ = set(found.determination.undetermined)
+    assert open_ == {f"{joint}.coulomb" for joint in static.joints}
+    (note,) = [f for f in found.findings if f.code == "static"]
+    assert "Stands do not show the Coulomb friction of panda_joint1, panda_joint2" in note.message
+    assert "not evaluated" in found.verdict.joints["panda_joint1"].status  # gravity turns it not
+
+
+def test_a_job_writes_a_urdf_of_its_gravity_that_other_logs_validate(tmp_path, rng):
+    full = robot("ur10_robot")
+    pi = truth(full)
+    write_log(poses(full, pi, rng), tmp_path / "fit.csv")
+    write_log(poses(full, pi, rng, rows=1, count=30), tmp_path / "kept.csv")
+    (tmp_path / "job.toml").write_text(
+        f'urdf = "{full.tree.path}"\n[units]\ntime = "s"\n[reduction]\nrows_in_memory = 100\n'
+        '[model]\ndynamics = "static"\nfriction = "none"\n[[identification]]\nlog = "fit.csv"\n'
+    )
+    job = read_job(tmp_path / "job.toml")
+    found, result = run_job(job, tmp_path / "out")
+    assert result["settings"]["model"]["dynamics"] == "static"
+    loaded = load_result(tmp_path / "out")
+    assert loaded.robot.is_static
+    np.testing.assert_allclose(loaded.parameters, found.standard, atol=1e-9)
+    sidecar = json.loads((tmp_path / "out" / "ur10_robot.identified.drive.json").read_text())
+    assert sidecar["dynamics"] == "static"
+    q = pin.neutral(full.pin_model)[None] + rng.uniform(-2, 2, (20, 6))
+    written = RobotModel.from_urdf(tmp_path / "out" / "ur10_robot.identified.urdf")
+    wanted = gravity(full, pi, q)
+    given = gravity(written, written.standard_parameters(), q)
+    np.testing.assert_allclose(given, wanted, atol=0.03 * np.abs(wanted).max())
+    checked = validate_result(tmp_path / "out" / "result.json", [tmp_path / "kept.csv"])
+    verdict = checked["verdict"]
+    assert verdict["per_joint"]["shoulder_lift_joint"]["status"] == "good"
+    assert verdict["per_joint"]["shoulder_pan_joint"]["status"] == "not evaluated"
+    assert verdict["reasons"][-1].startswith("static: ")
+
+
+def test_stands_of_a_joint_that_moves_more_elsewhere_are_left_out():
+    static = robot("panda", dynamics="static")
+    t = np.arange(3000) / 100
+    q = np.zeros((3000, 7))
+    q[:, 1] = 0.05 * np.clip(t, 5, 25)  # 20 s of motion between two stands
+    log = Log(t=t, q=q, tau=q, joints=static.joints)
+    motion, used = static_rows(static, log, resolve(log, SignalSettings(cutoff=None)))
+    moves = motion.direction[:, 1] == 1
+    assert moves.sum() == len(moves) - 4  # two stands, and where it sets out and stops
+    assert (used[:, 1] == moves).all()
+    assert used[:, 2].sum() == 2  # of the others, the two stands are all there is
+    assert not motion.v.any()
+    assert not motion.direction[:, 2].any()
+
+
+def test_what_static_models_cannot_do_is_refused(rng):
+    full, static = robot("panda"), robot("panda", dynamics="static")
+    with pytest.raises(ModelError, match="dynamics is 'slow', wanted one of full, static"):
+        robot("panda", dynamics="slow")
+    with pytest.raises(SettingsError, match="dynamics is 'static', but gravity is 0"):
+        robot("panda", dynamics="static", gravity=(0, 0, 0))
+    with pytest.raises(DataError, match="needs a model with dynamics = 'full'"):
+        OnlineIdentifier(static)
+    log = poses(full, truth(full), rng)
+    with pytest.raises(SettingsError, match="'prx' needs the mass matrix, which dynamics"):
+        identify(static, [log], estimator=EstimatorSettings("prx", metric="mass"))
+    fast = Log(t=log.t[:20], q=log.q[:20] + 2.0 * log.t[:20, None], tau=log.tau[:20],
+               joints=log.joints)  # fmt: skip
+    with pytest.raises(DataError, match="no stretch of a quarter of a second is slow enough for"):
+        identify(static, [fast])

@@ -1,0 +1,66 @@
+"""Stands count once, slow stretches once each, and what is fast is left out."""
+
+import numpy as np
+
+from robotid.logs.data import Log
+from robotid.logs.standing import standing_motion
+
+LEAST, FASTEST, HARDEST = np.full(2, 2e-3), np.full(2, 0.4), np.full(2, 0.3)
+
+
+def log_of(t, q, tau=None):
+    q = np.asarray(q, dtype=float)
+    return Log(t=t, q=q, tau=10 * q if tau is None else tau, joints=("a", "b"))
+
+
+def means(log, max_gap=0.1):
+    return standing_motion(log, max_gap, LEAST, FASTEST, HARDEST)
+
+
+def test_a_stand_is_the_mean_of_its_rows_however_long(rng):
+    t = np.concatenate([np.arange(n) / 100 + start for n, start in ((40, 0), (300, 9), (1, 20))])
+    poses = np.repeat([[0.1, 1.0], [0.5, -1.0], [0.5, 0.0]], [40, 300, 1], axis=0)
+    tau = rng.standard_normal((341, 2))
+    motion, stands = means(log_of(t, poses + 1e-5 * rng.standard_normal((341, 2)), tau))
+    assert stands.tolist() == [True] * 3
+    np.testing.assert_allclose(motion.q, poses[[0, 40, 340]], atol=1e-4)
+    parts = np.split(np.arange(341), [40, 340])
+    np.testing.assert_allclose(motion.tau, [tau[part].mean(axis=0) for part in parts])
+    np.testing.assert_allclose(motion.t, [t[part].mean() for part in parts])
+    assert motion.segment.tolist() == [0, 1, 2]
+    assert not motion.v.any()
+
+
+def test_rows_far_apart_are_poses_of_their_own_unless_alike():
+    q = [[0.0, 0.0], [1.0, 0.0], [1.0, 1e-3], [0.0, 1.0]]
+    motion, stands = means(log_of(np.arange(4) * 5.0, q), max_gap=12.5)
+    assert stands.all()
+    np.testing.assert_allclose(motion.q, [[0.0, 0.0], [1.0, 5e-4], [0.0, 1.0]])
+
+
+def test_slow_motion_has_its_sign_but_not_where_it_turns_or_one_joint_stands(rng):
+    t = np.arange(2000) / 100
+    triangle = 0.03 * np.abs((t + 5) % 20 - 10)  # turns at 5 s, at 15 s
+    q = np.column_stack([triangle, np.full_like(t, 0.7)]) + 1e-5 * rng.standard_normal((2000, 2))
+    motion, stands = means(log_of(t, q))
+    assert not stands.any()
+    far = np.minimum(np.abs(motion.t - 5), np.abs(motion.t - 15)) > 0.5
+    truth = np.where((motion.t < 5) | (motion.t > 15), -0.03, 0.03)
+    np.testing.assert_allclose(motion.v[far, 0], truth[far], atol=2e-4)
+    near = ~far
+    assert (motion.v[near, 0] * truth[near] >= 0).all()
+    assert (motion.v[near, 0] == 0).any()
+    np.testing.assert_allclose(motion.v[:, 1], 0, atol=5e-4)
+    np.testing.assert_allclose(motion.tau, 10 * motion.q, atol=1e-9)
+
+
+def test_fast_moves_between_poses_are_left_out_with_what_is_beside_them():
+    s = np.linspace(0, 1, 150)[:, None]
+    move = (10 * s**3 - 15 * s**4 + 6 * s**5) * [1.0, -0.8]
+    hold = np.ones((150, 2))
+    q = np.concatenate([0 * hold, move, hold * [1, -0.8], move[::-1], 0 * hold])
+    motion, stands = means(log_of(np.arange(len(q)) / 100, q))
+    assert stands.all()
+    np.testing.assert_allclose(motion.q, [[0, 0], [1, -0.8], [0, 0]], atol=1e-12)
+    fast, _ = means(log_of(np.arange(400) / 100, np.linspace(0, 4, 400)[:, None] * [1, 1]))
+    assert fast.t.size == 0
