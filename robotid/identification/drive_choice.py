@@ -42,6 +42,7 @@ _STEP = 1e-3  # relative, of a derivative
 _STEPS = 40  # of the search for all shapes of a joint together
 _STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
 _FEWEST = 3  # stretches that show chance
+_SHARPEST = 1e-6  # of the squared residual: exact data leave nothing to weigh by
 _NOTHING = 1e-300
 
 
@@ -324,7 +325,8 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
             break
         # between the sizes of the grid, or the next family would make up for that
         own = _refined(sample, drive, [every.own[i] for i in (*chosen, best)])
-        every = _Trials.of(sample, drive, [*own, *grid])
+        anew = _weighed_anew(sample, drive, own)
+        every, torque = _Trials.of(anew, drive, [*own, *grid]), float(anew.torque[drive.j])
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
@@ -426,7 +428,8 @@ def _found(
     bounds = _log_bounds(drive, families)
     margin = _EDGE * np.ptp(bounds, axis=1)
     is_at_bound = np.min(np.abs(np.log(flat)[:, None] - bounds), axis=1) < margin
-    covariance = _shape_covariance(sample, drive, families, flat)
+    anew = _weighed_anew(sample, drive, refined)
+    covariance = _shape_covariance(anew, drive, families, flat)
     return DriveChoice(
         joint=sample.joints[drive.j],
         families=tuple(family.name for family in families),
@@ -447,6 +450,36 @@ def _found(
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
         seen=drive.seen,
+    )
+
+
+def _weighed_anew(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> Sample:
+    """Return the rows with the joint's weighed by what its new terms leave of the residual.
+
+    By that of the fit without them the data of this joint would be far too weak: against those of
+    the others, and against what is known before the data.
+    """
+    if not chosen:
+        return sample
+    Z = drive.columns(_terms(drive, chosen))
+    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+    left = [
+        float(whole.left(which)[: sample.fitted].sum()) for which in ([], list(range(Z.shape[1])))
+    ]
+    factor = np.ones(len(sample.joints))
+    factor[drive.j] = np.sqrt(left[0] / max(left[1], _SHARPEST * left[0], _NOTHING))
+    W, r = sample.W * factor[:, None], sample.r * factor
+    by_stretch = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in sample.stretches]
+    return replace(
+        sample,
+        weight=sample.weight * factor,
+        torque=sample.torque * factor**2,
+        W=W,
+        r=r,
+        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
+        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
     )
 
 
@@ -486,6 +519,7 @@ def _refined(
 
     best = start
     if len(start):
+        sample = _weighed_anew(sample, drive, chosen)
         bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
         found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
         best = found.x if found.fun <= left(start) else start
