@@ -135,6 +135,15 @@ def test_the_family_is_chosen_on_its_joint_and_nothing_on_others(plain, cases, n
     assert found.metrics().per_joint[ELBOW].relative_error_pct == pytest.approx(1.0, rel=0.15)
 
 
+def test_a_shape_between_the_sizes_of_the_grid_needs_no_second_family(plain):
+    low, high = FAMILIES["stribeck"].shapes[0].within(SEEN)
+    speed = low * (high / low) ** (3.5 / 5)  # of 6 sizes
+    terms = [Stribeck(speed=speed)]
+    true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.stribeck": 6.0})
+    found = found_in(plain, [driven_log(true, pi, SEED, reach=REACH)], estimator="wls")
+    assert chosen(found) == {ELBOW: ("stribeck",)}
+
+
 def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(plain):
     true, pi = driven(plain, {}, {})
     for seed in range(2):
@@ -228,8 +237,9 @@ def test_friction_is_stated_for_all_joints_or_for_some():
 
 
 @pytest.mark.parametrize("estimator", ["wls", "consistent"])
-def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, cases, estimator, tmp_path):
-    log = cases("load")[2]
+def test_the_load_of_the_gears_is_that_of_the_bodies_found(plain, estimator, tmp_path):
+    true, pi = driven(plain, {ELBOW: [LoadFriction()]}, {f"{ELBOW}.load": 0.35})
+    log = driven_log(true, pi, SEED, reach=REACH)
     found = found_in(plain, [log], friction={"*": "load"}, estimator=estimator)
     np.testing.assert_array_equal(found.model.reference, found.standard)
     motion = process(log, EXACT)
@@ -317,6 +327,7 @@ def test_what_is_nearly_chosen_widens_the_intervals_it_would_move(plain):
         log = driven_log(true, pi, seed, reach=REACH, noise=0.06)
         found = found_in(plain, [log], estimator="wls")
         (choice,) = (c for c in found.drives if c.joint == ELBOW)
+        assert all(x.chance < 0.015 for x in choice.tried if x.is_taken and x.families)
         if choice.families or [t.name for t in choice.doubted] != ["load"]:
             continue
         seen += 1
