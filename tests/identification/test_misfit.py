@@ -180,7 +180,7 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
     found, result = run_job(job_from_settings(table, "job", tmp_path), tmp_path / "out")
     (named,) = [f for f in result["warnings"] if f["code"] == "friction_shape"]
     assert named["where"] == ELBOW
-    assert f"state {ELBOW} = [" in named["message"]
+    assert f"state {ELBOW} = [" in named["message"].lower()
     assert "in [drives] to add it to the model" in named["message"]
     assert f"{ELBOW}.coulomb" in named["message"].partition("stand on this misfit")[0]
     assert set(found.on_misfit) <= {name for name in found.mapping.names if ELBOW in name}
