@@ -24,6 +24,7 @@ PAGES = {
     "end_to_end": "speed.md",
     "figaroh": "speed.md",
     "fuzz": "limits.md",
+    "friction": "friction.md",
     "regressor": "speed.md",
     "startup": "speed.md",
     "scaling": "speed.md",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid._typing import Array
+from robotid.identification.model_error import shape_slope
 from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.torque import trajectory_regressor
@@ -115,4 +116,13 @@ def friction_curve(
     X = np.column_stack([none, *(term.column(motion) for _, term in own)])[:, 1:]
     k = [k for k, _ in own]
     variance = np.einsum("ij,jk,ik->i", X, found.standard_covariance[np.ix_(k, k)], X)
+    for choice in found.drives:
+        if choice.joint == joint and choice.shape_moves is not None:
+            # shapes bend the curve, too, beside moving its parameters
+            moved, C = X @ choice.shape_moves[k], np.array(choice.shape_covariance)
+            bent = moved + np.column_stack(
+                [shape_slope(found, choice, s, motion) for s in range(len(C))]
+            )
+            variance += np.einsum("ij,jk,ik->i", bent, C, bent)
+            variance -= np.einsum("ij,jk,ik->i", moved, C, moved)
     return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)

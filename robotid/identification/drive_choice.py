@@ -4,12 +4,12 @@ Terms are tried beside viscous and Coulomb friction, joint by joint, on rows spr
 logs. The family that explains most of the stretches left out is taken if it does so beyond chance,
 then the next one beside it, until nothing is left to gain. Recordings kept apart have no say in it.
 
-What a family is not linear in, its shape, is sought on a grid and then by Brent's method, with all
-linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
+What a family is not linear in, its shape, is sought on a grid; then all shapes of a joint together,
+with the linear parameters refitted each time (Golub, Pereyra 2003, variable projection).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -36,11 +36,13 @@ _LEAST = 0.05  # of the squared residual that is left, from which a family is wo
 _SEEN = 0.003  # of the torque: a gain that is smaller is not worth a parameter
 _ALIKE = 0.02  # of the squared residual, within which two families explain alike
 _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
-_SLOWEST = 0.02  # share of the rows that are slower than what counts as seen
+_SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _STEP = 1e-3  # relative, of a derivative
+_STEPS = 40  # of the search for all shapes of a joint together
 _STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
 _FEWEST = 3  # stretches that show chance
+_SHARPEST = 1e-6  # of the squared residual: exact data leave nothing to weigh by
 _NOTHING = 1e-300
 
 
@@ -90,8 +92,12 @@ class DriveChoice:
         terms: The terms themselves.
         tried: What was tried, step by step.
         shapes: The shapes that were found.
+        shape_covariance: Their covariance, row by row.
         sizes: Shapes of each family.
         seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+        doubted: Terms that held-out stretches favour, but not beyond chance: they were not taken,
+            and errors count what they would move.
+        shape_moves: By how much each shape moves standard parameters, shape (p, k).
     """
 
     joint: str
@@ -99,8 +105,11 @@ class DriveChoice:
     terms: tuple[DriveTerm, ...]
     tried: tuple[Tried, ...] = ()
     shapes: tuple[FoundShape, ...] = ()
+    shape_covariance: tuple[tuple[float, ...], ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    doubted: tuple[DriveTerm, ...] = ()
+    shape_moves: Array | None = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what was tried, taken and found, as plain values."""
@@ -247,8 +256,7 @@ class _Trials:
     fitted: int
 
     @classmethod
-    def of(cls, sample: Sample, drive: _Drive, families: Sequence[Family]) -> "_Trials":
-        own = list(_candidates(drive, families))
+    def of(cls, sample: Sample, drive: _Drive, own: list[tuple[Family, list[float]]]) -> "_Trials":
         terms = [family.make(drive.seen, *sizes) for family, sizes in own]
         columns = [drive.columns(those) for those in terms]
         ends = np.cumsum([x.shape[1] for x in columns]).tolist()
@@ -293,9 +301,11 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
 
 def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
     """Return the fewest families that held-out stretches ask for."""
-    every = _Trials.of(sample, drive, [f for f in FAMILIES.values() if f.is_automatic])
+    grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
+    every = _Trials.of(sample, drive, grid)
     torque = float(sample.torque[drive.j])
     chosen: list[int] = []
+    doubted: list[tuple[Family, list[float]]] = []
     before = every.left([])
     tried = [Tried((), _percent(before, torque), 1.0, True)]
     for _ in range(_FAMILIES):
@@ -309,10 +319,18 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
         names = [every.own[i][0].name for i in chosen]
         tried += list(_told(every, left, before, torque, names, best))
         if best is None:
+            nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
+            if nearest is not None and left[nearest].sum() < before.sum():
+                doubted = [every.own[nearest]]
             break
-        chosen.append(best)
-        before = left[best]
-    return _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+        # between the sizes of the grid, or the next family would make up for that
+        own = _refined(sample, drive, [every.own[i] for i in (*chosen, best)])
+        anew = _weighed_anew(sample, drive, own)
+        every, torque = _Trials.of(anew, drive, [*own, *grid]), float(anew.torque[drive.j])
+        chosen = list(range(len(own)))
+        before = every.left(chosen)
+    choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
+    return replace(choice, doubted=_terms(drive, doubted))
 
 
 def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: float) -> int | None:
@@ -375,7 +393,7 @@ def _percent(left: Array, torque: float) -> float:
 def _fixed(sample: Sample, drive: _Drive, names: Sequence[str]) -> DriveChoice:
     """Return the families asked for, with the shapes that fit best."""
     families = [FAMILIES[name] for name in names]
-    every = _Trials.of(sample, drive, families)
+    every = _Trials.of(sample, drive, list(_candidates(drive, families)))
     groups = [[i for i, (f, _) in enumerate(every.own) if f.name == name] for name in names]
     missing = [name for name, group in zip(names, groups, strict=True) if not group]
     if missing:
@@ -403,93 +421,126 @@ def _found(
     tried: tuple[Tried, ...],
 ) -> DriveChoice:
     """Return the choice with its shapes refined."""
-    sizes = [list(own) for _, own in chosen]
-    families = [family for family, _ in chosen]
-    shapes = []
-    for at, family in enumerate(families):
-        for k, shape in enumerate(family.shapes):
-            value = _refined(sample, drive, families, sizes, (at, k))
-            sizes[at][k] = value
-            low, high = shape.within(drive.seen)
-            margin = _EDGE * np.log(high / low)
-            is_at_bound = min(np.log(value / low), np.log(high / value)) < margin
-            shapes.append((at, k, bool(is_at_bound)))
-    terms = tuple(
-        term
-        for family, own in zip(families, sizes, strict=True)
-        for term in family.make(drive.seen, *own)
-    )
+    refined = _refined(sample, drive, chosen)
+    families = [family for family, _ in refined]
+    flat = np.array([size for _, own in refined for size in own])
+    shapes = [(family, shape) for family in families for shape in family.shapes]
+    bounds = _log_bounds(drive, families)
+    margin = _EDGE * np.ptp(bounds, axis=1)
+    is_at_bound = np.min(np.abs(np.log(flat)[:, None] - bounds), axis=1) < margin
+    anew = _weighed_anew(sample, drive, refined)
+    covariance = _shape_covariance(anew, drive, families, flat)
     return DriveChoice(
         joint=sample.joints[drive.j],
         families=tuple(family.name for family in families),
-        terms=terms,
+        terms=_terms(drive, refined),
         tried=tried,
         shapes=tuple(
             FoundShape(
-                name=f"{families[at].name}.{families[at].shapes[k].name}",
-                value=sizes[at][k],
-                std_error=_shape_error(sample, drive, families, sizes, (at, k)),
-                unit=families[at].shapes[k].units[int(drive.slides)],
-                is_at_bound=is_at_bound,
+                name=f"{family.name}.{shape.name}",
+                value=float(value),
+                std_error=float(std_error),
+                unit=shape.units[int(drive.slides)],
+                is_at_bound=bool(is_edge),
             )
-            for at, k, is_at_bound in shapes
+            for (family, shape), value, std_error, is_edge in zip(
+                shapes, flat, np.sqrt(np.diag(covariance)), is_at_bound, strict=True
+            )
         ),
-        sizes=tuple(tuple(own) for own in sizes),
+        shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
+        sizes=tuple(tuple(own) for _, own in refined),
         seen=drive.seen,
     )
 
 
-def _columns(drive: _Drive, families: Sequence[Family], sizes: Sequence[Sequence[float]]) -> Array:
-    parts = [
-        drive.columns(f.make(drive.seen, *own)) for f, own in zip(families, sizes, strict=True)
+def _weighed_anew(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> Sample:
+    """Return the rows with the joint's weighed by what its new terms leave of the residual.
+
+    By that of the fit without them the data of this joint would be far too weak: against those of
+    the others, and against what is known before the data.
+    """
+    if not chosen:
+        return sample
+    Z = drive.columns(_terms(drive, chosen))
+    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+    left = [
+        float(whole.left(which)[: sample.fitted].sum()) for which in ([], list(range(Z.shape[1])))
     ]
-    return np.hstack(parts)
+    factor = np.ones(len(sample.joints))
+    factor[drive.j] = np.sqrt(left[0] / max(left[1], _SHARPEST * left[0], _NOTHING))
+    W, r = sample.W * factor[:, None], sample.r * factor
+    by_stretch = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in sample.stretches]
+    return replace(
+        sample,
+        weight=sample.weight * factor,
+        torque=sample.torque * factor**2,
+        W=W,
+        r=r,
+        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
+        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
+    )
+
+
+def _terms(
+    drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> tuple[DriveTerm, ...]:
+    """Return the terms of families with their shapes."""
+    return tuple(term for family, own in chosen for term in family.make(drive.seen, *own))
+
+
+def _with_shapes(families: Sequence[Family], flat: Array) -> list[tuple[Family, list[float]]]:
+    """Return families with their shapes, of all in a row."""
+    sizes = iter(flat.tolist())
+    return [(family, [next(sizes) for _ in family.shapes]) for family in families]
+
+
+def _log_bounds(drive: _Drive, families: Sequence[Family]) -> Array:
+    """Return logarithms of where each shape is sought, shape (k, 2)."""
+    bounds = [shape.within(drive.seen) for family in families for shape in family.shapes]
+    logs: Array = np.log(np.reshape(bounds, (-1, 2)))
+    return logs
 
 
 def _refined(
-    sample: Sample,
-    drive: _Drive,
-    families: Sequence[Family],
-    sizes: Sequence[Sequence[float]],
-    which: tuple[int, int],
-) -> float:
-    """Return the size of one shape that leaves least of the held-out stretches, near its own."""
-    from scipy.optimize import minimize_scalar
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> list[tuple[Family, list[float]]]:
+    """Return families with the shapes that together leave least of the fitted rows, near theirs."""
+    from scipy.optimize import minimize
 
-    at, k = which
-    low, high = families[at].shapes[k].within(drive.seen)
-    step = np.log(high / low) / (_GRID - 1)
-    own = np.log(sizes[at][k])
+    families = [family for family, _ in chosen]
+    start = np.log([size for _, own in chosen for size in own])
 
-    def left(log_size: float) -> float:
-        tried = [list(x) for x in sizes]
-        tried[at][k] = float(np.exp(log_size))
-        Z = _columns(drive, families, tried)
-        apart, _ = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
-        return float(apart.left(list(range(Z.shape[1])))[: sample.fitted].sum())
+    def left(log_sizes: Array) -> float:
+        Z = drive.columns(_terms(drive, _with_shapes(families, np.exp(log_sizes))))
+        _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+        return float(np.log(whole.left(list(range(Z.shape[1])))[: sample.fitted].sum() + _NOTHING))
 
-    bounds = (max(own - step, np.log(low)), min(own + step, np.log(high)))
-    found = minimize_scalar(left, bounds=bounds, method="bounded", options={"maxiter": 12})
-    return float(np.exp(found.x)) if found.fun <= left(own) else float(sizes[at][k])
+    best = start
+    if len(start):
+        sample = _weighed_anew(sample, drive, chosen)
+        bounds, options = _log_bounds(drive, families), {"eps": _STEP, "maxiter": _STEPS}
+        found = minimize(left, start, method="L-BFGS-B", bounds=bounds, options=options)
+        best = found.x if found.fun <= left(start) else start
+    return _with_shapes(families, np.exp(best))
 
 
-def _shape_error(
-    sample: Sample,
-    drive: _Drive,
-    families: Sequence[Family],
-    sizes: Sequence[Sequence[float]],
-    which: tuple[int, int],
-) -> float:
-    """Return the standard error of a shape: that of the column d(torque)/d(shape) beside all."""
-    at, k = which
-    Z = _columns(drive, families, sizes)
+def _shape_covariance(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> Array:
+    """Return the covariance of shapes: that of the columns d(torque)/d(shape) beside all."""
+    if not len(flat):
+        return np.empty((0, 0))
+    Z = drive.columns(_terms(drive, _with_shapes(families, flat)))
     _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
     theta = whole.parameters(list(range(Z.shape[1])))
-    moved = [list(x) for x in sizes]
-    h = _STEP * sizes[at][k]
-    moved[at][k] += h
-    slope = (_columns(drive, families, moved) - Z) @ theta / h
-    _, beside = trials(sample, slice(drive.j, drive.j + 1), np.column_stack([Z, slope])[:, None])
-    every = list(range(Z.shape[1] + 1))
-    _, covariance = beside.estimate(every, sample.fitted)
-    return float(np.sqrt(max(covariance[-1, -1], 0.0)))
+    slopes = np.empty((len(Z), len(flat)))
+    for k, h in enumerate(_STEP * flat):
+        larger = flat + h * (np.arange(len(flat)) == k)
+        moved = drive.columns(_terms(drive, _with_shapes(families, larger)))
+        slopes[:, k] = (moved - Z) @ theta / h
+    _, beside = trials(sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None])
+    _, every = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
+    covariance: Array = every[Z.shape[1] :, Z.shape[1] :]
+    return covariance

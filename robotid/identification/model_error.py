@@ -1,10 +1,11 @@
-"""Standard errors that know what the drive model lacks, and what it has been told of its shapes.
+"""Standard errors that know what the drive model lacks, and what is open of its shapes.
 
 A term that the drives have and the model lacks moves the other parameters, by -T theta if theta is
 what it would be. That is no noise, and does not shrink with the length of the log: its square adds
-to their covariance. A shape that was found beside them has an error of its own, and so do they:
+to their covariance; so does that of a term which was nearly chosen. A shape that was found beside
+them has an error of its own, and so do they:
 
-    C += sum_terms (T theta) (T theta)^T + sum_shapes T var(s) T^T,  T = (W^T W + C_0^-1)^-1 W^T z
+    C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from robotid.identification.drive_choice import DriveChoice
     from robotid.identification.pipeline import Identification
 
-__all__ = ["with_model_error"]
+__all__ = ["shape_slope", "with_model_error"]
 
 _STEP = 1e-3  # relative, of a derivative
 _GROWN = 1.3  # times by which a standard error grows that stands on a misfit
@@ -40,7 +41,8 @@ def with_model_error(
     """
     if sample is None:
         return found
-    found = _wider(found, sample, list(_of_shapes(found, sample)))
+    found = _with_shape_errors(found, sample)
+    found = _wider(found, sample, list(_of_doubts(found, sample)))
     wider = _wider(found, sample, [misfit.shift for misfit in misfits])
     before, after = found.standard_error, wider.standard_error
     drives = np.arange(len(before)) >= found.model.layout.n_inertial
@@ -62,29 +64,68 @@ def _wider(found: "Identification", sample: Sample, moved: Sequence[Array]) -> "
     )
 
 
-def _of_shapes(found: "Identification", sample: Sample) -> Iterator[Array]:
-    """Yield by how much an error of each shape moves base parameters over their spread, (b,)."""
+def _with_shape_errors(found: "Identification", sample: Sample) -> "Identification":
+    """Return an identification whose errors count those of shapes.
+
+    Shapes of a joint err together: their covariance is C_s = L L^T, one move for each column of L.
+    """
     if not any(choice.shapes for choice in found.drives):
-        return
-    kept = [e for e in found.validation if not e.is_refitted]
-    recordings = [e.recording for e in (*found.fitted, *kept)]
-    motions = [drive_motion_along(found.model, x.trajectory) for x in recordings]
+        return found
+    motions, drives, moved = _motions(found), [], []
+    gain = found.mapping.gain(found.prior_std)
     for choice in found.drives:
-        j = sample.joints.index(choice.joint)
-        for k, shape in enumerate(choice.shapes):
+        if choice.shapes:
+            j = sample.joints.index(choice.joint)
             slopes = [
-                _slope(found, choice, k, motion.of(j))[rows]
+                np.column_stack(
+                    [shape_slope(found, choice, k, motion.of(j)) for k in range(len(choice.shapes))]
+                )[rows]
                 for motion, rows in zip(motions, sample.taken, strict=True)
             ]
-            g = np.concatenate(slopes)[:, None, None]
-            _, whole = trials(sample, slice(j, j + 1), g)
-            yield -shape.std_error * whole.T[:, 0]
+            _, whole = trials(sample, slice(j, j + 1), np.concatenate(slopes)[:, None])
+            T = whole.T[:, :-1]
+            variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
+            moved += list(-(T @ (axes * np.sqrt(np.maximum(variance, 0.0)))).T)
+            choice = replace(choice, shape_moves=-gain @ sample.U.T @ T)
+        drives.append(choice)
+    return replace(_wider(found, sample, moved), drives=tuple(drives))
 
 
-def _slope(
+def _of_doubts(found: "Identification", sample: Sample) -> Iterator[Array]:
+    """Yield by how much terms that were nearly taken would move base parameters, (b,) each."""
+    if not any(choice.doubted for choice in found.drives):
+        return
+    motions = _motions(found)
+    for choice in found.drives:
+        if not choice.doubted:
+            continue
+        j = sample.joints.index(choice.joint)
+        columns = [
+            np.column_stack([term.column(motion.of(j)) for term in choice.doubted])[rows]
+            for motion, rows in zip(motions, sample.taken, strict=True)
+        ]
+        _, whole = trials(sample, slice(j, j + 1), np.concatenate(columns)[:, None])
+        yield -whole.T[:, :-1] @ whole.parameters(list(range(len(choice.doubted))))
+
+
+def _motions(found: "Identification") -> list[DriveMotion]:
+    """Return how the drives move along each recording, as ``Sample.taken`` counts them."""
+    kept = [e for e in found.validation if not e.is_refitted]
+    recordings = [e.recording for e in (*found.fitted, *kept)]
+    return [drive_motion_along(found.model, x.trajectory) for x in recordings]
+
+
+def shape_slope(
     found: "Identification", choice: "DriveChoice", which: int, motion: DriveMotion
 ) -> Array:
-    """Return how the torque of a joint's drive changes with one of its shapes, shape (N,)."""
+    """Return how the torque of a joint's drive changes with one of its shapes, shape (N,).
+
+    Args:
+        found: The identification.
+        choice: The joint's terms.
+        which: Which of its shapes.
+        motion: How the drive moves, arrays of shape (N,).
+    """
     layout = found.model.layout
     theta = dict(zip(layout.names, found.standard, strict=True))
     size = choice.shapes[which].value * _STEP

@@ -372,6 +372,18 @@ def test_a_trajectory_without_its_memory_is_refused(rng):
     )
 
 
+def test_what_a_trajectory_remembers_of_another_load_is_not_read(rng, monkeypatch):
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=JOINTS, own_terms={"elbow_joint": [LoadFriction()]}
+    ).with_reference(np.ones(43))
+    x = states(rng)
+    wanted = drive_motion_along(model, x)
+    for start in (0, 10**9):  # by inverse dynamics, by rows
+        monkeypatch.setattr(prediction, "_START", start)
+        motion = drive_motion_along(model, remember(model, x))
+        np.testing.assert_allclose(motion.load, wanted.load, atol=1e-10)
+
+
 def test_terms_are_read_back_from_plain_values(term):
     if term.name not in TERMS:
         assert term_from_dict(term.to_dict()) == term

@@ -1,0 +1,72 @@
+"""Logs of a robot whose drives have terms of their own."""
+
+import numpy as np
+
+from robotid.identification.pipeline import identify
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+from robotid.regressor.memory import remember
+from robotid.regressor.prediction import predict
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.closed_loop import another_robot
+from robotid.simulation.motions import random_fourier
+
+EXACT = SignalSettings(cutoff=None, trim=0.0)
+JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
+LIFT, ELBOW, WRIST = JOINTS
+
+
+def arm():
+    """Return the three joints of a UR5 in one plane."""
+    return RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), joints=JOINTS)
+
+
+def driven(model, own, values):
+    """Return a robot near the model whose drives have further terms, and its parameters.
+
+    Args:
+        model: The robot.
+        own: Further terms by joint.
+        values: Parameters of these, and of others, by name.
+    """
+    model = model.with_terms(own)
+    pi = another_robot(model, np.random.default_rng(0))
+    names = list(model.layout.names)
+    for name, value in values.items():
+        pi[names.index(name)] = value
+    return model.with_reference(pi), pi
+
+
+def driven_log(
+    model, pi, seed, *, duration=30.0, rate=60.0, noise=0.01, reach=1.0, speed=1.0, still=()
+):
+    """Return a log of inverse dynamics, those of what drives remember among them.
+
+    Args:
+        model: The robot, its reference the parameters.
+        pi: Its parameters.
+        seed: Of motion and noise.
+        duration: Length [s].
+        rate: Rate [Hz].
+        noise: Of each torque, share of its usual size.
+        reach: Times how far a random motion goes.
+        speed: Times how fast it is.
+        still: Numbers of joints that stand.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * rate)) / rate
+    q, v, a = random_fourier(model, rng, period=duration / 3).evaluate(speed * t)
+    q, v, a = reach * q, reach * speed * v, reach * speed**2 * a
+    for j in still:
+        q[:, j], v[:, j], a[:, j] = 0.3, 0.0, 0.0
+    log = Log(t=t, q=q, v=v, a=a, tau=np.zeros_like(q), joints=model.joints)
+    tau = predict(model, [pi], remember(model, process(log, EXACT)))[0]
+    tau = tau + noise * np.sqrt(np.mean(tau**2, axis=0)) * rng.standard_normal(tau.shape)
+    return Log(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints)
+
+
+def found_in(model, logs, **options):
+    """Return what is identified of logs without a filter, the doctor aside."""
+    return identify(model, logs, signals=EXACT, doctor=False, **options)
