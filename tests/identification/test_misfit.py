@@ -172,6 +172,7 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
         write_log(log_with(ur5, 1, "stribeck", 2, part=k), path)
     table = {
         "urdf": ur5.tree.path,
+        "model": {"friction": "viscous+coulomb"},
         "identification": [{"log": str(paths[0])}],
         "validation": [{"log": str(paths[1])}],
         "output": {"report": False},
@@ -179,8 +180,10 @@ def test_a_hook_of_stribeck_makes_its_joint_usable(ur5, tmp_path):
     found, result = run_job(job_from_settings(table, "job", tmp_path), tmp_path / "out")
     (named,) = [f for f in result["warnings"] if f["code"] == "friction_shape"]
     assert named["where"] == ELBOW
-    assert "The model has no such term yet" in named["message"] or "Raise" in named["message"]
-    assert "the friction intervals of this joint are too narrow" in named["message"]
+    assert f"state {ELBOW} = [" in named["message"].lower()
+    assert "in [drives] to add it to the model" in named["message"]
+    assert f"{ELBOW}.coulomb" in named["message"].partition("stand on this misfit")[0]
+    assert set(found.on_misfit) <= {name for name in found.mapping.names if ELBOW in name}
     by_joint = found.verdict.joints
     assert by_joint[ELBOW].status == "usable"
     assert by_joint[ELBOW].reasons[-1].endswith("(friction_shape)")
@@ -242,7 +245,7 @@ def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
     surveyed = survey_logs(job, ur5, job.identification, job.validation)
     recordings = Recordings(ur5, structural_mapping(ur5), *surveyed)
     assert not recordings.is_held
-    (found,) = misfits(conclude(recordings, EstimatorSettings("wls")))
+    (found,) = misfits(conclude(recordings, EstimatorSettings("wls"), friction="none"))
     assert (found.joint, found.term.code) == (LIFT, "load_friction")
     assert found.size == pytest.approx(0.1, abs=0.01)
 
@@ -266,7 +269,7 @@ def test_real_drives_have_the_terms_that_others_measured_on_them(recordings, mon
                 for some in (job.identification, job.validation)
             )
             found = identify(
-                model, fit, validation=kept, signals=job.signals, doctor=False, friction={}
+                model, fit, validation=kept, signals=job.signals, doctor=False, friction="none"
             )
             key = name if couplings == job.couplings else f"{name} uncoupled"
             said[key] = {(m.joint, m.term.code): m for m in misfits(found) if m.matters}
