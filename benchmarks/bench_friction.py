@@ -5,10 +5,9 @@
 First: the validation error of each joint of the recordings of other laboratories, with viscous and
 Coulomb friction and with ``friction = "auto"``; ratio is the one over the other. Second: simulated
 recordings of a UR10 with load friction on lift and elbow and a hook of Stribeck on the pan, noise
-of 2 % that forgets after 50 ms: how often 95 % intervals hold the truth. Rows slower than 0.1 rad/s
-are left out (``--min-velocity``), for next to a reversal the filter blurs a hook. A parameter
-counts where the joint has no family beside that of the truth; the torque of a joint's friction,
-over the speeds seen and two loads, counts everywhere. Third: time on 1e5 samples of a Panda.
+of 2 % that forgets after 50 ms: how often 95 % intervals hold the truth. A parameter counts where
+the joint has no family beside that of the truth; the torque of a joint's friction, over the speeds
+seen and two loads, counts everywhere. Third: processor time on 1e5 samples of a Panda.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -49,7 +48,7 @@ def main():
     parser.add_argument("--quick", action="store_true", help="one recording of each kind")
     parser.add_argument("--recordings", type=int, default=100, help="simulated ones")
     parser.add_argument("--estimator", default="wls", help="of the simulated recordings")
-    parser.add_argument("--min-velocity", type=float, default=0.1, help="of these [rad/s]")
+    parser.add_argument("--min-velocity", type=float, default=0.02, help="of these [rad/s]")
     options = parser.parse_args()
     if "ROBOTID_DATA" in os.environ:
         real_recordings(
