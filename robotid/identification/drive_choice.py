@@ -33,7 +33,7 @@ _GRID = 6  # sizes of a shape that are tried, over its bounds
 _FAMILIES = 4  # chosen for a joint, at most
 _CHANCE = 0.015  # that a family is chosen that is not there, each time that one is tried
 _LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
-_SEEN = 0.003  # of the torque: a gain that is smaller is not worth a parameter
+_SEEN = 0.006  # of the torque: a gain that is smaller may be of how signs pass the filter
 _ALIKE = 0.02  # of the squared residual, within which two families explain alike
 _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
 _SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
@@ -237,9 +237,12 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Fam
     """Yield families with every shape on their grid."""
     for family in families:
         turns = (drive.seen["q"][1] - drive.seen["q"][0]) / _TURN
+        bounds = [shape.within(drive.seen) for shape in family.shapes]
         if family.needs and (drive.slides or turns < family.needs):
             continue
-        grids = [np.geomspace(*shape.within(drive.seen), _GRID) for shape in family.shapes]
+        if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
+            continue
+        grids = [np.geomspace(*pair, _GRID) for pair in bounds]
         yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
 
 

@@ -159,7 +159,7 @@ def test_ctrl_c_ends_with_one_line_and_resumes_to_the_same_bits(job, expected, t
 def break_off(job, out, monkeypatch):
     """Run a job until its pieces are reduced, and no further."""
 
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

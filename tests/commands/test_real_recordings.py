@@ -87,7 +87,9 @@ def test_tx40_has_sane_masses_and_armatures(run):
     names = identification.model.layout.names
     armature = [v for k, v in zip(names, identification.standard, strict=True) if "armature" in k]
     assert min(armature) >= 0
-    assert len(identification.base) == 61
+    own = sum(map(len, identification.model.layout.own.values()))
+    assert own >= 3
+    assert len(identification.base) == 61 + own
     (kept,) = identification.validation
     assert kept.metrics["estimate"].pooled_rmse < kept.metrics["wls"].pooled_rmse
 
@@ -125,7 +127,12 @@ def test_what_the_data_cannot_say_is_said(run):
     assert result["verdict"]["status"] == "poor"
     assert any("worse than a constant" in reason for reason in result["verdict"]["reasons"])
     _, result, _ = run("ur10e")
-    # it predicts to 8 % and better, but the friction of its first joint is no line
-    assert result["verdict"]["status"] == "usable"
-    assert {d["code"] for d in result["verdict"]["doubts"]} == {"friction_shape"}
-    assert {d["joint"] for d in result["verdict"]["doubts"]} == {"shoulder_pan_joint"}
+    # the friction of its first joint is no line, and that of the next two grows with the load
+    assert result["verdict"]["status"] == "good"
+    assert result["verdict"]["doubts"] == []
+    friction = {joint: found["families"] for joint, found in result["friction"].items()}
+    assert friction["shoulder_pan_joint"] in (["stribeck"], ["tanh"])
+    assert friction["shoulder_lift_joint"] == friction["elbow_joint"] == ["load"]
+    assert friction["wrist_1_joint"] == friction["wrist_3_joint"] == []
+    load = [p["value"] for p in result["drive_parameters"] if p["name"].endswith(".load")]
+    assert all(0.06 < mu < 0.085 for mu in load)  # six fits of two robots: 0.064 to 0.081

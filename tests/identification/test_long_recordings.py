@@ -18,6 +18,7 @@ from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.read import read_log, write_log
 from robotid.logs.settings import SignalSettings
+from robotid.robot.drives import DRIVE_TERMS
 
 HELD = 1024  # rows in memory, so that pieces have 256
 
@@ -33,6 +34,7 @@ def noisy_job(ur5, tmp_path_factory):
     return Job(
         urdf=Path(ur5.tree.path),
         signals=SignalSettings(cutoff=10.0),
+        terms=DRIVE_TERMS,  # of a log in pieces, what else there is is judged by three stretches
         identification=(LogEntry(paths[0]),),
         validation=(LogEntry(paths[1]), LogEntry(paths[1], 2.0, 9.0)),
         report=False,
@@ -123,9 +125,9 @@ def test_a_job_in_pieces_ends_where_it_ends_in_memory(noisy_job, tmp_path):
 def test_a_real_recording_in_pieces_ends_where_it_ends_in_memory(recordings, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOTID_DATA", str(recordings))
     # of a log in pieces, what drives lack is judged by the stretches at hand: here 1 s of 5 s
-    monkeypatch.setattr("robotid.identification.misfit.find_misfits", lambda _: ())
+    monkeypatch.setattr("robotid.identification.pipeline.find_misfits", lambda _: ())
     job = read_job(Path(__file__).parents[1] / "jobs" / "tx40.toml")
-    compare(replace(job, report=False), tmp_path, held=8000)
+    compare(replace(job, report=False, terms=DRIVE_TERMS), tmp_path, held=8000)
 
 
 @pytest.mark.parametrize("name", ["rls", "kalman", "prx", "gradient"])

@@ -36,7 +36,9 @@ def test_recursive_estimators_predict_real_recordings_as_wls_does(recordings, ro
     logs = [job.read(entry, model) for entry in job.identification]
     kept = [job.read(entry, model) for entry in job.validation]
     for name in RECURSIVE:
-        found = identify(model, logs, validation=kept, signals=job.signals, estimator=name)
+        found = identify(
+            model, logs, validation=kept, signals=job.signals, estimator=name, friction="none"
+        )
         ratio = relative_errors(found, "estimate") / relative_errors(found, "wls")
         assert ratio.max() < 1.15, name
 
