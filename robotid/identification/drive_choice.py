@@ -38,6 +38,7 @@ _ALIKE = 0.02  # of the squared residual, within which two families explain alik
 _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bound
 _SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
+_ROUNDING = 1e-10  # share of a column that is rounding: shapes and their errors know no other
 _STEP = 1e-3  # relative, of a derivative
 _STEPS = 40  # of the search for all shapes of a joint together
 _STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
@@ -517,7 +518,7 @@ def _refined(
 
     def left(log_sizes: Array) -> float:
         Z = drive.columns(_terms(drive, _with_shapes(families, np.exp(log_sizes))))
-        _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+        _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
         return float(np.log(whole.left(list(range(Z.shape[1])))[: sample.fitted].sum() + _NOTHING))
 
     best = start
@@ -536,14 +537,16 @@ def _shape_covariance(
     if not len(flat):
         return np.empty((0, 0))
     Z = drive.columns(_terms(drive, _with_shapes(families, flat)))
-    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None])
+    _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
     theta = whole.parameters(list(range(Z.shape[1])))
     slopes = np.empty((len(Z), len(flat)))
     for k, h in enumerate(_STEP * flat):
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, _with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    _, beside = trials(sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None])
+    _, beside = trials(
+        sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None], _ROUNDING
+    )
     _, every = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
     covariance: Array = every[Z.shape[1] :, Z.shape[1] :]
     return covariance

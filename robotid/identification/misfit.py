@@ -430,13 +430,14 @@ class Trial:
         return left
 
 
-def trials(sample: Sample, joints: slice, Z: Array) -> tuple[Trial, Trial]:
+def trials(sample: Sample, joints: slice, Z: Array, ridge: float = _RIDGE) -> tuple[Trial, Trial]:
     """Return trials of columns: fitted without the stretch that judges, and to all.
 
     Args:
         sample: The rows.
         joints: Which m joints are looked at.
         Z: What sizes of 1 add to their torques, shape (N, m, c).
+        ridge: Share of a column that the regressor must leave of it.
     """
     X = np.concatenate([sample.weight[:, joints, None] * Z, sample.r[:, joints, None]], axis=2)
     every_X = [X[k].reshape(-1, X.shape[2]) for k in sample.stretches]
@@ -454,7 +455,7 @@ def trials(sample: Sample, joints: slice, Z: Array) -> tuple[Trial, Trial]:
         S = D_fit - B_fit.swapaxes(-1, -2) @ T
         c = np.arange(S.shape[-1] - 1)
         still = D_fit[..., c, c] == 0  # a column of a joint that does not move
-        S[..., c, c] += np.where(still, 1.0, _RIDGE * D_fit[..., c, c])
+        S[..., c, c] += np.where(still, 1.0, ridge * D_fit[..., c, c])
         E = [
             x - w @ T_k
             for x, w, T_k in zip(every_X, every_W, np.broadcast_to(T, B.shape), strict=True)
