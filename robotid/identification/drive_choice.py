@@ -39,6 +39,7 @@ _EDGE = 0.02  # of the logarithm of its range, within which a shape is at its bo
 _SLOWEST = 0.0  # share of the rows that are slower than what counts as seen
 _TURN = 2 * np.pi  # [rad]
 _ROUNDING = 1e-10  # share of a column that is rounding: shapes and their errors know no other
+_FARTHEST = 1.33  # times that a shape grows or shrinks at once
 _STEP = 1e-3  # relative, of a derivative
 _STEPS = 40  # of the search for all shapes of a joint together
 _STILL = 1e-9  # of the squared residual of another stretch: the joint stands still in it
@@ -120,6 +121,31 @@ class DriveChoice:
             "seen": {key: list(pair) for key, pair in self.seen.items()},
             "tried": [{**asdict(step), "families": list(step.families)} for step in self.tried],
         }
+
+    def moved(self, step: Array, covariance: Array) -> "DriveChoice":
+        """Return the choice with shapes moved, within their bounds and by a third at most.
+
+        Args:
+            step: By how much, shape (k,).
+            covariance: Of the shapes there, shape (k, k).
+        """
+        flat = np.array([size for own in self.sizes for size in own])
+        families = [FAMILIES[name] for name in self.families]
+        bounds = np.array([s.within(self.seen) for family in families for s in family.shapes])
+        near = np.clip(flat + step, flat / _FARTHEST, flat * _FARTHEST)
+        sizes = np.clip(near, *bounds.T)
+        chosen = _with_shapes(families, sizes)
+        shapes = zip(self.shapes, sizes, np.sqrt(np.diag(covariance)), strict=True)
+        return replace(
+            self,
+            terms=tuple(t for family, own in chosen for t in family.make(self.seen, *own)),
+            shapes=tuple(
+                replace(shape, value=float(size), std_error=float(error))
+                for shape, size, error in shapes
+            ),
+            shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
+            sizes=tuple(tuple(own) for _, own in chosen),
+        )
 
     def altered(self, which: int, share: float) -> tuple[DriveTerm, ...]:
         """Return the terms with one of the shapes larger by a share.

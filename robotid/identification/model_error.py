@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.misfit import Misfit, Sample, trials
+from robotid.identification.misfit import Misfit, Sample, Trial, take_sample, trials
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import DriveMotion
 
@@ -23,9 +23,11 @@ if TYPE_CHECKING:
     from robotid.identification.drive_choice import DriveChoice
     from robotid.identification.pipeline import Identification
 
-__all__ = ["shape_slope", "with_model_error"]
+__all__ = ["settled_shapes", "shape_slope", "with_model_error"]
 
 _STEP = 1e-3  # relative, of a derivative
+_ROUNDING = 1e-10  # share of a column that is rounding
+_MOVES = 0.2  # standard errors by which a shape moves that is worth another fit
 _GROWN = 1.3  # times by which a standard error grows that stands on a misfit
 
 
@@ -75,20 +77,55 @@ def _with_shape_errors(found: "Identification", sample: Sample) -> "Identificati
     gain = found.mapping.gain(found.prior_std)
     for choice in found.drives:
         if choice.shapes:
-            j = sample.joints.index(choice.joint)
-            slopes = [
-                np.column_stack(
-                    [shape_slope(found, choice, k, motion.of(j)) for k in range(len(choice.shapes))]
-                )[rows]
-                for motion, rows in zip(motions, sample.taken, strict=True)
-            ]
-            _, whole = trials(sample, slice(j, j + 1), np.concatenate(slopes)[:, None])
-            T = whole.T[:, :-1]
+            T = _shape_trial(found, choice, sample, motions).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
             moved += list(-(T @ (axes * np.sqrt(np.maximum(variance, 0.0)))).T)
             choice = replace(choice, shape_moves=-gain @ sample.U.T @ T)
         drives.append(choice)
     return replace(_wider(found, sample, moved), drives=tuple(drives))
+
+
+def _shape_trial(
+    found: "Identification", choice: "DriveChoice", sample: Sample, motions: Sequence[DriveMotion]
+) -> Trial:
+    """Return a trial of the columns d(torque)/d(shape) of a joint, beside all that was fitted."""
+    j = sample.joints.index(choice.joint)
+    slopes = [
+        np.column_stack(
+            [shape_slope(found, choice, k, motion.of(j)) for k in range(len(choice.shapes))]
+        )[rows]
+        for motion, rows in zip(motions, sample.taken, strict=True)
+    ]
+    _, whole = trials(sample, slice(j, j + 1), np.concatenate(slopes)[:, None], _ROUNDING)
+    return whole
+
+
+def settled_shapes(found: "Identification") -> "tuple[DriveChoice, ...] | None":
+    """Return choices with shapes that fit better now that all joints have their terms.
+
+    One step of Gauss and Newton: what a shape should be moved by is the parameter of its column.
+
+    Args:
+        found: What was found with the shapes as they are.
+
+    Returns:
+        The choices; None if no shape moves by more than a part of its standard error.
+    """
+    sample = take_sample(found, is_steady=False)
+    if sample is None or not any(choice.shapes for choice in found.drives):
+        return None
+    motions, drives, farthest = _motions(found), [], 0.0
+    for choice in found.drives:
+        if choice.shapes:
+            whole = _shape_trial(found, choice, sample, motions)
+            step, covariance = whole.estimate(list(range(len(choice.shapes))), sample.fitted)
+            moved = choice.moved(step, covariance)
+            before, after = (np.array([s.value for s in c.shapes]) for c in (choice, moved))
+            errors = np.sqrt(np.diag(covariance))
+            farthest = max(farthest, float((np.abs(after - before) / errors).max()))
+            choice = moved
+        drives.append(choice)
+    return tuple(drives) if farthest > _MOVES else None
 
 
 def _of_doubts(found: "Identification", sample: Sample) -> Iterator[Array]:

@@ -30,7 +30,7 @@ from robotid.identification.findings import fit_findings, log_findings, unwritte
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
-from robotid.identification.model_error import with_model_error
+from robotid.identification.model_error import settled_shapes, with_model_error
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -76,6 +76,7 @@ _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is
 _KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's, if it stayed there
 _STAYED = 0.3  # spreads that such a parameter may have moved
+_MOST_SHAPES = 2  # fits until shapes fit together with the terms of all joints
 _MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
 _DAMPED = 3  # of them, after which they go half way only
 _SETTLED = 1e-3  # of the torque, by which they may still move it
@@ -407,16 +408,39 @@ def with_drives(
     """
     fit = _fitted(recordings, choice)
     drives = choose_drives(fit, wanted)
-    own = {drive.joint: drive.terms for drive in drives if drive.terms}
-    if own:
-        stated = recordings.model.layout.own
-        every = {d.name: (*stated.get(d.name, ()), *own.get(d.name, ()))
-                 for d in recordings.model.layout.drives}  # fmt: skip
-        model = recordings.model.with_terms(every)
-        known = dict(zip(fit.mapping.names, fit.standard, strict=True))
-        start = np.array([known.get(name, 0.0) for name in model.layout.names])
-        fit = _fitted(recordings.with_model(model.with_reference(start)), choice)
-    return replace(fit, drives=drives)
+    if not any(drive.terms for drive in drives):
+        return replace(fit, drives=drives)
+    rough = _rough(choice)
+    for _ in range(_MOST_SHAPES if any(drive.shapes for drive in drives) else 0):
+        moved = settled_shapes(
+            replace(_fitted(_with_own(recordings, fit, drives), rough), drives=drives)
+        )
+        if moved is None:
+            break
+        drives = moved
+    return replace(_fitted(_with_own(recordings, fit, drives), choice), drives=drives)
+
+
+def _with_own(
+    recordings: Recordings, fit: Identification, drives: Sequence[DriveChoice]
+) -> Recordings:
+    """Return recordings of the robot whose drives have the terms chosen, loaded as a fit says."""
+    plain, own = recordings.model, {drive.joint: drive.terms for drive in drives}
+    model = plain.with_terms(
+        {d.name: (*plain.layout.own.get(d.name, ()), *own.get(d.name, ()))
+         for d in plain.layout.drives}
+    )  # fmt: skip
+    known = dict(zip(fit.mapping.names, fit.standard, strict=True))
+    start = np.array([known.get(name, 0.0) for name in model.layout.names])
+    return recordings.with_model(model.with_reference(start))
+
+
+def _rough(choice: EstimatorSettings) -> EstimatorSettings:
+    """Return the estimator without what takes long and moves an estimate little."""
+    if not isinstance(choice, BoundedSettings):
+        return choice
+    weight = 1.0 if isinstance(choice.prior_weight, str) else choice.prior_weight
+    return replace(choice, prior_weight=weight, draws=0)
 
 
 def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification:
@@ -470,8 +494,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     model, mapping = recordings.model, recordings.mapping
     if not model.layout.remembering:
         return recordings
-    if isinstance(choice, BoundedSettings) and isinstance(choice.prior_weight, str):
-        choice = replace(choice, prior_weight=1.0)  # the load hardly knows of the prior's weight
+    choice = _rough(choice)
     for step in range(_MOST_LOADS):
         ground = _ground(recordings, choice)
         before = ground.before
