@@ -56,7 +56,9 @@ def _drive_table(found: Identification) -> str:
             code(layout.names[i]),
             *_value(found.standard[i], found.standard_error[i], at_bound=bool(at_bound[i])),
             text(layout.units[i]),
-            text(sources[i]),
+            text(
+                f"{sources[i]}, on a misfit" if layout.names[i] in found.on_misfit else sources[i]
+            ),
         ]
         for i in range(layout.n_inertial, len(layout.names))
     ]

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from html import unescape
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from helpers.pages import number, percent, tables
 
 from robotid.identification.information import information
 from robotid.identification.summary import verdict_cell
+from robotid.report import tables as report_tables
 from robotid.robot.parameters import INERTIAL_TERMS
 from robotid.versions import versions
 
@@ -250,3 +251,11 @@ def test_findings_stand_under_their_severity_with_code_message_and_place(shown, 
 
 def test_versions_are_listed(shown):
     assert dict(shown["Versions that ran"].rows) == versions()
+
+
+def test_a_drive_parameter_that_stands_on_a_misfit_says_so(identified):
+    found = replace(identified, on_misfit=("elbow_joint.coulomb",))
+    rows = re.split("</tr>", report_tables.tables(found)["drives"].replace("<wbr>", ""))
+    marked = [row for row in rows if "on a misfit" in row]
+    assert len(marked) == 1
+    assert "elbow_joint.coulomb" in marked[0]
