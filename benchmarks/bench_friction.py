@@ -63,7 +63,7 @@ def main():
 
 
 def real_recordings(names):
-    print("| recording | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |")
+    print("| kept recording of | joint | RMSE, viscous and Coulomb | RMSE, auto | ratio | chosen |")
     print("|---|---|---|---|---|---|")
     for name in names:
         job = read_job(JOBS / f"{name}.toml")
@@ -79,8 +79,9 @@ def real_recordings(names):
         )
         chosen = {choice.joint: choice.families for choice in auto.drives}
         ratios = []
-        for joint, measured in plain.metrics().per_joint.items():
-            rmse = auto.metrics().per_joint[joint].rmse
+        (before,), (after,) = plain.predictions.values(), auto.predictions.values()
+        for joint, measured in before.per_joint.items():
+            rmse = after.per_joint[joint].rmse
             ratios.append(rmse / measured.rmse)
             print(
                 f"| {name} | {joint} | {measured.rmse:.3g} {measured.unit} | {rmse:.3g} | "
