@@ -28,6 +28,7 @@ __all__ = ["settled_shapes", "shape_slope", "with_model_error"]
 _STEP = 1e-3  # relative, of a derivative
 _ROUNDING = 1e-10  # share of a column that is rounding
 _MOVES = 0.2  # standard errors by which a shape moves that is worth another fit
+_PINNED = 1e-6  # of the smallest spread: that of a parameter that is known
 _GROWN = 1.3  # times by which a standard error grows that stands on a misfit
 
 
@@ -58,12 +59,19 @@ def _wider(found: "Identification", sample: Sample, moved: Sequence[Array]) -> "
     if not moved:
         return found
     X = sample.U.T @ np.column_stack(moved)  # (b, m), base parameters
-    GX = found.mapping.gain(found.prior_std) @ X
+    GX = _gain(found) @ X
     return replace(
         found,
         standard_covariance=found.standard_covariance + GX @ GX.T,
         base_error=np.sqrt(found.base_error**2 + np.sum(X**2, axis=1)),
     )
+
+
+def _gain(found: "Identification") -> Array:
+    """Return how a change of base parameters spreads over the standard ones, shape (p, b)."""
+    spread = found.prior_std
+    least = _PINNED * float(spread[spread > 0].min())  # what is known exactly hardly moves
+    return found.mapping.gain(np.maximum(spread, least))
 
 
 def _with_shape_errors(found: "Identification", sample: Sample) -> "Identification":
@@ -74,7 +82,7 @@ def _with_shape_errors(found: "Identification", sample: Sample) -> "Identificati
     if not any(choice.shapes for choice in found.drives):
         return found
     motions, drives, moved = _motions(found), [], []
-    gain = found.mapping.gain(found.prior_std)
+    gain = _gain(found)
     for choice in found.drives:
         if choice.shapes:
             T = _shape_trial(found, choice, sample, motions).T[:, :-1]

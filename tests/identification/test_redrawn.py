@@ -112,8 +112,8 @@ def test_bounds_make_intervals_narrower_and_are_named(ur5, rng):
     np.testing.assert_array_equal(found.standard, free.standard)
     assert "64 fits to redrawn data and prior" in found.errors.method
     assert "redrawn" not in free.errors.method
-    np.testing.assert_allclose(found.errors.unbounded**2, np.diag(free.standard_covariance))
-    ratio = np.sqrt(np.diag(found.standard_covariance) / np.diag(free.standard_covariance))
+    np.testing.assert_allclose(found.errors.unbounded**2, np.diag(free.estimate.covariance))
+    ratio = np.sqrt(np.diag(found.estimate.covariance) / np.diag(free.estimate.covariance))
     assert 0.4 < np.median(ratio) < 1.0
     assert ratio.max() < 1.4
     assert found.errors.freedom.max() < 64
