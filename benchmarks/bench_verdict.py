@@ -169,7 +169,8 @@ def codes_of_notes(said):
 
 def held(result, truth):
     """Return the share of the true base parameters inside their intervals."""
-    beta = result.mapping.to_base(truth)
+    known = dict(zip(result.model.with_terms({}).layout.names, truth, strict=True))
+    beta = result.mapping.to_base(np.array([known.get(x, 0.0) for x in result.mapping.names]))
     low, high = result.base_interval.T
     return float(np.mean((low <= beta) & (beta <= high)))
 
