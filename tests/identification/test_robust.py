@@ -118,7 +118,8 @@ def test_friction_that_is_not_coulombs_near_a_reversal_is_no_outlier(ur5):
     noise = 1e-3 * np.random.default_rng(5).standard_normal(quiet.tau.shape)
     step = pi[[name.endswith(".coulomb") for name in ur5.layout.names]]
     smooth = step * (np.tanh(quiet.v / 0.03) - np.sign(quiet.v))
-    found = identify(ur5, [replace(quiet, tau=quiet.tau + noise + smooth)], estimator="wls")
+    log = replace(quiet, tau=quiet.tau + noise + smooth)
+    found = identify(ur5, [log], estimator="wls", friction="none")
     (evaluation,) = found.fitted
     residual = np.abs(evaluation.recording.trajectory.tau - evaluation.torques["estimate"])
     usual = np.median(residual, axis=0)
