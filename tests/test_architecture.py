@@ -17,7 +17,7 @@ PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
     "exceptions",
-    "findings versions _files _html _typing",
+    "findings versions _files _typing pages",
     "_settings",
     "robot logs",
     "regressor",

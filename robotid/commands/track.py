@@ -187,7 +187,7 @@ class _Teller:
 
     def __call__(self, k: int, identifier: OnlineIdentifier) -> None:
         t, start = float(self._log.t[k]), float(self._log.t[0])
-        if t < self._due:
+        if t < self._due and k < len(self._log.t) - 1:  # the page ends at the last pose
             return
         self._due = t + 1.0 / _RATE
         if self._speed > 0:

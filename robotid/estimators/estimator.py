@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from robotid._html import code, number, table
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.pages.html import code, number, table
 from robotid.regressor.factors import Factors, compress
 from robotid.regressor.problem import Problem
 

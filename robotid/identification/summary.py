@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from robotid._html import code, number, percent, table, text
+from robotid.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
     from robotid.identification.metrics import Metrics

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._html import Cell, code, figure, number, page, table, text
+from robotid.pages.html import Cell, code, figure, number, page, table, text
 from robotid.paper.study import CASES
 from robotid.versions import __version__
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import check_file, write_text
-from robotid._html import Cell, code, number, page, percent, table, text
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.findings import listed
+from robotid.pages.html import Cell, code, number, page, percent, table, text
 from robotid.robot.drives import TERMS
 
 __all__ = ["compare_results", "write_comparison"]

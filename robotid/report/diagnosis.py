@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robotid._html import code, figure, number, table, text
 from robotid._typing import Array
 from robotid.findings import listed
 from robotid.identification.bands import REACH, FrictionCurve, friction_curve
@@ -15,6 +14,7 @@ from robotid.identification.drive_choice import DriveChoice
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.information import Information, information
 from robotid.identification.pipeline import Identification
+from robotid.pages.html import code, figure, number, table, text
 from robotid.regressor.memory import drive_motion_along
 from robotid.report.residuals import autocorrelation, friction_split, spectrum
 from robotid.report.svg import (

@@ -6,7 +6,6 @@ from html import escape
 from pathlib import Path
 
 from robotid._files import write_text
-from robotid._html import code, figure, number, page, percent, table, text
 from robotid.findings import listed
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
@@ -14,6 +13,7 @@ from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.logs.settings import SignalSettings
+from robotid.pages.html import code, figure, number, page, percent, table, text
 from robotid.report.diagnosis import (
     body_figures,
     drive_figures,

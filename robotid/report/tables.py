@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from robotid._files import file_sha256
-from robotid._html import Cell, code, number, percent, table, text
 from robotid.findings import listed
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import SOURCES, Identification
+from robotid.pages.html import Cell, code, number, percent, table, text
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 

@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from robotid._html import scaffold
+from robotid.pages.html import asset, scaffold
 
 __all__ = ["page"]
 
@@ -29,11 +29,11 @@ def page(data: Mapping[str, Any]) -> str:
     return scaffold(
         title,
         '<link rel="icon" href="data:,">\n'
-        f"<style>{_asset('uPlot.min.css')}\n/*tones*/{_asset('replay.css')}</style>\n",
+        f"<style>{asset('uPlot.min.css')}\n/*tones*/{_asset('replay.css')}</style>\n",
         f'<header><h1>{escape(title)}</h1>{notes}<p id="state" role="status"></p></header>\n'
         f"{_BODY}\n"
         f'<script type="application/json" id="data">{text}</script>\n'
-        f"<script>{_viewer()}</script>\n<script>{_asset('uPlot.iife.min.js')}</script>\n"
+        f"<script>{_viewer()}</script>\n<script>{asset('uPlot.iife.min.js')}</script>\n"
         f"<script>{_asset('replay.js')}</script>\n",
         policy=policy,
     )

@@ -7,13 +7,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from robotid._html import number, percent
 from robotid.exceptions import DataError
 from robotid.findings import Finding
 from robotid.identification.information import information
 from robotid.identification.pipeline import identify
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.pages.html import number, percent
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.document import write_report
 from robotid.report.plots import stretches, thin

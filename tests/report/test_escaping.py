@@ -8,11 +8,11 @@ import pytest
 from helpers.paths import URDF
 from helpers.synthetic import exact_log, truth
 
-from robotid._html import page
 from robotid.cli import main
 from robotid.exceptions import DataError
 from robotid.export.result import read_result
 from robotid.logs.read import write_log
+from robotid.pages.html import page
 from robotid.report import comparison
 from robotid.robot.model import RobotModel
 

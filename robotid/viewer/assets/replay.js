@@ -649,7 +649,13 @@ function listen() {
   const state = (text) => { byId("state").textContent = text; };
   source.onopen = () => state("live");
   source.onmessage = (event) => JSON.parse(event.data).forEach(take);
-  source.addEventListener("end", () => { source.close(); state("the tracker has finished"); refresh(); });
+  source.addEventListener("end", () => {
+    source.close();
+    refresh();
+    if (clock.follow) clock.time = clock.end;
+    show();
+    state("the tracker has finished");
+  });
   source.onerror = () => state("no connection to the tracker");
   setInterval(refresh, 250);
 }

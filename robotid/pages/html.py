@@ -3,13 +3,34 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from pathlib import Path
 
-__all__ = ["Cell", "code", "figure", "number", "page", "percent", "scaffold", "table", "text"]
+__all__ = [
+    "Cell",
+    "asset",
+    "code",
+    "figure",
+    "number",
+    "page",
+    "percent",
+    "scaffold",
+    "table",
+    "text",
+]
 
-_STYLE = Path(__file__).with_name("_page.css").read_text(encoding="utf-8")
-_TONES = "\n" + Path(__file__).with_name("_tones.css").read_text(encoding="utf-8")
+_ASSETS = Path(__file__).parent / "assets"
+
+
+@cache
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of.
+
+    Args:
+        name: Its name in the folder of assets.
+    """
+    return (_ASSETS / name).read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -120,7 +141,7 @@ def page(title: str, header: str, sections: Mapping[str, tuple[str, str]]) -> st
     )
     return scaffold(
         title,
-        f"<style>/*tones*/{_STYLE}</style>\n",
+        f"<style>/*tones*/{asset('page.css')}</style>\n",
         '<a class="skip" href="#content">Skip to the content</a>\n'
         f'<main id="content" tabindex="-1">\n<header>\n{header}</header>\n'
         f'<nav aria-label="Sections">{links}</nav>\n{body}</main>\n',
@@ -143,9 +164,13 @@ def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
         f"content=\"default-src 'none'; style-src 'unsafe-inline'{policy}\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)}</title>\n{head.replace('/*tones*/', _TONES)}</head>\n"
+        f"<title>{escape(title)}</title>\n{_toned(head)}</head>\n"
         f"<body>\n{body}</body>\n</html>\n"
     )
+
+
+def _toned(head: str) -> str:
+    return head.replace("/*tones*/", "\n" + asset("tones.css"))
 
 
 def _row(cells: Sequence[Cell]) -> str:

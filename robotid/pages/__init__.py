@@ -1,0 +1,3 @@
+"""What every page is made of: the document, its style, tables and charts."""
+
+__all__: list[str] = []
