@@ -9,7 +9,7 @@ mean residual of each bin of a quantity, of the other stretches, predicts the on
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,6 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.findings import listed
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.misfit import chance
 from robotid.regressor.columns import drive_values, friction_directions
@@ -32,7 +31,7 @@ __all__ = ["Dependence", "JointTorque", "Rows", "TorqueSplit", "joint_torques", 
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # of all recordings together that are split
-_BINS = 16  # of a quantity, each of as many rows
+_BINS = 10  # of a quantity, each of as many rows
 _STRETCHES = 16  # left out in turn
 _SHORTEST = 10  # independent rows in a stretch
 _FEWEST = 6  # stretches to judge by
@@ -44,12 +43,17 @@ _SLOW = 0.25  # of the usual speed: below it is low speed
 _SEEN_IN = 3  # stretches, from which the scatter of a bin's mean is told
 _FORGOTTEN = 0.5  # share that is as quick as noise, from which the rest needs no other reason
 _ADVICE = {
-    "position": "look for a spring, a cable or a gear's ripple that the model lacks",
-    "speed": "try another friction model",
-    "acceleration": "look for an inertia that the model lacks, or a torque that comes late",
-    "load": "look at the scale of the torque, and for friction that grows with the load",
-    "time": "friction that warms up, a sensor that drifts or a load that was changed does this",
+    "constant": "Zero the torque sensor, and look for a spring or a weight that the model lacks",
+    "position": "Look for a spring, a cable or a gear's ripple that the model lacks",
+    "speed": "Try another friction model",
+    "acceleration": "Look for an inertia that the model lacks, or a torque that comes late",
+    "load": "Look at the scale of the torque, and for friction that grows with the load",
+    "time": "Friction that warms up, a sensor that drifts or a load that was changed does this",
 }
+_CHANGED = (
+    "The fitted recordings do not show this: something has changed since (friction with "
+    "temperature, the zero of a sensor, a load), or they do not move the joint that way"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +142,7 @@ class Dependence:
     """How the residual of a joint follows a quantity.
 
     Attributes:
-        name: "position", "speed", "acceleration", "load" or "time".
+        name: "constant", "position", "speed", "acceleration", "load" or "time".
         unit: Unit of the quantity.
         centres: Mean of the quantity in each bin, shape (B,).
         means: Mean residual there, shape (B,) [N m or N].
@@ -181,7 +185,7 @@ class Dependence:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of the recordings that judge a result, one recording after the other.
+    """Rows of recordings, one after the other.
 
     Attributes:
         recordings: Names of the recordings.
@@ -234,6 +238,7 @@ class JointTorque:
         quantities: What the residual may follow: unit and values, (N,), by name.
         quick: Share of the squared residual that is forgotten within a period of the filter's
             cut-off, as filtered noise is, or from sample to sample; None if that is not known.
+        fitted: The same of the fitted recordings; None if it is of them itself.
     """
 
     joint: str
@@ -245,6 +250,7 @@ class JointTorque:
     terms: Mapping[str, Array]
     quantities: Mapping[str, tuple[str, Array]]
     quick: float | None
+    fitted: "JointTorque | None" = None
 
     @cached_property
     def residual(self) -> Array:
@@ -273,24 +279,30 @@ class JointTorque:
 
     @cached_property
     def follows(self) -> tuple[Dependence, ...]:
-        """How the residual follows each quantity; what "time" explains, the best other leaves."""
-        r, stretches = self.residual, self.rows.stretches
+        """How the residual follows nothing (a constant), each quantity, and time.
+
+        A quantity is asked what it explains beside a constant; time, of what the best other leaves.
+        """
+        r = self.residual
         if not self.used.any():
             return ()
         used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
-        found: list[Dependence] = []
+        everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
+        constant = _binned(r[used], r[used], everywhere, self._stretches(used))
+        found = [Dependence("constant", self.unit, *constant)]
         for name, (unit, x) in self.quantities.items():
             if np.ptp(x[used]) > 0:
-                stretch = None if stretches is None else stretches[used]
-                shares = _binned(x[used], r[used], _even_bins(x[used]), stretch)
+                shares = _binned(x[used], r[used], _even_bins(x[used]), self._stretches(used))
                 found.append(Dependence(name, unit, *shares))
         left, best = r, self._best(found)
-        if best is not None:
-            left = r - best.at(self.quantities[best.name][1])[0]
-        piece = self.rows.pieces[used]
+        if best is not None and best.name in self.quantities:
+            left = r - np.interp(self.quantities[best.name][1], best.centres, best.means)
         quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
         shares = _binned(self.rows.time[used], left[used], quarter, piece)
         return (*found, Dependence("time", "s", *shares))
+
+    def _stretches(self, used: Array) -> Array | None:
+        return None if self.rows.stretches is None else self.rows.stretches[used]
 
     @staticmethod
     def _best(follows: Sequence[Dependence]) -> Dependence | None:
@@ -300,30 +312,40 @@ class JointTorque:
     @property
     def sentence(self) -> str:
         """Why the joint is predicted no better, in words."""
-        if not self.used.any():
-            return "no row is used: the joint does not move"
         rms, best = self.rms, self._best(self.follows)
+        if np.isnan(rms["measured"]):
+            return "no row is used: the joint does not move"
         left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
         if best is not None:
-            low = " at low speed," if self._is_slow(best) else ""
-            return (
-                f"{left} and follows the {best.name}, which explains {_percent(best.share or 0.0)} "
-                f"of its square (best seen{low} about {best.where:.2g} {best.unit}): "
-                f"{_ADVICE[best.name]}"
-            )
+            advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
+            return f"{left} and {self._said(best)}. {advice}"
         if self.quick is None or self.rows.stretches is None:
             return f"{left}; too little was recorded to tell what it follows"
         quick = f"{_percent(self.quick)} of its square is as quick as noise"
         if self.quick >= _FORGOTTEN:
             return f"{left}, and nothing explains it: {quick}"
+        names = [d.name for d in self.follows if d.name != "constant"]
         return (
-            f"{left}, and {listed([d.name for d in self.follows])} alone do not explain it, though "
-            f"only {quick}: look at the motion of other joints, and at elasticity"
+            f"{left}, and neither a constant nor {', '.join(names)} alone explain it, though only "
+            f"{quick}. Look at the motion of other joints, and at elasticity"
         )
 
-    def _is_slow(self, best: Dependence) -> bool:
-        usual = self.size(self.quantities[best.name][1])
-        return best.name == "speed" and abs(best.where) < _SLOW * usual
+    def _said(self, best: Dependence) -> str:
+        """Return in words what the residual follows."""
+        share = _percent(best.share or 0.0)
+        if best.name == "constant":
+            return f"is {share} a constant of {best.means[0]:.2g} {self.unit}"
+        usual = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
+        low = " at low speed," if abs(best.where) < _SLOW * usual else ""
+        return (
+            f"follows the {best.name}, which explains {share} of its square (best seen{low} about "
+            f"{best.where:.2g} {best.unit})"
+        )
+
+    def _has_changed(self, name: str) -> bool:
+        """Whether the residual of the fitted recordings, asked the same, does not follow it."""
+        before = () if self.fitted is None else self.fitted.follows
+        return any(d.name == name and d.share is not None and not d.is_sure for d in before)
 
 
 def joint_torques(found: "Identification") -> tuple[JointTorque, ...]:
@@ -335,17 +357,29 @@ def joint_torques(found: "Identification") -> tuple[JointTorque, ...]:
     Args:
         found: What was found.
     """
+    kept = [e for e in found.validation if not e.is_refitted]
+    fitted = _torques_of(found, found.fitted)
+    if not kept:
+        return fitted
+    judged = zip(_torques_of(found, kept), fitted, strict=True)
+    return tuple(replace(torque, fitted=of_fit) for torque, of_fit in judged)
+
+
+def _torques_of(
+    found: "Identification", evaluations: Sequence[Evaluation]
+) -> tuple[JointTorque, ...]:
+    """Return the torque of each row in some recordings."""
     model, pi = found.model, found.standard
-    shown = [e for e in found.validation if not e.is_refitted] or list(found.fitted)
-    taken = [_spread(len(e.recording.trajectory.t), _ROWS // len(shown)) for e in shown]
-    own = list(zip(shown, taken, strict=True))
+    most = _ROWS // len(evaluations)
+    own = [(e, _spread(len(e.recording.trajectory.t), most)) for e in evaluations]
     motions = [e.recording.trajectory.at(k) for e, k in own]
     splits = [split_torque(model, pi, m.q, m.v, m.a, m.direction, m.memory) for m in motions]
     used = np.concatenate([e.recording.mask[k] for e, k in own])
     q, v, a, tau = (
         np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "v", "a", "tau")
     )
-    load, rows, quick = np.concatenate([s.load for s in splits]), _rows(own), _quick_shares(shown)
+    load = np.concatenate([s.load for s in splits])
+    rows, quick = _rows(own), _quick_shares(evaluations)
     judged = []
     for j, joint in enumerate(model.row_names):
         terms = [split.terms_of(j) for split in splits]
@@ -422,8 +456,8 @@ def _quick_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
 
 
 def _even_bins(x: Array) -> Array:
-    """Return which bin each value is in, of bins with as many rows each, shape (N,), int."""
-    edges = np.unique(np.quantile(x, np.arange(1, _BINS) / _BINS))
+    """Return which bin each value is in, of bins with as many rows each and cut at 0, (N,) int."""
+    edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
     return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
 
 
@@ -447,8 +481,8 @@ def _binned(
     if K < _FEWEST:
         return centres, means, errors, None, 1.0
     N_other, S_other = n - N, S.sum(axis=0) - S  # of all stretches but one
-    plain = (S_other.sum(axis=1) / N_other.sum(axis=1))[:, None]
-    mean = np.where(N_other > 0, S_other / np.maximum(N_other, 1.0), plain)
+    plain = (S_other.sum(axis=1) / N_other.sum(axis=1))[:, None] * (B > 1)  # beside a constant
+    mean = np.where(N_other > 0, S_other / np.maximum(N_other, 1.0), plain)  # (K, B)
     before, after = (
         Q - 2 * np.sum(m * S, axis=1) + np.sum(m**2 * N, axis=1) for m in (plain, mean)
     )
