@@ -4,8 +4,7 @@ A torque is gravity, inertia, velocity torques, and what each drive adds, sum by
 
     tau = g(q) + M(q) a + C(q, v) v + friction + motor inertia + offset + ... + residual.
 
-What the residual follows is tested in stretches of the recordings that are left out in turn: the
-mean residual of each bin of a quantity, of the other stretches, predicts the one left out.
+What the residual follows, and whether by chance, ``dependence`` tells.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,8 +16,8 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
+from robotid.identification.dependence import FEWEST, Dependence, even_bins, follow
 from robotid.identification.evaluation import Evaluation
-from robotid.identification.misfit import chance
 from robotid.regressor.columns import drive_values, friction_directions
 from robotid.regressor.prediction import rigid_parts
 from robotid.regressor.used_rows import independent_share
@@ -27,20 +26,15 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["Dependence", "JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque"]
+__all__ = ["JointTorque", "Rows", "TorqueSplit", "joint_torques", "split_torque"]
 
 _RIGID = ("gravity", "inertia", "Coriolis")
 _ROWS = 4000  # of all recordings together that are split
-_BINS = 10  # of a quantity, each of as many rows
 _STRETCHES = 16  # left out in turn
 _SHORTEST = 10  # independent rows in a stretch
-_FEWEST = 6  # stretches to judge by
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _QUARTERS = 4  # of a recording, between which its residual may drift; and pieces of each
-_LEAST = 0.1  # share of the squared residual from which something follows
-_CHANCE = 1e-3  # ... and how rarely that may be by chance
 _SLOW = 0.25  # of the usual speed: below it is low speed
-_SEEN_IN = 3  # stretches, from which the scatter of a bin's mean is told
 _FORGOTTEN = 0.5  # share that is as quick as noise, from which the rest needs no other reason
 _ADVICE = {
     "constant": "Zero the torque sensor, and look for a spring or a weight that the model lacks",
@@ -64,12 +58,14 @@ class TorqueSplit:
         parts: "gravity", "inertia" and "Coriolis" (with centrifugal torques) of the bodies, then
             what the drives add, by ``DriveTerm.part``; each of shape (N, n_rows) [N m, N].
         names: Names of the k drive parameters.
+        kinds: Which part each of them counts as.
         terms: What each of them adds at its drive, shape (k, N) [N m, N].
         loads: Ratio of each row to the drive of each parameter, shape (n_rows, k) [-].
     """
 
     parts: Mapping[str, Array]
     names: tuple[str, ...]
+    kinds: tuple[str, ...]
     terms: Array
     loads: Array
 
@@ -83,14 +79,19 @@ class TorqueSplit:
         """The torque of the bodies, shape (N, n_rows) [N m, N]."""
         return np.asarray(sum(self.parts[name] for name in _RIGID if name in self.parts))
 
-    def terms_of(self, row: int) -> dict[str, Array]:
-        """Return what each drive parameter that loads a row adds to it, by name, each (N,).
+    def terms_of(self, row: int) -> dict[str, dict[str, Array]]:
+        """Return what each drive parameter that loads a row adds to it, (N,), by part and name.
 
         Args:
             row: Which row.
         """
-        ratios = zip(self.names, self.loads[row], self.terms, strict=True)
-        return {name: ratio * torque for name, ratio, torque in ratios if ratio}
+        terms: dict[str, dict[str, Array]] = {}
+        for name, kind, ratio, torque in zip(
+            self.names, self.kinds, self.loads[row], self.terms, strict=True
+        ):
+            if ratio:
+                terms.setdefault(kind, {})[name] = ratio * torque
+        return terms
 
 
 def split_torque(
@@ -131,56 +132,11 @@ def split_torque(
     signs = friction_directions(layout, v, direction)
     terms = pi[layout.n_inertial :, None] * drive_values(layout, q, v, a, signs, memory)  # (k, N)
     loads = np.vstack([np.zeros((first, len(terms))), layout.drive_loads])  # (n_rows, k)
-    kinds = np.array([term.part for _, term in layout.drive_parameters])
-    for kind in dict.fromkeys(kinds.tolist()):
-        parts[kind] = terms[kinds == kind].T @ loads[:, kinds == kind].T
-    return TorqueSplit(parts, layout.drive_names, terms, loads)
-
-
-@dataclass(frozen=True, eq=False)
-class Dependence:
-    """How the residual of a joint follows a quantity.
-
-    Attributes:
-        name: "constant", "position", "speed", "acceleration", "load" or "time".
-        unit: Unit of the quantity.
-        centres: Mean of the quantity in each bin, shape (B,).
-        means: Mean residual there, shape (B,) [N m or N].
-        errors: Standard error of that by its scatter from stretch to stretch, shape (B,); NaN in
-            bins of fewer than three stretches.
-        share: Share of the residual's variance that the means of other stretches explain; None if
-            there are too few stretches to tell. Below 0 they explain nothing.
-        chance: How likely that is by chance [-].
-    """
-
-    name: str
-    unit: str
-    centres: Array
-    means: Array
-    errors: Array
-    share: float | None
-    chance: float
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether the residual follows the quantity beyond chance, and by enough to matter."""
-        return self.share is not None and self.share >= _LEAST and self.chance < _CHANCE
-
-    @property
-    def where(self) -> float:
-        """Where the mean residual is off by the most standard errors."""
-        sure = np.abs(self.means) / np.where(self.errors > 0, self.errors, np.inf)
-        return float(self.centres[int(np.argmax(sure))])
-
-    def at(self, x: Array) -> tuple[Array, Array]:
-        """Return the mean residual and its standard error, linear between bins, shape (N,) each.
-
-        Args:
-            x: Values of the quantity, shape (N,); NaN comes back outside of the bins.
-        """
-        curves = (np.interp(x, self.centres, y, np.nan, np.nan) for y in (self.means, self.errors))
-        mean, error = curves
-        return mean, error
+    kinds = tuple(term.part for _, term in layout.drive_parameters)
+    for kind in dict.fromkeys(kinds):
+        own = [k for k, other in enumerate(kinds) if other == kind]
+        parts[kind] = terms[own].T @ loads[:, own].T  # (N, n_rows)
+    return TorqueSplit(parts, layout.drive_names, kinds, terms, loads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +190,7 @@ class JointTorque:
         used: Which of them are used, shape (N,), bool.
         tau: Measured torque, shape (N,).
         parts: What the predicted torque consists of, by name, each of shape (N,).
-        terms: What each drive parameter adds, by name, likewise.
+        terms: What each drive parameter adds, likewise, by part and name.
         quantities: What the residual may follow: unit and values, (N,), by name.
         quick: Share of the squared residual that is forgotten within a period of the filter's
             cut-off, as filtered noise is, or from sample to sample; None if that is not known.
@@ -247,7 +203,7 @@ class JointTorque:
     used: Array
     tau: Array
     parts: Mapping[str, Array]
-    terms: Mapping[str, Array]
+    terms: Mapping[str, Mapping[str, Array]]
     quantities: Mapping[str, tuple[str, Array]]
     quick: float | None
     fitted: "JointTorque | None" = None
@@ -288,21 +244,17 @@ class JointTorque:
             return ()
         used = self.used & (np.abs(r) <= _OUTLIER * np.median(np.abs(r[self.used])))
         everywhere, piece = np.zeros(int(used.sum()), dtype=int), self.rows.pieces[used]
-        constant = _binned(r[used], r[used], everywhere, self._stretches(used))
-        found = [Dependence("constant", self.unit, *constant)]
+        stretches = None if self.rows.stretches is None else self.rows.stretches[used]
+        found = [follow("constant", self.unit, r[used], r[used], everywhere, stretches)]
         for name, (unit, x) in self.quantities.items():
             if np.ptp(x[used]) > 0:
-                shares = _binned(x[used], r[used], _even_bins(x[used]), self._stretches(used))
-                found.append(Dependence(name, unit, *shares))
+                found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), stretches))
         left, best = r, self._best(found)
         if best is not None and best.name in self.quantities:
             left = r - np.interp(self.quantities[best.name][1], best.centres, best.means)
         quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
-        shares = _binned(self.rows.time[used], left[used], quarter, piece)
-        return (*found, Dependence("time", "s", *shares))
-
-    def _stretches(self, used: Array) -> Array | None:
-        return None if self.rows.stretches is None else self.rows.stretches[used]
+        time = follow("time", "s", self.rows.time[used], left[used], quarter, piece)
+        return (*found, time)
 
     @staticmethod
     def _best(follows: Sequence[Dependence]) -> Dependence | None:
@@ -315,6 +267,8 @@ class JointTorque:
         rms, best = self.rms, self._best(self.follows)
         if np.isnan(rms["measured"]):
             return "no row is used: the joint does not move"
+        if rms["measured"] == 0:
+            return "the measured torque is 0 throughout"
         left = f"the residual is {_percent(rms['residual'] / rms['measured'])} of the torque"
         if best is not None:
             advice = _CHANGED if self._has_changed(best.name) else _ADVICE[best.name]
@@ -382,7 +336,7 @@ def _torques_of(
     rows, quick = _rows(own), _quick_shares(evaluations)
     judged = []
     for j, joint in enumerate(model.row_names):
-        terms = [split.terms_of(j) for split in splits]
+        terms = [split.terms_of(j) for split in splits]  # alike in all
         angle = "m" if joint in model.layout.prismatic else "rad"
         quantities = {
             "position": (angle, q[:, j]),
@@ -402,7 +356,10 @@ def _torques_of(
                 parts={
                     x: np.concatenate([s.parts[x][:, j] for s in splits]) for x in splits[0].parts
                 },
-                terms={x: np.concatenate([each[x] for each in terms]) for x in terms[0]},
+                terms={
+                    part: {x: np.concatenate([each[part][x] for each in terms]) for x in own}
+                    for part, own in terms[0].items()
+                },
                 quantities=quantities,
                 quick=quick[j],
             )
@@ -428,7 +385,7 @@ def _rows(own: Sequence[tuple[Evaluation, Array]]) -> Rows:
         t=np.concatenate([e.recording.trajectory.t[k] for e, k in own]),
         recording=np.repeat(np.arange(len(own)), counts),
         segment=np.concatenate([e.recording.trajectory.segment[k] for e, k in own]),
-        stretches=np.arange(total) * many // total if many >= _FEWEST else None,
+        stretches=np.arange(total) * many // total if many >= FEWEST else None,
     )
 
 
@@ -453,40 +410,6 @@ def _quick_shares(evaluations: Sequence[Evaluation]) -> list[float | None]:
         min(1.0, 1.0 - product / square) if square > 0 else None
         for product, square in zip(products.tolist(), squares.tolist(), strict=True)
     ]
-
-
-def _even_bins(x: Array) -> Array:
-    """Return which bin each value is in, of bins with as many rows each and cut at 0, (N,) int."""
-    edges = np.unique(np.append(np.quantile(x, np.arange(1, _BINS) / _BINS), 0.0))
-    return np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
-
-
-def _binned(
-    x: Array, r: Array, bins: Array, stretches: Array | None
-) -> tuple[Array, Array, Array, float | None, float]:
-    """Return centres, mean residuals and their errors by bin, the share explained, its chance."""
-    n = np.bincount(bins).astype(float)
-    centres, means = np.bincount(bins, x) / n, np.bincount(bins, r) / n
-    if stretches is None:
-        return centres, means, np.full(len(n), np.nan), None, 1.0
-    stretch = np.unique(stretches, return_inverse=True)[1]
-    K, B = int(stretch.max()) + 1, len(n)
-    cell = stretch * B + bins
-    N = np.bincount(cell, minlength=K * B).reshape(K, B).astype(float)  # rows of stretch and bin
-    S = np.bincount(cell, r, K * B).reshape(K, B)  # and sums of their residuals
-    Q = np.bincount(stretch, r**2)
-    present = (N > 0).sum(axis=0)
-    scatter = np.sum((S - N * means) ** 2, axis=0) * present / np.maximum(present - 1, 1)
-    errors = np.where(present >= _SEEN_IN, np.sqrt(scatter) / n, np.nan)
-    if K < _FEWEST:
-        return centres, means, errors, None, 1.0
-    N_other, S_other = n - N, S.sum(axis=0) - S  # of all stretches but one
-    plain = (S_other.sum(axis=1) / N_other.sum(axis=1))[:, None] * (B > 1)  # beside a constant
-    mean = np.where(N_other > 0, S_other / np.maximum(N_other, 1.0), plain)  # (K, B)
-    before, after = (
-        Q - 2 * np.sum(m * S, axis=1) + np.sum(m**2 * N, axis=1) for m in (plain, mean)
-    )
-    return centres, means, errors, float(1 - after.sum() / before.sum()), chance(before, after, K)
 
 
 def _percent(share: float) -> str:
