@@ -34,6 +34,7 @@ _STRETCHES = 16  # left out in turn
 _SHORTEST = 10  # independent rows in a stretch
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _QUARTERS = 4  # of a recording, between which its residual may drift; and pieces of each
+_ROUNDING = 1e-10  # of the torque, below which a part is none
 _SLOW = 0.25  # of the usual speed: below it is low speed
 _FORGOTTEN = 0.5  # share that is as quick as noise, from which the rest needs no other reason
 _ADVICE = {
@@ -212,6 +213,12 @@ class JointTorque:
     def residual(self) -> Array:
         """Measured minus predicted torque, shape (N,)."""
         return np.asarray(self.tau - sum(self.parts.values()))
+
+    @cached_property
+    def present(self) -> tuple[str, ...]:
+        """Names of the parts that are more than rounding in any row."""
+        least = _ROUNDING * float(np.abs(self.tau).max())
+        return tuple(name for name, x in self.parts.items() if np.abs(x).max() > least)
 
     @property
     def power(self) -> Array | None:

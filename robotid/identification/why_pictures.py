@@ -46,7 +46,7 @@ def why_charts(torque: JointTorque, *, points: int = _POINTS) -> dict[str, Chart
 
 def _split(torque: JointTorque, points: int) -> Chart:
     k = _first(torque, points)
-    parts = {name: x[k] for name, x in torque.parts.items() if x[k].any()}
+    parts = {name: torque.parts[name][k] for name in torque.present}
     lines = [*parts.values(), torque.residual[k], torque.tau[k]]
     t, *lines = broken(torque.rows.segment[k], torque.rows.t[k], *lines)
     *stacked, residual, tau = lines
@@ -75,7 +75,7 @@ def _power(torque: JointTorque, power: Array, points: int) -> Chart:
     return Chart(
         title=f"Mechanical power of {torque.joint} over time, and that of its friction",
         x=t,
-        series=(Series("into friction", heat, "tone-3"), Series("torque x speed", whole, "text")),
+        series=(Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")),
         x_label="time [s]",
         y_label="power [W]",
         link=torque.rows.recordings[0],

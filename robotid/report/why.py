@@ -10,8 +10,9 @@ from robotid.pages.html import Cell, code, number, percent, table, text
 
 __all__ = ["why_section"]
 
-_POINTS = 600  # of a chart
-_ALL_POINTS = 3600  # of one chart of every joint together
+_POINTS = 400  # of a chart
+_ALL_POINTS = 2400  # of one chart of every joint together
+_STILL = 60  # of them, in print
 
 
 def why_section(found: Identification) -> str:
@@ -55,7 +56,7 @@ def _joint(torque: JointTorque, row: int, points: int, *, is_open: bool) -> str:
 
 
 def _chart(chart: Chart, caption: str) -> str:
-    return chart_html(chart, caption, points=2 * len(chart.x))
+    return chart_html(chart, caption, points=2 * len(chart.x), still=_STILL)
 
 
 def _caption(torque: JointTorque, name: str) -> str:
@@ -66,18 +67,17 @@ def _caption(torque: JointTorque, name: str) -> str:
         )
     (dependence,) = (d for d in torque.follows if d.name == name)
     said = "too few stretches to tell"
-    if dependence.share is not None:
-        share = max(dependence.share, 0.0)
-        said = f"explains {percent(100 * share).html} % of it"
-        if not dependence.is_sure:
-            said += ", no more than chance" if dependence.chance > 0 else ""
+    if dependence.is_sure:
+        said = f"<strong>explains {percent(100 * (dependence.share or 0.0)).html} % of it</strong>"
+    elif dependence.share is not None:
+        said = "explains no more than chance"
     return f"Residual against {name}: {said}"
 
 
 def _parts(torque: JointTorque) -> str:
     """Return the table of what the torque consists of."""
     rms = torque.rms
-    whole = rms["measured"]
+    whole, parts = rms["measured"], torque.present
     cells = [
         [
             text(name),
@@ -85,7 +85,7 @@ def _parts(torque: JointTorque) -> str:
             percent(100 * rms[name] / whole if whole else None),
             _terms(torque, name),
         ]
-        for name in (*sorted(torque.parts, key=lambda name: -rms[name]), "residual")
+        for name in (*sorted(parts, key=lambda name: -rms[name]), "residual")
     ]
     foot = [text("measured"), number(whole, ".3g"), percent(100.0), Cell("")]
     headers = ["part", f"rms {torque.unit}", "% of torque", "its terms, rms"]
