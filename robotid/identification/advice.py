@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from robotid.findings import Cause, grouped, listed
@@ -99,7 +99,17 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
             asked.setdefault(number, []).append(cause)
     urgent = sorted(asked, key=lambda k: (all(c.severity != "error" for c in asked[k]), k))
     steps = [_STEPS[number][0](found, origin, asked[number]) for number in urgent]
-    return tuple([*steps, *_uses(found, origin, steps)][:_MOST])
+    return _once([*steps, *_uses(found, origin, steps)][:_MOST])
+
+
+def _once(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Return the steps, what several ask to be typed in the last of them only."""
+    kept: list[Step] = []
+    for k, step in enumerate(steps):
+        later = {block for other in steps[k + 1 :] for block in other.blocks}
+        blocks = tuple(block for block in step.blocks if block not in later)
+        kept.append(replace(step, blocks=blocks))
+    return tuple(kept)
 
 
 _Maker: TypeAlias = "Callable[[Identification, Origin, Sequence[Cause]], Step]"
@@ -140,8 +150,8 @@ def _weigh(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     if any(cause.code in ("total_mass", "urdf_mismatch") for cause in causes):
         check = "Check the sign, the order and the unit of the torques and the URDF's masses. "
     words = (
-        f"{check}Weigh the links that move and state their mass: as identified they weigh "
-        f"{after:.4g} kg, in the URDF {before:.4g} kg, and nothing else tells the scale."
+        f"{check}Weigh the links that move and state their mass, which tells the scale: "
+        f"{after:.4g} kg as identified, {before:.4g} kg in the URDF."
     )
     return Step(words, origin.stating("[estimator.constraints]", "total_mass = KG"))
 

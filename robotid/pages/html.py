@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -27,8 +28,8 @@ __all__ = [
 ]
 
 _ASSETS = Path(__file__).parent / "assets"
-#: What in a body asks for which script.
-_SCRIPTS = {"<details": "page.js", '<pre class="command"': "page.js", '<table class="data"': "tables.js"}
+#: What in a page asks for which script.
+_SCRIPTS = {"page.js": '<details|<table class="data"', "tables.js": '<table class="data"'}
 
 
 @cache
@@ -200,12 +201,14 @@ def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, st
     shown = {key: Section(*section) for key, section in sections.items()}
     links = "".join(f'<a href="#{key}">{x.title}</a> ' for key, x in shown.items())
     body = "".join(_section(key, section) for key, section in shown.items())
+    named = [name for name, mark in _SCRIPTS.items() if re.search(mark, header + body)]
     return scaffold(
         title,
         f"<style>/*tones*/{asset('page.css')}</style>\n",
         '<a class="skip" href="#content">Skip to the content</a>\n'
         f'<nav aria-label="Sections"><div><a href="#content">{escape(title)}</a> {links}</div></nav>'
         f'\n<main id="content" tabindex="-1">\n<header>\n{header}</header>\n{body}</main>\n',
+        scripts=named,
     )
 
 
@@ -219,19 +222,28 @@ def _section(key: str, section: Section) -> str:
     return f'<section aria-labelledby="{key}">\n{html}</section>\n'
 
 
-def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
+def scaffold(
+    title: str, head: str, body: str, *, policy: str = "", scripts: Sequence[str] = ()
+) -> str:
     """Return the HTML of a document, which fetches nothing that its policy does not allow.
+
+    Where its body holds charts, it has the scripts that draw them; no script but these and those
+    that are named may run.
 
     Args:
         title: Title of the window, not escaped yet.
         head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
         body: HTML of the body.
-        policy: What the page may do beside having styles, as a content security policy.
+        policy: What the page may do beside having styles and charts, as a content security policy.
+        scripts: Names of assets that it runs.
     """
-    named = dict.fromkeys(name for mark, name in _SCRIPTS.items() if mark in body)
-    if named and "script-src" not in policy:
-        policy += "; script-src " + " ".join(_allowed(asset(name)) for name in named)
-        body += "".join(f"<script>{asset(name)}</script>\n" for name in named)
+    style, run = "", [asset(name) for name in scripts]
+    if '<figure class="chart"' in body:
+        style = f"<style>{asset('uPlot.min.css')}\n{asset('charts.css')}</style>\n"
+        run += [asset("uPlot.iife.min.js"), asset("charts.js")]
+    if run:
+        policy += "; script-src " + " ".join(map(_allowed, run))
+    inline = "".join(f"<script>{script}</script>\n" for script in run)
     # the policy keeps the page offline whatever a name in it might hold
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -239,8 +251,8 @@ def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
         f"content=\"default-src 'none'; style-src 'unsafe-inline'{policy}\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)}</title>\n{_toned(head)}</head>\n"
-        f"<body>\n{body}</body>\n</html>\n"
+        f"<title>{escape(title)}</title>\n{_toned(head)}{style}</head>\n"
+        f"<body>\n{body}{inline}</body>\n</html>\n"
     )
 
 

@@ -21,12 +21,12 @@ DETERMINED = {
 }
 _FIRST = 3  # reasons of the verdict that are seen at once
 _ROWS = 12  # joints whose errors are seen at once
-_WIDEST = 150.0  # [%] at the end of the scale
-_TICKS = (1.0, 5.0, GOOD, POOR, 100.0)  # [%] of the scale
+_WIDEST = 150.0  # [%] at the end of the scale; what is beyond stands there
+_TICKS = (1.0, 5.0, GOOD, POOR, 100.0, _WIDEST)  # [%] of the scale
 #: Other predictions of the same torque, each with its mark: a path about (0, 9) and its style.
 _OTHERS = {
-    "wls": ("WLS", "M-4 0h8l-4 5z", "fill"),
-    "urdf_with_drives": ("URDF + drives", "M-4 18h8l-4 -5z", "fill"),
+    "wls": ("WLS", "M-5 -1h10l-5 6z", "fill"),
+    "urdf_with_drives": ("URDF + drives", "M-5 19h10l-5 -6z", "fill"),
     "gravity_only": ("gravity only", "M-3 6l6 6m0 -6l-6 6", "line"),
     "urdf": ("URDF", "M0 0v18", "line"),
 }
@@ -41,7 +41,7 @@ def summary_screen(found: Identification, origin: Origin, files: Mapping[str, st
         files: Files beside the report, by what they are.
     """
     return (
-        f"<h1>{escape(found.model.name)}</h1>\n{_verdict(found)}{_facts(found, files)}"
+        f"{_verdict(found)}{_facts(found, files)}"
         f'<div class="halves">\n<div>{_bars(found)}</div>\n<div>{_next(found, origin)}</div>\n'
         "</div>\n"
     )
@@ -82,7 +82,8 @@ def _verdict(found: Identification) -> str:
         title = f"{count} more reason{'s' if count > 1 else ''}"
         more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
     return (
-        f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
+        f'<div class="verdict {verdict.status}"><h1>{escape(found.model.name)} '
+        f"<span>Verdict: <strong>{verdict.status}</strong></span></h1>"
         f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
     )
 
@@ -114,19 +115,20 @@ def _facts(found: Identification, files: Mapping[str, str]) -> str:
 
 def _bars(found: Identification) -> str:
     errors, verdicts = joint_errors(found), found.verdict.joints
+    alone = "" if len(found.predictions) != 1 else f" on {next(iter(found.predictions))}"
     still = {joint: None for joint in verdicts if joint not in errors}
     rows = [
-        _row(found.model.row_names.index(joint), joint, errors.get(joint), verdicts[joint])
+        _row(found.model.row_names.index(joint), joint, errors.get(joint), verdicts[joint], alone)
         for joint in [*errors, *still]
     ]
-    kind = "recordings kept apart" if found.predictions else "fitted rows, for none was kept apart"
+    kind = "not fitted" if found.predictions else "fitted rows, for no recording was kept apart"
     more = "".join(rows[_ROWS:])
     if more:
         title = f"{len(rows) - _ROWS} more joints, which are predicted better"
         more = f"<details><summary>{title}</summary><ol>{more}</ol></details>\n"
     return (
-        f'<h2 id="worst">Torque missed, worst joint first</h2>\n<p class="note">100 |τ − '
-        f"prediction| / |τ| on {kind}.</p>\n{_legend()}"
+        '<h2 id="worst">Torque missed, worst joint first <span class="note">100 |τ − prediction| / '
+        f"|τ|, {kind}</span></h2>\n{_legend()}"
         f'<ol class="bars">{"".join(rows[:_ROWS])}</ol>\n{more}'
     )
 
@@ -141,9 +143,13 @@ def _row(
     joint: str,
     measured: tuple[JointMetrics, float | None] | None,
     verdict: JointVerdict,
+    alone: str,
 ) -> str:
+    """Return the row of a joint; the one recording that was kept apart need not be named."""
     status, kind = verdict.status, verdict.status.replace(" ", "-")
     picture, said = "", percent(None)
+    why = joint_reason(joint, verdict.reasons)
+    why = why.replace(alone, "") if alone else why
     if measured is not None:
         metrics, wls = measured
         said = percent(metrics.relative_error_pct)
@@ -151,7 +157,7 @@ def _row(
     return (
         f'<li class="{kind}"><a class="code" href="#torque-{row}">{code(joint).html}</a>'
         f'{picture}<span class="number">{said.html} %</span><strong>{status}</strong>'
-        f'<span class="why">{escape(joint_reason(joint, verdict.reasons))}</span></li>\n'
+        f'<span class="why">{escape(why)}</span></li>\n'
     )
 
 
@@ -162,7 +168,7 @@ def _picture(row: int, joint: str, measured: JointMetrics, wls: float | None) ->
     figures = [f"{_OTHERS[key][0]} {percent(value).html} %" for key, value in shown.items()]
     error = percent(measured.relative_error_pct).html
     title = f"{joint}: {error} % missed; by comparison {', '.join(figures)}"
-    lines = "".join(f'<line x1="{_at(x)}" x2="{_at(x)}" y1="-3" y2="22"/>' for x in (GOOD, POOR))
+    lines = "".join(f'<line x1="{_at(x)}" x2="{_at(x)}" y1="-2" y2="18"/>' for x in (GOOD, POOR))
     marks = "".join(
         f'<svg x="{_at(value)}" overflow="visible">{_mark(key)}</svg>'
         for key, value in shown.items()
@@ -187,7 +193,7 @@ def _legend() -> str:
         f"</svg>{words}</span>"
         for key, (words, _, _) in _OTHERS.items()
     )
-    names = {GOOD: f"{GOOD:g} good", POOR: f"{POOR:g} usable", 100.0: "100 %"}
+    names = {GOOD: f"{GOOD:g} good", POOR: f"{POOR:g} usable", 100.0: "100", _WIDEST: "150 %"}
     scale = "".join(
         f'<span style="left: {_at(x)}">{names.get(x, f"{x:g}")}</span>' for x in _TICKS
     )

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
@@ -56,6 +57,8 @@ def _parameter_table(found: Identification) -> str:
         owner, term = name.rsplit(".", 1)
         value, uncertain = with_error(found.standard[i], error[i])
         change, _ = with_error(found.standard[i] - prior[i], error[i], sign="+")
+        if not set("123456789") & set(change.html):
+            change = replace(change, html="0")
         words = DETERMINED[source] + (", on a misfit" if name in found.on_misfit else "")
         rows.append(
             [
