@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robotid._settings import Settings
 from robotid._typing import Array
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
@@ -67,7 +68,15 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import prior_spread
 
-__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify", "with_drives"]
+__all__ = [
+    "SOURCES",
+    "Asked",
+    "EstimatorSettings",
+    "Identification",
+    "conclude",
+    "identify",
+    "with_drives",
+]
 
 #: What may have determined a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
@@ -81,6 +90,23 @@ _MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
 _DAMPED = 3  # of them, after which they go half way only
 _SETTLED = 1e-3  # of the torque, by which they may still move it
 _AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an identification was asked for, beside robot, logs and estimator.
+
+    Attributes:
+        signals: How logs become trajectories.
+        friction: As of ``identify``.
+        ignore: As of ``identify``.
+        job: The job that was run; None if there was none.
+    """
+
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    friction: str | Mapping[str, str] = AUTO
+    ignore: tuple[str, ...] = ()
+    job: Settings | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +138,7 @@ class Identification:
         drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
         misfits: Terms that the model of its drives still lacks.
         on_misfit: Names of drive parameters whose errors grew by these.
+        asked: Signals, friction and findings to ignore, as they were asked for.
     """
 
     model: RobotModel
@@ -138,6 +165,7 @@ class Identification:
     drives: tuple[DriveChoice, ...] = ()
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
+    asked: Asked = field(default_factory=Asked)
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def __repr__(self) -> str:
@@ -151,6 +179,29 @@ class Identification:
         return identification_text(self)
 
     __str__ = summary
+
+    def save(self, folder: str | Path, *, report: bool = True) -> Path:
+        """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
+
+        ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read it.
+        Every file is made in a folder of its own first and put in place when all are complete.
+        A result that cannot be right has no URDF. Logs in files are named, with their hashes;
+        how their columns were read by hand (gains, units, names) is not known to it.
+
+        Args:
+            folder: Where to write; made if it is missing.
+            report: Whether report.html is written.
+
+        Returns:
+            Path of the result.json.
+
+        Raises:
+            ModelError: If the URDF that the robot was read from is gone.
+            SettingsError: If the folder is a file, or cannot be written to.
+        """
+        from robotid.commands.identify import save_result
+
+        return save_result(self, folder, report=report)
 
     @property
     def is_consistent(self) -> bool:
@@ -376,6 +427,7 @@ def conclude(
         findings=tuple(findings),
         alarms=tuple(finding.message for finding in alarms),
         doubts=doubts_of(counted, model.joints, names, is_robust=is_robust),
+        asked=Asked(recordings.fitted[0].asked, friction, tuple(ignore)),
     )
 
 
