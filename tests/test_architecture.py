@@ -39,6 +39,7 @@ INSIDE_FUNCTIONS = {
     "yourdfpy": {"robot"},
     "meshcat": {"viewer"},
     "trimesh": {"robot"},
+    "pandas": {"identification"},
     "pyarrow": {"logs"},
     "rosbags": {"logs"},
     "h5py": {"logs"},

@@ -5,8 +5,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robotid._settings import Settings
 from robotid._typing import Array
@@ -23,7 +25,12 @@ from robotid.exceptions import (
     SettingsError,
 )
 from robotid.findings import Finding
-from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.bands import (
+    FrictionCurve,
+    TorqueBand,
+    torque_band,
+    usual_friction,
+)
 from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.drive_choice import DriveChoice, choose_drives, wanted_families
 from robotid.identification.evaluation import Evaluation, evaluate_logs, hidden_joints, pool
@@ -32,6 +39,7 @@ from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
 from robotid.identification.model_error import settled_shapes, with_model_error
+from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -61,6 +69,8 @@ from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.bodies import held_parameters
 from robotid.robot.drives import AUTO
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
@@ -179,6 +189,82 @@ class Identification:
         return identification_text(self)
 
     __str__ = summary
+
+    def predict(
+        self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
+    ) -> Array:
+        """Return the torques of motion, by the identified bodies, drives and chosen friction.
+
+        Friction acts by the sign of the speed: at rest, where it holds any torque up to its size,
+        it counts as 0. Drives whose friction has a memory (presliding) have moved one way for
+        long, and a torque that comes late (lag) is told as of an instant at which it stays.
+
+        Args:
+            q: Positions in the order of ``model.joints``, shape (n,) or (N, n) [rad, m].
+            v: Velocities, likewise [rad/s, m/s]; None: at rest.
+            a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+
+        Returns:
+            Torques, likewise [N m, N].
+
+        Raises:
+            DataError: If a shape does not fit, or a value is not finite.
+        """
+        return predict_instants(self.model, self.standard, q, v, a)
+
+    def friction(
+        self,
+        joint: str,
+        v: ArrayLike | None = None,
+        *,
+        q: float | None = None,
+        load: float | None = None,
+    ) -> FrictionCurve:
+        """Return friction and offset of a joint's drive against its speed, with their band.
+
+        Args:
+            joint: The joint, or the name of a coupling.
+            v: Speeds, shape (k,) [rad/s or m/s]; None: 20 either way, from the slowest to the
+                fastest of the fitted rows.
+            q: Position, of which some friction depends [rad or m]; None: the median.
+            load: Torque of the bodies that the gear carries, of which some friction depends
+                [N m or N]; None: its root mean square in the fitted logs.
+
+        Returns:
+            The curve: ``v``, ``torque``, ``std``, ``half_width`` of the 95 % band, ``load``.
+
+        Raises:
+            DataError: If there is no such drive; or without speeds, if it stood still.
+        """
+        return usual_friction(self, joint, v, q=q, load=load)
+
+    def table(self) -> Any:  # noqa: ANN401
+        """Return the standard parameters as a table: a row for each, links first, then drives.
+
+        Returns:
+            A pandas DataFrame if pandas is installed, else a list of dictionaries. Columns:
+            "part" (link or drive), "parameter", "urdf", "value", "std_error", "source" (as of
+            ``sources``), "unit". A URDF has no value of drives that is used, and a parameter at
+            its bound no standard error: None, or NaN in a DataFrame.
+        """
+        return parameter_table(*parameter_entries(self))
+
+    def pinocchio_model(self) -> Any:  # noqa: ANN401
+        """Return a ``pinocchio.Model`` with the identified inertias, armature and friction.
+
+        ``damping`` has the viscous friction; ``lowerDryFrictionLimit`` and
+        ``upperDryFrictionLimit``, -Fc - offset and Fc - offset, have Coulomb friction and offset.
+        ``rnea`` knows of inertias and armature only; the torque of joints that move is
+
+        ``rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
+
+        which is that of ``predict``. Drives that turn with several joints, and friction that
+        depends on load, position, past or, other than linearly, on speed have no place in it: a
+        warning names them. Locked joints are part of the links that carry them; with mimic
+        joints, or joints in another order than the URDF's, ``model.configurations(q)`` and
+        ``model.velocity_map`` lead to Pinocchio's coordinates.
+        """
+        return pinocchio_model(self.model, self.standard)
 
     def save(self, folder: str | Path, *, report: bool = True) -> Path:
         """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
