@@ -65,7 +65,7 @@ from robotid.identification.verdict import (
     refuted,
 )
 from robotid.identification.witness import Witness, call_witness
-from robotid.logs.data import Log
+from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
@@ -428,10 +428,10 @@ class Identification:
 
 
 def identify(
-    model: RobotModel,
-    logs: Sequence[Log],
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable],
     *,
-    validation: Sequence[Log] = (),
+    validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
     friction: str | Mapping[str, str] = AUTO,
@@ -441,9 +441,11 @@ def identify(
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
-        model: The robot, from its URDF.
-        logs: Recordings to fit; their joints must be the model's, in its order.
-        validation: Recordings kept apart to measure the prediction with.
+        model: The robot; or the path of its URDF, all of whose joints move.
+        logs: Recordings to fit: a ``Log`` of the model's joints in its order, the path of a file,
+            a DataFrame with the columns of such a file, or several of these. Files are read
+            whole, as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
+        validation: Recordings kept apart to measure the prediction with, likewise.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
         friction: What friction joints have beside viscous and Coulomb's, as of
@@ -452,7 +454,7 @@ def identify(
         ignore: Codes of errors and doubts that you know better.
 
     Raises:
-        DataError: If a log does not fit the model or is too short.
+        DataError: If a log cannot be read, does not fit the model or is too short.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
@@ -460,10 +462,15 @@ def identify(
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
-    if not logs:
+    model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
+    first, second = (
+        read_logs(some, model.joints, prismatic=model.layout.prismatic)
+        for some in (logs, validation)
+    )
+    if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
-    fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (logs, validation))
-    found = diagnose(model, logs, validation, settings) if doctor else ()
+    fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (first, second))
+    found = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
     return conclude(recordings, choice, found, ignore, friction=friction)
 
