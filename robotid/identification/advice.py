@@ -236,7 +236,9 @@ def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> 
 def _doctor(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     said = causes[0].messages[0]
     words = f"{said[0].upper()}{said[1:]}."
-    return Step(words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ())
+    return Step(
+        words, (shlex.join(["robotid", "doctor", *origin.source]),) if origin.source else ()
+    )
 
 
 def _uses(found: Identification, origin: Origin, asked: Sequence[Step]) -> list[Step]:

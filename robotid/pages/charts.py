@@ -20,6 +20,7 @@ _POINTS = 2000  # rows of a chart's data
 _STILL = 200  # points of a line in the still picture
 _WIDTH = 640  # [px] of the still picture
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 20, 34  # [px] around its axes
+_THIN = 0.05  # [px] what covers no more is not drawn
 _LETTER = 6.2  # [px] about the width of one
 
 
@@ -93,7 +94,7 @@ class Chart:
                     )
 
 
-def chart_html(chart: Chart, caption: str, *, points: int = _POINTS) -> str:
+def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int = _STILL) -> str:
     """Return a chart as a figure of a page that ``pages.html`` makes.
 
     It holds a still picture, for print and where no script runs, and the data that charts.js
@@ -103,6 +104,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS) -> str:
         chart: The chart.
         caption: HTML of the caption.
         points: About how many rows of data go into the page; extremes and breaks are kept.
+        still: About how many of them the still picture shows.
     """
     order = np.argsort(chart.x, kind="stable")
     x = np.asarray(chart.x, dtype=float)[order]
@@ -135,7 +137,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS) -> str:
     # "<" is an escape in JSON, so no text in it can end the script
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f'<figure class="chart"><figcaption>{caption}</figcaption>{_still(chart, x, series)}'
+        f'<figure class="chart"><figcaption>{caption}</figcaption>{_still(chart, x, series, still)}'
         f'<script type="application/json">{text}</script></figure>\n'
     )
 
@@ -275,7 +277,7 @@ def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
     return covers
 
 
-def _still(chart: Chart, x: Array, series: Sequence[_Drawn]) -> str:
+def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str:
     """Return the chart as an ``<svg>`` of a few points."""
     covers = _covers(series)
     height = _TOP + chart.height + _BOTTOM
@@ -292,7 +294,7 @@ def _still(chart: Chart, x: Array, series: Sequence[_Drawn]) -> str:
         across = _Axis(across.low - 0.5, across.low + 0.5, _LEFT, _WIDTH - _RIGHT, logs[0])
     up = _Axis(*_extent([scaled[1]], 0.04), _TOP + chart.height, _TOP, logs[1])
     drawn = "".join(
-        _drawn(chart, x, item, cover, across, up)
+        _drawn(chart, x, item, cover, across, up, points)
         for item, cover in zip(series, covers, strict=True)
     )
     return (
@@ -358,6 +360,7 @@ def _drawn(
     cover: _Cover,
     across: _Axis,
     up: _Axis,
+    points: int,
 ) -> str:
     """Return one series as paths."""
     series, y, half = item
@@ -375,18 +378,20 @@ def _drawn(
         drawn = f'<path d="{path}" fill="{colour}" fill-opacity="{faint}"/>'
         return drawn + (_whiskers(x, y, half, across, up, "currentColor"))
     if series.kind == "dots":
-        rows = np.flatnonzero(np.isfinite(y))[:: max(1, int(np.isfinite(y).sum()) // (2 * _STILL))]
+        rows = np.flatnonzero(np.isfinite(y))[:: max(1, int(np.isfinite(y).sum()) // (2 * points))]
         path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in _finite(across(x[rows]), up(y[rows])))
         return (
             f'<path d="{path}" stroke="{colour}" stroke-width="3" stroke-linecap="round" '
             f'stroke-opacity="{faint}"/>{_whiskers(x, y, half, across, up, colour)}'
         )
     if series.kind == "area":
-        return _band(x, y, cover, across, up, f'fill="{colour}" fill-opacity="{0.7 * faint}"')
+        style = f'fill="{colour}" fill-opacity="{0.7 * faint}"'
+        return _band(x, y, cover, across, up, style, points)
     under = ""
     if half is not None:
-        under = _band(x, y, cover, across, up, f'fill="{colour}" fill-opacity="0.2"')
-    rows = thin(y, _STILL)
+        style = f'fill="{colour}" fill-opacity="0.2"'
+        under = _band(x, y, cover, across, up, style, points)
+    rows = thin(y, points)
     path = "".join(_path(across(x[rows])[r], up(y[rows])[r]) for r in _runs(y[rows]))
     return (
         f'{under}<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.2" '
@@ -394,18 +399,22 @@ def _drawn(
     )
 
 
-def _band(x: Array, y: Array, cover: _Cover, across: _Axis, up: _Axis, style: str) -> str:
+def _band(
+    x: Array, y: Array, cover: _Cover, across: _Axis, up: _Axis, style: str, points: int
+) -> str:
     """Return what lies between edges, as a path."""
     breaks = np.flatnonzero(np.diff(np.isfinite(y)))
-    step = max(1, len(x) // _STILL)
+    step = max(1, len(x) // points)
     rows = np.unique(np.r_[np.arange(0, len(x), step), breaks, breaks + 1, len(x) - 1])
     at = across(x[rows])
     path = ""
     for low, high in cover:
         lower, upper = up(low[rows]), up(high[rows])
+        is_wide = np.abs(upper - lower) > _THIN
+        is_seen = is_wide | np.r_[is_wide[1:], False] | np.r_[False, is_wide[:-1]]
         path += "".join(
             _path(np.r_[at[r], at[r][::-1]], np.r_[upper[r], lower[r][::-1]]) + "z"
-            for r in _runs(lower + upper + y[rows])
+            for r in _runs(np.where(is_seen, lower + upper + y[rows], np.nan))
         )
     return f'<path d="{path}" {style}/>'
 

@@ -25,17 +25,18 @@ from robotid.pages.html import (
     table,
     text,
 )
+from robotid.report.causes import findings_line, findings_section
 from robotid.report.diagnosis import (
     body_figures,
     drive_figures,
     information_section,
     residual_section,
 )
-from robotid.report.causes import findings_line, findings_section
 from robotid.report.plots import plot_torque
-from robotid.report.svg import svg_element
 from robotid.report.summary_screen import summary_screen
+from robotid.report.svg import svg_element
 from robotid.report.tables import tables
+from robotid.report.why import why_section
 from robotid.versions import __version__
 
 __all__ = ["write_report"]
@@ -77,6 +78,7 @@ def write_report(
         "errors": Section("Errors", _errors(found), f"{joints} joints, by recording", False),
         "findings": Section("Findings", findings_section(found), findings_line(found), False),
         "torques": Section("Torques", _torques(found)),
+        "why": Section("Why each joint", why_section(found), "what its torque is made of", False),
         "parameters": Section(
             "Parameters",
             made["parameters"] + folded("changes", "Changes of the URDF", made["changes"]),
@@ -243,7 +245,14 @@ def _torques(found: Identification) -> str:
         )
         said = verdict_cell(name, asdict(verdicts[name])) if name in verdicts else ""
         is_bad = said.startswith(("poor", "usable"))
-        parts.append(folded(f"torque-{row}", f"<strong>{code(name).html}</strong> {escape(said)}", f'<div class="plots">\n{figures}</div>\n', is_open=is_bad))
+        parts.append(
+            folded(
+                f"torque-{row}",
+                f"<strong>{code(name).html}</strong> {escape(said)}",
+                f'<div class="plots">\n{figures}</div>\n',
+                is_open=is_bad,
+            )
+        )
     return "".join(parts)
 
 

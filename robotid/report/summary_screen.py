@@ -194,9 +194,7 @@ def _legend() -> str:
         for key, (words, _, _) in _OTHERS.items()
     )
     names = {GOOD: f"{GOOD:g} good", POOR: f"{POOR:g} usable", 100.0: "100", _WIDEST: "150 %"}
-    scale = "".join(
-        f'<span style="left: {_at(x)}">{names.get(x, f"{x:g}")}</span>' for x in _TICKS
-    )
+    scale = "".join(f'<span style="left: {_at(x)}">{names.get(x, f"{x:g}")}</span>' for x in _TICKS)
     return (
         f'<p class="legend">{keys}</p>\n<div class="scale" aria-hidden="true"><div>{scale}</div>'
         "</div>\n"
@@ -214,4 +212,3 @@ def _next(found: Identification, origin: Origin) -> str:
         for step in next_steps(found, origin)
     )
     return f'<h2 id="next">Do next</h2>\n<ol class="next">{steps}</ol>\n'
-
