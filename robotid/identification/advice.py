@@ -168,8 +168,8 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 
 
 def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    delays = [f.evidence["delay"] for c in causes for f in c.findings if "delay" in f.evidence]
-    delay = f"{sum(delays) / len(delays):.4f}" if delays else "SECONDS"
+    delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
+    delay = f"{sum(delays) / len(delays):.4f}"
     words = (
         f"If the drives filter their torque, state that it is {delay} s late; friction that the "
         "model lacks can look like this, too."
