@@ -17,7 +17,6 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.html import number, percent
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.report.document import write_report
-from robotid.report.plots import stretches, thin
 from robotid.robot.model import RobotModel
 from robotid.versions import versions
 
@@ -275,43 +274,6 @@ def test_without_a_validation_log_the_fitted_rows_are_drawn(model, tmp_path):
     assert "No log was kept apart: these are the fitted logs." in text
     assert "a.csv 0-7.99 s: fitted" in text
     assert "fitted rows, for no recording was kept apart" in text
-
-
-def test_lines_are_not_joined_across_a_gap(html, found):
-    trajectory = found.validation[0].recording.trajectory
-    assert trajectory.segment[-1] == 1
-    after = np.flatnonzero(np.diff(trajectory.segment))[0] + 1
-    t, y = thin(trajectory.t, trajectory.tau[:, 0], stretches(trajectory.segment), 200)
-    between = (t > trajectory.t[after - 1]) & (t < trajectory.t[after])
-    assert not between.any()
-    assert np.isnan(t).sum() == np.isnan(y).sum() == 1
-    figure = html[html.index('<title id="tau0-0-title"') :].split("</svg>")[0]
-    measured = re.search(r'<path d="([^"]*)"[^>]*stroke: currentColor; stroke-opacity: 0.6', figure)
-    assert measured
-    assert measured[1].count("M ") == 2
-
-
-def test_rows_left_out_break_the_line():
-    segment = np.array([0, 0, 0, 0, 1, 1])
-    used = np.array([True, True, False, True, True, True])
-    assert stretches(segment, used) == [slice(0, 2), slice(3, 4), slice(4, 6)]
-    assert stretches(segment, ~used) == [slice(2, 3)]
-    assert stretches(segment, np.zeros(6, dtype=bool)) == []
-    t, y = thin(np.arange(6.0), np.arange(6.0), stretches(segment, used), 100)
-    np.testing.assert_array_equal(t, [0, 1, np.nan, 3, np.nan, 4, 5])
-    np.testing.assert_array_equal(y, t)
-
-
-def test_thinning_keeps_every_extreme_and_the_ends(rng):
-    t = np.linspace(0.0, 1.0, 100_000)
-    y = rng.standard_normal(len(t))
-    y[77_777], y[12_345] = 50.0, -50.0
-    short, thinned = thin(t, y, [slice(0, len(t))], 2000)
-    assert len(short) <= 2010
-    assert (thinned.max(), thinned.min()) == (50.0, -50.0)
-    assert (short[0], short[-1]) == (0.0, 1.0)
-    assert (np.diff(short) > 0).all()
-    assert np.isin(thinned, y).all()
 
 
 def test_long_recordings_stay_small(model, tmp_path):
