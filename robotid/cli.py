@@ -140,12 +140,18 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _identify(options: argparse.Namespace) -> int:
-    from robotid.commands.identify import run_job
-    from robotid.workers.plan import WorkPlan
+    from robotid._typing import report_stage
 
-    job = job_from_flags(options)
-    workers = job.workers if options.workers is None else options.workers
-    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+    verbose = options.verbose
+    with terminal_progress(
+        quiet=options.json, force=options.progress, is_verbose=verbose
+    ) as progress:
+        report_stage(progress, "reading logs")  # before what takes the first second: its modules
+        from robotid.commands.identify import run_job
+        from robotid.workers.plan import WorkPlan
+
+        job = job_from_flags(options)
+        workers = job.workers if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
         _, result = run_job(job, options.out, plan=plan)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])

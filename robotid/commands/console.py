@@ -177,52 +177,86 @@ def print_files(folder: str, names: Sequence[str]) -> None:
 
 @contextmanager
 def terminal_progress(
-    *, quiet: bool = False, force: bool = False
+    *, quiet: bool = False, force: bool = False, is_verbose: bool = False
 ) -> "Iterator[ProgressCallback | None]":
     """Show progress on the standard error stream while the context lasts, if it is a terminal.
 
     Args:
         quiet: Show none even on a terminal, as beside JSON.
         force: Show it in any case.
+        is_verbose: Whether to print a line per stage where there is no terminal.
 
     Yields:
         What to call with the name of the work, units done, units in all and their name; None if
-        nothing is shown. A new name begins a new bar.
+        nothing is shown. A new name begins a new bar; "stages" stay, with what they consist of
+        below them.
     """
-    if not force and (quiet or not sys.stderr.isatty()):
-        yield None
-        return
+    if force or not (quiet or not sys.stderr.isatty()):
+        with _bars(force=force) as show:
+            yield show
+    else:
+        yield _stage_lines() if is_verbose and not quiet else None
+
+
+def _stage_lines() -> "ProgressCallback":
+    """Return what prints a line as a stage begins."""
+    said: list[str] = []
+
+    def show(what: str, done: int, total: int, unit: str) -> None:
+        if unit == "stages" and what not in said:
+            said.append(what)
+            with suppress(BrokenPipeError):  # nobody reads on, and the work is worth ending
+                print(f"robotid: {done + 1}/{total} {what}", file=sys.stderr, flush=True)
+
+    return show
+
+
+@contextmanager
+def _bars(*, force: bool) -> "Iterator[ProgressCallback]":
+    """Show a bar of the stage, and below it one of its work; both are gone at the end."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.progress import TimeElapsedColumn as Elapsed
+    from rich.progress import TimeRemainingColumn as Remaining
 
     console = Console(stderr=True, force_terminal=True if force else None)
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %  {task.fields[rate]}"),
-        TimeRemainingColumn(),
+        BarColumn(bar_width=20),
+        Elapsed(),
+        TextColumn("{task.fields[said]}"),
+        Remaining(),
     )
     tasks: dict[str, TaskID] = {}
     first: dict[str, int] = {}
+    stage = ""
     with Progress(*columns, console=console, transient=True) as bars:
 
         def show(what: str, done: int, total: int, unit: str) -> None:
+            nonlocal stage
             if what not in tasks:
-                for finished in tasks.values():
-                    bars.remove_task(finished)
-                tasks.clear()
-                tasks[what] = bars.add_task(what, total=total, completed=done, rate="")
+                for name in [name for name in tasks if unit == "stages" or name != stage]:
+                    bars.remove_task(tasks.pop(name))
+                words = f"    {what}" if stage else what
+                if unit == "stages":
+                    stage, words = what, f"{done + 1}/{total} {what}"
+                tasks[what] = bars.add_task(words, total=None, said="")
                 first[what] = done
-            task = bars.tasks[0]
-            elapsed = task.elapsed or 0.0
-            made = done - first[what]
-            rate = made / elapsed if elapsed > 0 else 0.0
-            words = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
-            bars.update(
-                tasks[what], completed=done, total=total, rate=f"{words} {unit}/s" if made else ""
-            )
+            if unit != "stages":
+                elapsed = next(t for t in bars.tasks if t.id == tasks[what]).elapsed or 0.0
+                said = _share_and_rate(done, total, done - first[what], elapsed, unit)
+                bars.update(tasks[what], completed=done, total=total, said=said)
 
         yield show
+
+
+def _share_and_rate(done: int, total: int, made: int, elapsed: float, unit: str) -> str:
+    """Return how far a work is and how fast it goes, as "50 %  1,200 samples/s"."""
+    share = f"{100 * done / max(total, 1):3.0f} %"
+    if not (made and elapsed > 0):
+        return share
+    rate = made / elapsed
+    return f"{share}  {f'{rate:,.0f}' if rate >= 10 else f'{rate:.2g}'} {unit}/s"
 
 
 def _print_result(result: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
+from robotid._typing import report_stage
 from robotid.commands.job import Job
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
@@ -51,12 +52,15 @@ def run_job(
         SettingsError: If a setting does not fit.
         WorkerError: If a worker ends before its work.
     """
+    chosen = plan or WorkPlan(job.workers or 1)
+    report_stage(chosen.progress, "reading logs")
     model, target = job.model(), Path(folder)
     name = f"{Path(model.tree.path).stem}.identified.urdf"
     sidecar = str(Path(name).with_suffix(".drive.json"))
     files = ["report.html", name, sidecar]
     check_folder(target, ["result.json", *files])
-    identification, checkpoint = _identify(job, model, target, plan)
+    identification, checkpoint = _identify(job, model, target, chosen)
+    report_stage(chosen.progress, "writing")
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
@@ -86,28 +90,36 @@ def _remove_stale(files: Iterable[Path]) -> None:
 
 
 def _identify(
-    job: Job, model: RobotModel, folder: Path, plan: WorkPlan | None
+    job: Job, model: RobotModel, folder: Path, plan: WorkPlan
 ) -> tuple[Identification, Checkpoint | None]:
     """Identify from the job's logs; finished pieces of long ones are kept in the folder."""
     check_ignored(job.ignore)
     fitted, kept = survey_logs(job, model, job.identification, job.validation)
     if not fitted:
         raise DataError("no log was given; at least one is needed to identify anything")
+    report_stage(plan.progress, "checking logs")
     stated = model.locked if job.mimic == "coupled" else job.locked
     found = [*locked_findings(model, stated), *examine_logs(job, model, fitted, kept)]
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    chosen, checkpoint = plan or WorkPlan(job.workers or 1), None
+    checkpoint = None
     if not recordings.is_held:
         checkpoint = Checkpoint.open(
-            folder, checkpoint_inputs(job), recordings.pieces, resume=chosen.resume
+            folder, checkpoint_inputs(job), recordings.pieces, resume=plan.resume
         )
-        recordings = replace(recordings, plan=chosen, checkpoint=checkpoint)
-    elif chosen.is_asked_for:
+        recordings = replace(recordings, plan=plan, checkpoint=checkpoint)
+    elif plan.is_asked_for:
         _log.warning(
             "the logs have no more than %d rows and are read at once: workers, scheduler and "
             "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
             job.rows_in_memory,
         )
-    with chosen:
-        concluded = conclude(recordings, job.estimator, found, job.ignore, friction=job.friction)
-        return concluded, checkpoint
+    with plan:
+        concluded = conclude(
+            recordings,
+            job.estimator,
+            found,
+            job.ignore,
+            friction=job.friction,
+            progress=plan.progress,
+        )
+    return concluded, checkpoint
