@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from robotid._files import check_file
 from robotid.commands.console import (
     Terminated,
-    print_content,
     print_error,
-    print_files,
     shown_log,
     terminal_progress,
     terminations_raised,
     unheard_in_silence,
 )
 from robotid.commands.flags import add_flags, job_from_flags, refuse_log_flags, source_settings
+from robotid.commands.printing import print_content, print_files, print_next, say
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
@@ -99,7 +98,10 @@ def _show(
         if options.json:
             print(json.dumps(content, allow_nan=False))
             return
-        print_content(command, content)
+        shown = {"is_verbose": options.verbose} if hasattr(options, "verbose") else {}
+        if hasattr(options, "base"):
+            shown["with_base"] = options.base
+        print_content(command, content, **shown)
         if files:
             print_files(options.out, files)
 
@@ -107,12 +109,13 @@ def _show(
 def _demo(options: argparse.Namespace) -> None:
     from robotid.commands.demo import run_demo
 
-    print("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
-    identification, result, truth = run_demo(options.out)
+    say("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
+    with terminal_progress() as progress:
+        identification, result, truth = run_demo(options.out, progress=progress)
     print_content("identify", result)
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
-    print(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
+    say(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
     print_files(options.out, [*result["outputs"].values(), "result.json", "replay.html"])
 
 
@@ -134,6 +137,8 @@ def _inspect(options: argparse.Namespace) -> None:
     from robotid.exceptions import ModelError
 
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
+    if not (content["robot"] or options.json):
+        raise ModelError(content["findings"][0]["message"])
     _show(content, options, "inspect")
     if content["structure"] is None:
         raise ModelError(f"no model can be built from {options.urdf}; see the findings")
@@ -155,6 +160,8 @@ def _identify(options: argparse.Namespace) -> int:
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
         _, result = run_job(job, options.out, plan=plan)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
+    if not options.json:
+        print_next(result, options.out)
     return 1 if result["verdict"]["alarms"] else 0
 
 
@@ -216,8 +223,10 @@ def _doctor(options: argparse.Namespace) -> int:
     from robotid.identification.verdict import alarming
 
     job = job_from_flags(options)
-    findings = examine(job)
-    _show(findings_to_dict(findings), options, "doctor")
+    model = job.model()
+    findings = examine(job, model)
+    content = findings_to_dict(findings) | {"joints": list(model.joints)}
+    _show(content, options, "doctor")
     return 1 if alarming(findings, job.ignore) else 0
 
 

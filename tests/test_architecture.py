@@ -16,7 +16,7 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions",
+    "exceptions _text",
     "findings versions _files _typing pages",
     "_settings",
     "robot logs",

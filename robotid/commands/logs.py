@@ -72,18 +72,19 @@ def survey_logs(
     return tuple(survey(entries) for entries in groups)
 
 
-def examine(job: Job) -> tuple[Finding, ...]:
+def examine(job: Job, model: RobotModel | None = None) -> tuple[Finding, ...]:
     """Examine the logs of a job; the findings have errors first.
 
     Args:
         job: The job. A log that cannot be read gives a finding, not an error.
+        model: Its robot; made of its URDF if None.
 
     Raises:
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
     check_ignored(job.ignore)
-    model = job.model()
+    model = model or job.model()
     refused: list[Finding] = []
 
     def refuse(entry: LogEntry, error: DataError) -> None:
