@@ -16,8 +16,8 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions _text",
-    "findings versions _files _typing pages",
+    "exceptions _text _typing",
+    "findings versions _files pages",
     "_settings",
     "robot logs",
     "regressor",

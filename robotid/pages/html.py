@@ -1,5 +1,7 @@
 """HTML of the pages: scaffold, style, sections, tables. Everything inline, nothing fetched."""
 
+import base64
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -151,12 +153,20 @@ def page(title: str, header: str, sections: Mapping[str, tuple[str, str]]) -> st
 def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
     """Return the HTML of a document, which fetches nothing that its policy does not allow.
 
+    Where its body holds charts, it has the scripts that draw them, and no other may run.
+
     Args:
         title: Title of the window, not escaped yet.
         head: HTML of the head: style, icon; ``/*tones*/`` in it becomes the pages' colours.
         body: HTML of the body.
-        policy: What the page may do beside having styles, as a content security policy.
+        policy: What the page may do beside having styles and charts, as a content security policy.
     """
+    style, scripts = "", ""
+    if '<figure class="chart"' in body:
+        style = f"<style>{asset('uPlot.min.css')}\n{asset('charts.css')}</style>\n"
+        run = (asset("uPlot.iife.min.js"), asset("charts.js"))
+        scripts = "".join(f"<script>{script}</script>\n" for script in run)
+        policy += "; script-src " + " ".join(map(_allowed, run))
     # the policy keeps the page offline whatever a name in it might hold
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -164,9 +174,16 @@ def scaffold(title: str, head: str, body: str, *, policy: str = "") -> str:
         f"content=\"default-src 'none'; style-src 'unsafe-inline'{policy}\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)}</title>\n{_toned(head)}</head>\n"
-        f"<body>\n{body}</body>\n</html>\n"
+        f"<title>{escape(title)}</title>\n{_toned(head)}{style}</head>\n"
+        f"<body>\n{body}{scripts}</body>\n</html>\n"
     )
+
+
+@cache
+def _allowed(script: str) -> str:
+    """Return what allows this one script in a content security policy."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    return f"'sha256-{digest}'"
 
 
 def _toned(head: str) -> str:

@@ -23,6 +23,7 @@ from robotid.report.diagnosis import (
 from robotid.report.plots import plot_torque
 from robotid.report.svg import svg_element
 from robotid.report.tables import tables
+from robotid.report.why import why_section
 from robotid.versions import __version__
 
 __all__ = ["write_report"]
@@ -52,6 +53,7 @@ def write_report(identification: Identification, target: str | Path) -> Path:
     sections = {
         "errors": ("Prediction errors", _errors(identification)),
         "torques": ("Torques over time", _torques(identification)),
+        "why": ("Why each joint is predicted so", why_section(identification)),
         "residuals": ("What the residuals hold", residual_section(identification)),
         "drives": ("Drive parameters", drive_figures(identification) + made["drives"]),
         "base": ("Base parameters", made["base"]),
