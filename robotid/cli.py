@@ -17,8 +17,14 @@ from robotid.commands.console import (
     terminations_raised,
     unheard_in_silence,
 )
-from robotid.commands.flags import add_flags, job_from_flags, refuse_log_flags, source_settings
-from robotid.commands.printing import print_content, print_files, print_next, say
+from robotid.commands.flags import (
+    add_flags,
+    job_from_flags,
+    refuse_log_flags,
+    source_settings,
+    source_words,
+)
+from robotid.commands.printing import print_content, print_files, print_steps, say
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
@@ -54,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     """Run a command line, tell what stops it, and return its exit code."""
-    options = _parser(words).parse_args(words)
+    options = _parser(words).parse_args(words, argparse.Namespace(words=words))
     try:
         with terminations_raised(), shown_log(is_verbose=getattr(options, "verbose", False)):
             code: int | None = options.run(options)
@@ -153,15 +159,17 @@ def _identify(options: argparse.Namespace) -> int:
     ) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
         from robotid.commands.identify import run_job
+        from robotid.identification.advice import Origin, next_steps
         from robotid.workers.plan import WorkPlan
 
         job = job_from_flags(options)
         workers = job.workers if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
-        _, result = run_job(job, options.out, plan=plan)
+        source = source_words(options.words)
+        found, result = run_job(job, options.out, plan=plan, source=source)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
     if not options.json:
-        print_next(result, options.out)
+        print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["alarms"] else 0
 
 

@@ -63,6 +63,7 @@ def run_demo(
         identification=(entries[0],),
         validation=(entries[1],),
     )
-    identification, result = run_job(job, target, plan=WorkPlan(progress=progress))
+    plan, beside = WorkPlan(progress=progress), {"replay": "replay.html"}
+    identification, result = run_job(job, target, plan=plan, beside=beside)
     replay_identified(identification).write(target / "replay.html")
     return identification, result, identification.mapping.to_base(truth)

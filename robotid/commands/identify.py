@@ -1,7 +1,7 @@
 """A job from its files to the folder of results."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
+from robotid.identification.advice import Origin
 from robotid.identification.findings import locked_findings
 from robotid.identification.pipeline import Identification, conclude
 from robotid.identification.recordings import Recordings
@@ -29,7 +30,12 @@ _log = logging.getLogger(__name__)
 
 
 def run_job(
-    job: Job, folder: str | Path, *, plan: WorkPlan | None = None
+    job: Job,
+    folder: str | Path,
+    *,
+    plan: WorkPlan | None = None,
+    source: Sequence[str] = (),
+    beside: Mapping[str, str] | None = None,
 ) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
@@ -40,6 +46,8 @@ def run_job(
         job: What to do.
         folder: Where to write; made if it is missing.
         plan: Who works on long logs; as the job says, in this process, if None.
+        source: What follows ``robotid identify`` to run it again, for the report.
+        beside: Further files that the folder will hold, by what they are, for the report.
 
     Returns:
         The identification and the content of result.json.
@@ -64,15 +72,18 @@ def run_job(
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
+        written = {"urdf": name, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
-            write_report(identification, partial / "report.html")
+            links = {"result": "result.json", **written, **(beside or {})}
+            origin = Origin(tuple(source), str(target))
+            write_report(identification, partial / "report.html", files=links, origin=origin)
             outputs["report"] = "report.html"
             identification = replace(identification, report=str(target / "report.html"))
-        if identification.has_urdf:
+        if written:
             write_urdf(
                 identification.model, identification.standard, partial / name, dynamics=job.dynamics
             )
-            outputs |= {"urdf": name, "sidecar": sidecar}
+            outputs |= written
         result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
     _remove_stale(target / other for other in files if other not in outputs.values())

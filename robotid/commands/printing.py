@@ -1,16 +1,18 @@
 """What the commands found as text: lines that fit the terminal, columns, a little colour."""
 
-import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robotid._text import columns, in_digits_of, terminal_width, tinted, wrapped
 from robotid.findings import Finding, grouped, listed
 
-__all__ = ["print_content", "print_files", "print_next", "say"]
+if TYPE_CHECKING:
+    from robotid.identification.advice import Step
+
+__all__ = ["print_content", "print_files", "print_steps", "say"]
 
 
 def say(text: str, hang: str = "", tone: str = "") -> None:
@@ -63,21 +65,17 @@ def print_files(folder: str, names: Sequence[str]) -> None:
         print(f"  {Path(folder) / name}")
 
 
-def print_next(result: Mapping[str, Any], folder: str) -> None:
-    """Print the commands that show a result, and that test it where that was not done.
+def print_steps(steps: "Sequence[Step]") -> None:
+    """Print what to do next, each step with what to type, on lines to copy.
 
     Args:
-        result: The content of its result.json.
-        folder: Where that is.
+        steps: The steps.
     """
-    paths = {entry["role"]: entry["path"] for entry in result["inputs"]}
-    log = paths.get("validation", paths["identification"])
-    page = str(Path(folder) / "replay.html")
-    words = ["robotid", "replay", paths["urdf"], log, folder, "--html", page]
-    print(f"\nnext, to watch it:\n  {shlex.join(words)}")
-    if not result["validation"]:
-        print("to test it on a log of another motion:")
-        print(f"  {shlex.join(['robotid', 'validate', str(Path(folder) / 'result.json')])} LOG")
+    print("\ndo next:")
+    for number, step in enumerate(steps, start=1):
+        say(f"  {number}. {step.words}", "   ")
+        for block in step.blocks:
+            print("\n".join(f"       {line}" for line in block.split("\n")))
 
 
 def _print_block(*lines: str) -> None:
