@@ -4,16 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import trajectory_values
+from robotid.regressor.columns import friction_directions, trajectory_values
 from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.rows import BLOCK, COMPILED, TrajectoryRows, trajectory_rows
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = ["predict", "rigid_parts"]
+__all__ = ["predict", "predict_instants", "rigid_parts"]
 
 _START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
 
@@ -81,6 +84,57 @@ def _rows_by_pi(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> A
         Y = joint_torque_regressor(model, q[k], v[k], a[k], memory=memory[k])
         torque[k] = (Y @ pi).reshape(-1, model.n_rows)
     return torque
+
+
+def predict_instants(
+    model: RobotModel,
+    pi: Array,
+    q: ArrayLike,
+    v: ArrayLike | None = None,
+    a: ArrayLike | None = None,
+) -> Array:
+    """Return the torques that parameters predict at instants that need not follow each other.
+
+    Friction acts by the sign of the speed: at rest, where it holds any torque up to its size, it
+    counts as 0. Drives whose friction has a memory have slid for long one way, under the load that
+    the bodies make, and nothing comes late. Velocities and accelerations of a robot whose
+    ``dynamics`` is "static" have no part but for the sign of friction.
+
+    Args:
+        model: The robot; its reference tells the load of the gears.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        q: Joint coordinates in the model's order, shape (n,) or (N, n) [rad, m]; seven more first
+            with a floating base.
+        v: Velocities, shape (n_rows,) or (N, n_rows) [rad/s, m/s]; None: at rest.
+        a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+
+    Returns:
+        Torques, shape (n_rows,) or (N, n_rows) [N m, N].
+
+    Raises:
+        DataError: If a shape does not fit, or a value is not finite.
+    """
+    q = np.asarray(q, dtype=float)
+    wanted = (*q.shape[:-1], model.n_rows)
+    if q.ndim not in (1, 2):
+        raise DataError(f"q has shape {q.shape}, wanted ({model.n_rows},) or (N, {model.n_rows})")
+    given = [np.zeros(wanted) if x is None else np.asarray(x, dtype=float) for x in (v, a)]
+    for name, x in zip("va", given, strict=True):
+        if x.shape != wanted:
+            raise DataError(
+                f"{name} has shape {x.shape}, wanted {wanted}, as q is {q.shape}: a column for "
+                f"each of {listed(model.row_names)}"
+            )
+    q, v, a = (np.atleast_2d(x) for x in (q, *given))
+    direction = friction_directions(model.layout, v, None)
+    if model.is_static:
+        v, a = np.zeros_like(v), np.zeros_like(a)
+    torque = np.empty(v.shape)
+    for start in range(0, len(v), BLOCK):
+        part = slice(start, start + BLOCK)
+        Y = joint_torque_regressor(model, q[part], v[part], a[part], direction[part])
+        torque[part] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque.reshape(wanted)
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
