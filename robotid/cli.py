@@ -29,6 +29,9 @@ from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from robotid._typing import ProgressCallback
     from robotid.commands.job import Job
 
 __all__ = ["main"]
@@ -130,7 +133,7 @@ def _paper(options: argparse.Namespace) -> None:
     from robotid.paper.study import PaperSettings
 
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
-    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+    with _progress(options) as progress:
         result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
     _show(result, options, "paper")
     if not options.json:
@@ -150,13 +153,19 @@ def _inspect(options: argparse.Namespace) -> None:
         raise ModelError(f"no model can be built from {options.urdf}; see the findings")
 
 
+def _progress(options: argparse.Namespace) -> "AbstractContextManager[ProgressCallback | None]":
+    """Return the progress that the flags of a command ask for."""
+    return terminal_progress(
+        quiet=options.json,
+        force=getattr(options, "progress", False),
+        is_verbose=getattr(options, "verbose", False),
+    )
+
+
 def _identify(options: argparse.Namespace) -> int:
     from robotid._typing import report_stage
 
-    verbose = options.verbose
-    with terminal_progress(
-        quiet=options.json, force=options.progress, is_verbose=verbose
-    ) as progress:
+    with _progress(options) as progress:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
         from robotid.commands.identify import run_job
         from robotid.identification.advice import Origin, next_steps
@@ -230,9 +239,10 @@ def _doctor(options: argparse.Namespace) -> int:
     from robotid.doctor.diagnosis import findings_to_dict
     from robotid.identification.verdict import alarming
 
-    job = job_from_flags(options)
-    model = job.model()
-    findings = examine(job, model)
+    with _progress(options) as progress:
+        job = job_from_flags(options)
+        model = job.model()
+        findings = examine(job, model, progress=progress)
     content = findings_to_dict(findings) | {"joints": list(model.joints)}
     _show(content, options, "doctor")
     return 1 if alarming(findings, job.ignore) else 0
@@ -257,6 +267,17 @@ def _payload(options: argparse.Namespace) -> None:
         find_gains=options.gains,
     )
     _show(found, options, "payload")
+
+
+def _report(options: argparse.Namespace) -> None:
+    from robotid._typing import report_stage
+
+    with _progress(options) as progress:
+        report_stage(progress, "reading logs")
+        from robotid.commands.report import rewrite_report
+
+        written = rewrite_report(options.result, options.out, progress=progress)
+    _show(written, options, "report")
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -300,6 +321,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor),
     "validate": ("measure a result's prediction on other logs", _validate),
     "payload": ("what hangs on a link: a log with it against one without", _payload),
+    "report": ("write the report of a result again, from its inputs", _report),
     "compare": ("several results side by side", _compare),
     "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
     "convert": (

@@ -131,6 +131,12 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_json(parser)
         case "payload":
             _add_payload(parser)
+        case "report":
+            add("result", metavar="RESULT", help="result.json or its folder")
+            add("--out", metavar="FILE", help="page to write; default: report.html beside it")
+            _add_json(parser)
+            _add_verbose(parser)
+            _add_progress(parser)
         case "compare":
             add("results", nargs="+", metavar="RESULT.json")
             add("--out", metavar="FILE.html", help="page to write")

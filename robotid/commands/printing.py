@@ -46,6 +46,7 @@ def print_content(
         "doctor": partial(_print_examination, is_verbose=is_verbose),
         "validate": _print_validation,
         "payload": _print_payload,
+        "report": lambda done: print(f"written: {done['report']}"),
         "compare": _print_comparison,
         "export": _print_export,
         "convert": _print_conversion,
