@@ -141,18 +141,23 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             add("results", nargs="+", metavar="RESULT.json")
             add("--out", metavar="FILE.html", help="page to write")
             _add_json(parser)
-        case "export":
-            add("result", metavar="RESULT", help="result.json or its folder")
-            kinds = ("urdf", "mjcf", "sdf", "ranges")
-            add("--format", required=True, choices=kinds, help="ranges: YAML of 95 %% intervals")
-            add("--out", required=True, metavar="FILE", help="file to write")
-            _add_json(parser)
-        case "convert":
-            add("log", metavar="IN", help="a log of any format, or a bag's folder")
-            add("out", metavar="OUT", help="file to write; its suffix says the format")
-            add("--joints", metavar="A,B,...", help="joints to write; default: all")
-            _add_settings(parser, _SOURCE)
-            _add_json(parser)
+        case "export" | "convert":
+            _add_conversion(parser, command)
+
+
+def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
+    add = parser.add_argument
+    if command == "export":
+        add("result", metavar="RESULT", help="result.json or its folder")
+        kinds = ("urdf", "mjcf", "sdf", "ranges")
+        add("--format", required=True, choices=kinds, help="ranges: YAML of 95 %% intervals")
+        add("--out", required=True, metavar="FILE", help="file to write")
+    else:
+        add("log", metavar="IN", help="a log of any format, or a bag's folder")
+        add("out", metavar="OUT", help="file to write; its suffix says the format")
+        add("--joints", metavar="A,B,...", help="joints to write; default: all")
+        _add_settings(parser, _SOURCE)
+    _add_json(parser)
 
 
 def _add_payload(parser: argparse.ArgumentParser) -> None:

@@ -240,8 +240,8 @@ def _print_comparison(content: dict[str, Any]) -> None:
     labels = [result["label"] for result in results]
     for result in results:
         verdict = result["verdict"]["status"]
-        said = f"{result['label']}: {verdict:6}  {result['estimator']}  "
-        say(f"{said}'{result['path']}'", " " * 11, verdict)
+        said = f"{result['label']}  {verdict:7} {result['estimator']:10} "
+        print(tinted(f"{said}{result['path']}", verdict, verdict, sys.stdout))
     for remark in content["remarks"]:
         say(f"- {remark}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
