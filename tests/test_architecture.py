@@ -16,8 +16,8 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions",
-    "findings versions _files _typing pages",
+    "exceptions _typing",
+    "findings versions _files pages",
     "_settings",
     "robot logs",
     "regressor",

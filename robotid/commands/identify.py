@@ -1,9 +1,10 @@
 """A job from its files to the folder of results."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
@@ -12,6 +13,7 @@ from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
+from robotid.identification.advice import Origin
 from robotid.identification.drive_choice import wanted_families
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.findings import locked_findings
@@ -32,7 +34,12 @@ _log = logging.getLogger(__name__)
 
 
 def run_job(
-    job: Job, folder: str | Path, *, plan: WorkPlan | None = None
+    job: Job,
+    folder: str | Path,
+    *,
+    plan: WorkPlan | None = None,
+    source: Sequence[str] = (),
+    beside: Mapping[str, str] | None = None,
 ) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
@@ -43,6 +50,8 @@ def run_job(
         job: What to do.
         folder: Where to write; made if it is missing.
         plan: Who works on long logs; as the job says, in this process, if None.
+        source: What follows ``robotid identify`` to run it again, for the report.
+        beside: Further files that the folder will hold, by what they are, for the report.
 
     Returns:
         The identification and the content of result.json.
@@ -59,7 +68,7 @@ def run_job(
     check_folder(target, ["result.json", *_names(model)])
     identification, checkpoint = _identify(job, model, target, plan)
     asked = replace(identification.asked, job=job)
-    saved = _write(replace(identification, asked=asked), job, target)
+    saved = _write(replace(identification, asked=asked), job, target, source, beside or {})
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -95,22 +104,29 @@ def _names(model: RobotModel) -> tuple[str, str, str]:
 
 
 def _write(
-    identification: Identification, job: Job, target: Path
+    identification: Identification,
+    job: Job,
+    target: Path,
+    source: Sequence[str] = (),
+    beside: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     report, name, sidecar = _names(identification.model)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
+        written = {"urdf": name, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
-            write_report(identification, partial / report)
+            links = {"result": "result.json", **written, **beside}
+            origin = Origin(tuple(source), str(target))
+            write_report(identification, partial / report, files=links, origin=origin)
             outputs["report"] = report
             identification = replace(identification, report=str(target / report))
-        if identification.has_urdf:
+        if written:
             write_urdf(
                 identification.model, identification.standard, partial / name, dynamics=job.dynamics
             )
-            outputs |= {"urdf": name, "sidecar": sidecar}
+            outputs |= written
         result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
     others = {report, name, sidecar} - set(outputs.values())

@@ -16,7 +16,7 @@ from robotid.regressor.rows import BLOCK, COMPILED, TrajectoryRows, trajectory_r
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = ["predict", "predict_instants"]
+__all__ = ["predict", "predict_instants", "rigid_parts"]
 
 _START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
 
@@ -96,12 +96,43 @@ def predict_instants(
     direction = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
-    torque = np.empty(v.shape)
+    return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
+
+
+def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
+    """Return gravity, inertia and velocity torques of the bodies, each (N, n_rows) [N m, N].
+
+    They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
+    tau(q, 0, a), so that their sum is the torque of the bodies.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), possible ones or not; those of drives add nothing.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+
+    Raises:
+        DataError: If q does not fit the model.
+    """
+    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+    rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
+    still = np.zeros_like(v)
+    g, g_and_Ma, whole = (rigid(model, bodies, q, *x) for x in ((still, still), (still, a), (v, a)))
+    return [g, g_and_Ma - g, whole - g_and_Ma]
+
+
+def _rows_by_pi(
+    model: RobotModel, pi: Array, q: Array, v: Array, a: Array, direction: Array | None = None
+) -> Array:
+    """Return Y pi at instants that need not follow each other, shape (N, n_rows), by blocks."""
+    torque = np.empty_like(v)
     for start in range(0, len(v), BLOCK):
-        part = slice(start, start + BLOCK)
-        Y = joint_torque_regressor(model, q[part], v[part], a[part], direction[part])
-        torque[part] = (Y @ pi).reshape(-1, model.n_rows)
-    return torque.reshape(wanted)
+        k = slice(start, start + BLOCK)
+        signs = None if direction is None else direction[k]
+        Y = joint_torque_regressor(model, q[k], v[k], a[k], signs)
+        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
@@ -129,18 +160,21 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 
 def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque by the recursive Newton-Euler algorithm and the drives' terms."""
-    G, v, a = model.velocity_map, trajectory.v, trajectory.a
-    pin_model, rnea = model.with_parameters(pi).pin_model, pin.rnea
+    m, layout, theta = trajectory, model.layout, pi[model.layout.n_inertial :]
+    torque = _newton_euler(model, pi, m.q, m.v, m.a)
+    if theta.any():
+        values = trajectory_values(layout, m)
+        torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
+    return torque
+
+
+def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+    """Return the torque of the bodies, shape (N, n_rows)."""
+    G, pin_model, rnea = model.velocity_map, model.with_parameters(pi).pin_model, pin.rnea
     data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
     is_plain = np.array_equal(G, np.eye(len(G)))
     rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
-    configurations = np.ascontiguousarray(model.configurations(trajectory.q))
+    configurations = np.ascontiguousarray(model.configurations(q))
     for torque_k, *motion_k in zip(torque, configurations, rates, changes, strict=True):
         torque_k[:] = rnea(pin_model, data, *motion_k)
-    if not is_plain:
-        torque = torque @ G  # tau = G^T tau_pinocchio
-    layout, theta = model.layout, pi[model.layout.n_inertial :]
-    if theta.any():
-        values = trajectory_values(layout, trajectory)
-        torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
-    return torque
+    return torque if is_plain else torque @ G  # tau = G^T tau_pinocchio
