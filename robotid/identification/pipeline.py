@@ -24,7 +24,7 @@ from robotid.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.bands import (
     FrictionCurve,
     TorqueBand,
@@ -55,6 +55,7 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.survey import hold_log
+from robotid.identification.torque_split import joint_torques
 from robotid.identification.verdict import (
     Doubt,
     Verdict,
@@ -64,9 +65,12 @@ from robotid.identification.verdict import (
     judge,
     refuted,
 )
+from robotid.identification.why_pictures import why_charts
 from robotid.identification.witness import Witness, call_witness
+from robotid.logs.data import suggestion
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
+from robotid.pages.plots import Plot
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
 from robotid.regressor.prediction import predict_instants
@@ -265,6 +269,35 @@ class Identification:
         ``model.velocity_map`` lead to Pinocchio's coordinates.
         """
         return pinocchio_model(self.model, self.standard)
+
+    def plot_why(self, joint: str) -> Plot:
+        """Return charts of what a joint's torque consists of, and of what its residual follows.
+
+        Args:
+            joint: The joint.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("why.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        torque = joint_torques(self)[self._row(joint)]
+        charts = why_charts(torque)
+        about = {name: f"residual against {name}" for name in charts}
+        about |= {"split": torque.sentence, "power": "mechanical power"}
+        shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
+        return Plot(f"Why {joint} is predicted as it is", shown)
+
+    def _row(self, joint: str) -> int:
+        """Return the number of a joint's torque row."""
+        names = self.model.row_names
+        if joint not in names:
+            raise DataError(
+                f"joint {joint!r} is not among those identified: {listed(names)}"
+                f"{suggestion(joint, names)}"
+            )
+        return names.index(joint)
 
     def save(self, folder: str | Path, *, report: bool = True) -> Path:
         """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
