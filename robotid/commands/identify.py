@@ -4,7 +4,6 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
@@ -68,7 +67,8 @@ def run_job(
     check_folder(target, ["result.json", *_names(model)])
     identification, checkpoint = _identify(job, model, target, plan)
     asked = replace(identification.asked, job=job)
-    saved = _write(replace(identification, asked=asked), job, target, source, beside or {})
+    found = replace(identification, asked=asked)
+    saved = _write(found, job, target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -107,8 +107,9 @@ def _write(
     identification: Identification,
     job: Job,
     target: Path,
+    *,
     source: Sequence[str] = (),
-    beside: Mapping[str, str] = MappingProxyType({}),
+    beside: Mapping[str, str] | None = None,
 ) -> tuple[Identification, dict[str, Any]]:
     """Write all files of a result; return the identification with its report, and result.json."""
     report, name, sidecar = _names(identification.model)
@@ -117,7 +118,7 @@ def _write(
         outputs = {}
         written = {"urdf": name, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
-            links = {"result": "result.json", **written, **beside}
+            links = {"result": "result.json", **written, **(beside or {})}
             origin = Origin(tuple(source), str(target))
             write_report(identification, partial / report, files=links, origin=origin)
             outputs["report"] = report

@@ -454,8 +454,9 @@ class _Finder:
                 f"where they stood, as with {locks}"
             )
         return DataError(
-            f"{self.where}: {has} but no gain; give it in N m/A: gains={{{without[0]!r}: ...{more}}} "
-            f"(job file table [torque], key gains; CLI {flags}){also}",
+            f"{self.where}: {has} but no gain; give it in N m/A: "
+            f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
+            f"{flags}){also}",
             code="missing_gain",
         )
 

@@ -206,8 +206,9 @@ def page(title: str, header: str, sections: Mapping[str, Section | tuple[str, st
         title,
         f"<style>/*tones*/{asset('page.css')}</style>\n",
         '<a class="skip" href="#content">Skip to the content</a>\n'
-        f'<nav aria-label="Sections"><div><a href="#content">{escape(title)}</a> {links}</div></nav>'
-        f'\n<main id="content" tabindex="-1">\n<header>\n{header}</header>\n{body}</main>\n',
+        f'<nav aria-label="Sections"><div><a href="#content">{escape(title)}</a> {links}'
+        f'</div></nav>\n<main id="content" tabindex="-1">\n<header>\n{header}</header>\n'
+        f"{body}</main>\n",
         scripts=named,
     )
 

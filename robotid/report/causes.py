@@ -51,7 +51,8 @@ def _cause(cause: Cause) -> str:
         each = f"<details><summary>{title}</summary><ul>{items}</ul></details>\n"
     return (
         f'<div class="cause {cause.severity}" id="cause-{escape(cause.code)}"><h3>'
-        f"<strong>{cause.severity}</strong> {code(cause.code).html}{about}</h3>\n{said}{each}</div>\n"
+        f"<strong>{cause.severity}</strong> {code(cause.code).html}{about}</h3>\n"
+        f"{said}{each}</div>\n"
     )
 
 
