@@ -98,9 +98,9 @@ def _facts(found: Identification, files: Mapping[str, str]) -> str:
     )
     words = ", ".join(f"{count} {DETERMINED[kind]}" for kind, count in counts.items() if count)
     facts = {
-        "Total mass": f"<b>{before:.2f} → {after:.2f} kg</b>{change}",
+        "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
         "Base parameters determined": (
-            f"<b>{found.determination.rank} of {len(found.base)}</b>, condition number "
+            f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
             f"{found.wls.condition:.3g}"
         ),
         f"{total} parameters, determined by": f'<span class="shares">{shares}</span>{words}',
@@ -170,7 +170,7 @@ def _picture(row: int, joint: str, measured: JointMetrics, wls: float | None) ->
     title = f"{joint}: {error} % missed; by comparison {', '.join(figures)}"
     lines = "".join(f'<line x1="{_at(x)}" x2="{_at(x)}" y1="-2" y2="18"/>' for x in (GOOD, POOR))
     marks = "".join(
-        f'<svg x="{_at(value)}" overflow="visible">{_mark(key)}</svg>'
+        f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{_mark(key)}</svg>'
         for key, value in shown.items()
         if value is not None
     )
