@@ -10,7 +10,8 @@ from robotid.pages.html import asset, scaffold
 
 __all__ = ["Plot"]
 
-_AROUND = 130  # [px] of caption, axis and legend around each chart
+_AROUND = 112  # [px] of caption, axis and legend around each chart
+_STYLE = "main { padding: .5rem 1rem; } h1 { font-size: 1.125rem; margin: 0 0 .5rem; }"
 _HIGHEST = 900  # [px] that a cell of a notebook gives
 
 
@@ -27,7 +28,7 @@ class Plot:
     charts: tuple[tuple[Chart, str], ...]
 
     def __repr__(self) -> str:
-        return f"<Plot of {self.title}: {len(self.charts)} charts; .write('plot.html') keeps it>"
+        return f"<Plot of {self.title}; .write('plot.html') keeps it>"
 
     def _repr_html_(self) -> str:
         height = min(_HIGHEST, sum(chart.height + _AROUND for chart, _ in self.charts) + 60)
@@ -41,7 +42,7 @@ class Plot:
         figures = "".join(chart_html(chart, escape(caption)) for chart, caption in self.charts)
         return scaffold(
             self.title,
-            f"<style>/*tones*/{asset('page.css')}</style>\n",
+            f"<style>/*tones*/{asset('page.css')}\n{_STYLE}</style>\n",
             f'<main id="content">\n<h1>{escape(self.title)}</h1>\n{figures}</main>\n',
         )
 

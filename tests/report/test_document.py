@@ -166,7 +166,14 @@ def test_verdict_comes_first_then_how_it_was_made(html, found):
     text = Reader(html).text
     order = [f"Verdict: {found.verdict.status}", found.verdict.reasons[0], "Total mass", "Do next"]
     order += ["cut-off 10 Hz, order 4", "velocity measured", "Errors", "Findings", "Torques"]
-    order += ["Parameters", "Changes of the URDF", "Appendix", "Base parameters", "total", "SHA-256"]
+    order += [
+        "Parameters",
+        "Changes of the URDF",
+        "Appendix",
+        "Base parameters",
+        "total",
+        "SHA-256",
+    ]
     places = [text.index(order[0])]
     for words in order[1:]:
         assert words in text[places[-1] :], words
