@@ -56,6 +56,8 @@ CORRELATION = 0.1
 _NOISE = 0.01  # the same of its standard deviation, as a share of the largest torque
 _FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
 _FAINTEST = 1e-3  # of the largest torque of all joints, that of one that carries nothing
+_EXACT = 1e-9  # share of the largest residual that every joint has at least
+_LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
 _IMPULSE = 40.0  # periods of the filter after which nothing is left of an impulse
 
 
@@ -128,19 +130,28 @@ class Run:
     def noise(self, K: Array) -> TorqueNoise:
         """Return the noise that it shows: its residuals, correlated as their scores scatter.
 
+        The score of a joint scatters otherwise in each direction; what it does to the parameters
+        that the joint tells most of, in the geometric mean, stands for all.
+
         Args:
             K: Map to the base parameters, shape (b, p).
         """
         factors, beta = self.factors, K @ self.standard
         sigma = np.sqrt(factors.residual_squares(beta) / np.maximum(factors.rows, 1))
-        sigma = np.maximum(sigma, _FAINTEST**2 * max(float(sigma.max()), 1e-300))
+        sigma = np.maximum(sigma, _EXACT * max(float(sigma.max()), _EXACT))
         bread = solve_factor(factors, sigma, beta).covariance
-        free = np.maximum(1.0 - factors.leverages(bread) / sigma**2 / factors.rows, 0.1)
         inflation = np.full(len(sigma), 1.0 / self.share)
         if len(self.stretches) >= FEWEST_STRETCHES:
             for j in np.flatnonzero(factors.rows):
                 alone = np.where(np.arange(len(sigma)) == j, sigma, np.inf)
-                inflation[j] = scatter(self.stretches, beta, alone, bread).inflation
+                own = np.diag(bread @ factors.information(alone**-2.0) @ bread)
+                share = own / np.diag(bread)  # of each parameter's variance, by this joint
+                told = share > _FAINTEST
+                scattered = np.diag(scatter(self.stretches, beta, alone, bread).covariance)
+                ratio = np.log(scattered[told] / own[told])
+                inflation[j] = np.exp(np.average(ratio, weights=share[told]))
+        spent = factors.leverages(bread) / sigma**2
+        free = np.maximum(1.0 - spent / np.maximum(factors.rows, 1), _LEAST_FREE)
         # its density is sigma^2 inflation step, whatever its standard deviation is
         return TorqueNoise(
             sigma / np.sqrt(free), free * inflation * self.step, ("found",) * len(sigma)
