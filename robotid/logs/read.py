@@ -46,6 +46,7 @@ def read_log(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    is_motion: bool = False,
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
 
@@ -62,6 +63,7 @@ def read_log(
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
         transmissions: The motors and gears, where the file has columns of motors.
+        is_motion: Whether it is read for its motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -70,7 +72,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions,
+        source=source, transmissions=transmissions, is_motion=is_motion,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -78,7 +80,11 @@ def read_log(
 
 
 def read_logs(
-    given: Readable | Sequence[Readable], joints: Sequence[str], *, prismatic: Collection[str] = ()
+    given: Readable | Sequence[Readable],
+    joints: Sequence[str],
+    *,
+    prismatic: Collection[str] = (),
+    is_motion: bool = False,
 ) -> tuple[Log, ...]:
     """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
 
@@ -86,6 +92,7 @@ def read_logs(
         given: A log, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
         prismatic: Names of joints that slide; the others turn.
+        is_motion: Whether they are read for their motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If it is something else, or does not hold what is wanted.
@@ -98,7 +105,10 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        log if isinstance(log, Log) else read_log(log, joints, prismatic=prismatic) for log in logs
+        log
+        if isinstance(log, Log)
+        else read_log(log, joints, prismatic=prismatic, is_motion=is_motion)
+        for log in logs
     )
 
 
