@@ -143,7 +143,7 @@ def build_result(
             for e in identification.validation
         ],
         "warnings": [
-            {"code": f.code, "message": f.message, "where": f.where}
+            {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
             for f in identification.findings
         ],
         "wls": {
@@ -202,7 +202,8 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
         evaluation: The recording.
         name: Which parameters predict.
     """
-    return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
+    recording = evaluation.recording
+    return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid._settings import Settings
-from robotid._typing import Array
+from robotid._typing import Array, ProgressCallback, report_stage
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
 from robotid.doctor.urdf_inertials import impossible_inertials
@@ -438,6 +438,7 @@ def identify(
     friction: str | Mapping[str, str] = AUTO,
     doctor: bool = True,
     ignore: Sequence[str] = (),
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters from motion logs, as the command line does.
 
@@ -453,6 +454,7 @@ def identify(
             ``wanted_families``: "auto" has it chosen.
         doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
         ignore: Codes of errors and doubts that you know better.
+        progress: Called as each of ``STAGES`` begins: its name, stages done, in all, "stages".
 
     Raises:
         DataError: If a log cannot be read, does not fit the model or is too short.
@@ -463,6 +465,7 @@ def identify(
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
+    report_stage(progress, "reading logs")
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic)
@@ -471,9 +474,10 @@ def identify(
     if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (first, second))
+    report_stage(progress, "checking logs")
     found = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    return conclude(recordings, choice, found, ignore, friction=friction)
+    return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
 
 
 def conclude(
@@ -483,6 +487,7 @@ def conclude(
     ignore: Sequence[str] = (),
     *,
     friction: str | Mapping[str, str] = AUTO,
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters from recordings, in memory or not, and judge the result.
 
@@ -492,6 +497,7 @@ def conclude(
         found: What was found of them before, as by the doctor.
         ignore: Codes of findings that the verdict does not count.
         friction: As of ``identify``.
+        progress: As of ``identify``.
 
     Raises:
         DataError: If a row of a log cannot be used.
@@ -504,8 +510,10 @@ def conclude(
             "dynamics is 'static', which has friction 'none' or 'viscous+coulomb' (without the "
             "viscous), but more is stated; leave it out, or set dynamics = 'full'"
         )
+    report_stage(progress, "fitting")
     with _explained(found):
         fit = with_drives(recordings, choice, wanted)
+    report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"
