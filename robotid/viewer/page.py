@@ -12,7 +12,19 @@ from robotid.pages.html import asset, scaffold
 __all__ = ["page"]
 
 _ASSETS = Path(__file__).parent / "assets"
-_SCRIPTS = "data scene masses arcs plots clock strip picking controls live start".split()
+_SCRIPTS = [
+    "data",
+    "scene",
+    "masses",
+    "arcs",
+    "plots",
+    "clock",
+    "strip",
+    "picking",
+    "controls",
+    "live",
+    "start",
+]
 
 
 def page(data: Mapping[str, Any]) -> str:
