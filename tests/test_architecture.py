@@ -16,7 +16,7 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions _typing",
+    "exceptions _text _typing",
     "findings versions _files pages",
     "_settings",
     "robot logs",

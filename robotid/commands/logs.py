@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import file_sha256
+from robotid._typing import STAGES, ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import check_locked
@@ -72,24 +73,30 @@ def survey_logs(
     return tuple(survey(entries) for entries in groups)
 
 
-def examine(job: Job) -> tuple[Finding, ...]:
+def examine(
+    job: Job, model: RobotModel | None = None, *, progress: ProgressCallback | None = None
+) -> tuple[Finding, ...]:
     """Examine the logs of a job; the findings have errors first.
 
     Args:
         job: The job. A log that cannot be read gives a finding, not an error.
+        model: Its robot; made of its URDF if None.
+        progress: Called as its two stages begin.
 
     Raises:
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
     check_ignored(job.ignore)
-    model = job.model()
+    model = model or job.model()
     refused: list[Finding] = []
 
     def refuse(entry: LogEntry, error: DataError) -> None:
         refused.append(Finding(error.code, "error", entry.path.name, str(error)))
 
+    report_stage(progress, "reading logs", STAGES[:2])
     fitted, kept = survey_logs(job, model, job.identification, job.validation, refuse=refuse)
+    report_stage(progress, "checking logs", STAGES[:2])
     return by_severity([*refused, *examine_logs(job, model, fitted, kept)])
 
 

@@ -150,7 +150,7 @@ def build_result(
             for e in identification.validation
         ],
         "warnings": [
-            {"code": f.code, "message": f.message, "where": f.where}
+            {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
             for f in identification.findings
         ],
         "wls": {
@@ -171,7 +171,8 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
         evaluation: The recording.
         name: Which parameters predict.
     """
-    return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
+    recording = evaluation.recording
+    return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,7 +391,9 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
     }
     missing = [name for name in model.layout.names if name not in stated]
     if missing:
-        raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
+        raise ModelError(
+            f"the result has no value of {listed(missing, 5)}: the URDF has changed since"
+        )
     return np.array([stated[name] for name in model.layout.names])
 
 
