@@ -207,7 +207,7 @@ def _next(found: Identification, origin: Origin) -> str:
     steps = "".join(
         f"<li><p>{escape(step.words)}</p>"
         + "".join(
-            f'<div class="copy"><pre class="command" tabindex="0">{escape(block)}</pre></div>'
+            f'<div class="copy"><pre class="command">{escape(block)}</pre></div>'
             for block in step.blocks
         )
         + "</li>\n"
