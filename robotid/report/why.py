@@ -6,7 +6,7 @@ from robotid.identification.pipeline import Identification
 from robotid.identification.torque_split import JointTorque, joint_torques
 from robotid.identification.why_pictures import why_charts
 from robotid.pages.charts import Chart, chart_html
-from robotid.pages.html import Cell, code, number, percent, table, text
+from robotid.pages.html import Cell, code, folded, number, percent, table, text
 
 __all__ = ["why_section"]
 
@@ -25,8 +25,16 @@ def why_section(found: Identification) -> str:
     shown = ", ".join(torques[0].rows.recordings)
     kind = "kept apart" if torques[0].fitted is not None else "fitted, for none was kept apart"
     points = max(100, min(_POINTS, _ALL_POINTS // len(torques)))
+    names = [e.recording.name for e in found.validation or found.fitted]
+    first = torques[0].rows.recordings[0]
+    link = f"recording {names.index(first)}" if first in names else "fitted"  # as torques_section
     joints = "".join(
-        _joint(torque, found.model.row_names.index(torque.joint), points, is_open=k == 0)
+        folded(
+            f"why-{found.model.row_names.index(torque.joint)}",
+            f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}",
+            _joint(torque, link, points),
+            is_open=k == 0,
+        )
         for k, torque in enumerate(torques)
     )
     return (
@@ -43,16 +51,14 @@ def _missed(torque: JointTorque) -> float:
     return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
 
 
-def _joint(torque: JointTorque, row: int, points: int, *, is_open: bool) -> str:
-    summary = f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}"
-    body = ""
-    if torque.used.any():
-        charts = why_charts(torque, points=points)
-        split = _chart(charts.pop("split"), "Torque in parts, stacked; shaded: rows not used")
-        small = "".join(_chart(chart, _caption(torque, name)) for name, chart in charts.items())
-        body = f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
-    opened = " open" if is_open else ""
-    return f'<details id="why-{row}"{opened}><summary>{summary}</summary>\n{body}</details>\n'
+def _joint(torque: JointTorque, link: str, points: int) -> str:
+    """Return table and charts of a joint."""
+    if not torque.used.any():
+        return ""
+    charts = why_charts(torque, link=link, points=points)
+    split = _chart(charts.pop("split"), "Torque in parts, stacked; shaded: rows not used")
+    small = "".join(_chart(chart, _caption(torque, name)) for name, chart in charts.items())
+    return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
 
 
 def _chart(chart: Chart, caption: str) -> str:

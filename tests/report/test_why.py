@@ -119,3 +119,9 @@ def test_the_residual_against_speed_is_drawn_with_its_mean(section, torques):
     )  # fmt: skip
     assert chart["x_label"] == "speed [rad/s]"
     assert x[0] >= speed.centres[0] - 1e-6
+
+
+def test_charts_over_time_share_the_cursor_of_the_torques(report):
+    linked = {chart["link"] for chart in charts(report) if chart["title"].startswith("Torque of")}
+    measured = {c["link"] for c in charts(report) if "Measured" in c["title"]}
+    assert linked == {"recording 0"} <= measured, (linked, measured)
