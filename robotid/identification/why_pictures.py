@@ -5,6 +5,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.identification.bands import REACH
 from robotid.identification.dependence import Dependence
+from robotid.identification.pictures import unused_spans
 from robotid.identification.torque_split import JointTorque
 from robotid.pages.charts import Chart, Series, broken
 
@@ -65,7 +66,7 @@ def _split(torque: JointTorque, link: str, points: int) -> Chart:
         x_label="time [s]",
         y_label=f"torque [{torque.unit}]",
         link=link,
-        spans=_unused(torque, k),
+        spans=unused_spans(torque.rows.t[k], torque.used[k]),
         height=240,
     )
 
@@ -116,10 +117,3 @@ def _first(torque: JointTorque, points: int) -> Array:
 
 def _evenly(count: int, most: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
-def _unused(torque: JointTorque, k: Array) -> tuple[tuple[float, float], ...]:
-    """Return the stretches of time whose rows are not used."""
-    t, edges = torque.rows.t[k], np.flatnonzero(np.diff(np.r_[0, ~torque.used[k], 0]))
-    last = len(t) - 1
-    return tuple((float(t[start]), float(t[min(end, last)])) for start, end in edges.reshape(-1, 2))

@@ -10,9 +10,11 @@ from robotid.pages.html import Cell, code, folded, number, percent, table, text
 
 __all__ = ["why_section"]
 
-_POINTS = 400  # of a chart
-_ALL_POINTS = 2400  # of one chart of every joint together
-_STILL = 60  # of them, in print
+_POINTS = 300  # of a chart
+_ALL_POINTS = 1800  # of one chart of every joint together
+_FEWEST_POINTS = 100
+_STILL = 30  # of them, in print
+_MOST = 12  # joints with all their charts; others have those that say something
 
 
 def why_section(found: Identification) -> str:
@@ -24,7 +26,7 @@ def why_section(found: Identification) -> str:
     torques = sorted(joint_torques(found), key=_missed, reverse=True)
     shown = ", ".join(torques[0].rows.recordings)
     kind = "kept apart" if torques[0].fitted is not None else "fitted, for none was kept apart"
-    points = max(100, min(_POINTS, _ALL_POINTS // len(torques)))
+    points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
     names = [e.recording.name for e in found.validation or found.fitted]
     first = torques[0].rows.recordings[0]
     link = f"recording {names.index(first)}" if first in names else "fitted"  # as torques_section
@@ -32,7 +34,7 @@ def why_section(found: Identification) -> str:
         folded(
             f"why-{found.model.row_names.index(torque.joint)}",
             f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}",
-            _joint(torque, link, points),
+            _joint(torque, link, points, is_full=k < _MOST),
             is_open=k == 0,
         )
         for k, torque in enumerate(torques)
@@ -51,13 +53,18 @@ def _missed(torque: JointTorque) -> float:
     return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
 
 
-def _joint(torque: JointTorque, link: str, points: int) -> str:
-    """Return table and charts of a joint."""
+def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str:
+    """Return table and charts of a joint, all or those alone that say what its residual follows."""
     if not torque.used.any():
         return ""
     charts = why_charts(torque, link=link, points=points)
     split = _chart(charts.pop("split"), "Torque in parts, stacked; shaded: rows not used")
-    small = "".join(_chart(chart, _caption(torque, name)) for name, chart in charts.items())
+    sure = {d.name for d in torque.follows if d.is_sure}
+    small = "".join(
+        _chart(chart, _caption(torque, name))
+        for name, chart in charts.items()
+        if is_full or name in sure
+    )
     return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
 
 
