@@ -2,6 +2,7 @@
 
 from html import escape
 
+from robotid.identification.dependence import LEAST
 from robotid.identification.pipeline import Identification
 from robotid.identification.torque_split import JointTorque, joint_torques
 from robotid.identification.why_pictures import why_charts
@@ -79,11 +80,14 @@ def _caption(torque: JointTorque, name: str) -> str:
             "-", "−"
         )
     (dependence,) = (d for d in torque.follows if d.name == name)
-    said = "too few stretches to tell"
-    if dependence.is_sure:
-        said = f"<strong>explains {percent(100 * (dependence.share or 0.0)).html} % of it</strong>"
-    elif dependence.share is not None:
-        said = "explains no more than chance"
+    share = percent(100 * (dependence.share or 0.0)).html
+    said = "explains nothing"
+    if dependence.share is None:
+        said = "too little was recorded to tell"
+    elif dependence.is_sure:
+        said = f"<strong>explains {share} % of its variance</strong>"
+    elif dependence.share >= LEAST:
+        said = f"explains {share} %, perhaps by chance"
     return f"Residual against {name}: {said}"
 
 
