@@ -271,7 +271,7 @@ def test_what_the_fitted_recordings_do_not_show_has_changed(rng):
     assert "something has changed since" in replace(after, fitted=before).sentence
 
 
-@pytest.mark.parametrize(("kind", "low", "high"), [("noise", 0.9, 1.0), ("slow", 0.046, 0.052)])
+@pytest.mark.parametrize(("kind", "low", "high"), [("noise", 0.9, 1.0), ("slow", 0.046, 0.07)])
 def test_filtered_noise_is_quick_and_what_is_slow_is_not(kind, low, high):
     rng, rate, cutoff, N = np.random.default_rng(0), 500.0, 10.0, 20_000
     t, segment = np.arange(N) / rate, np.arange(N) // 500
