@@ -26,7 +26,7 @@ __all__ = [
     "unused_spans",
 ]
 
-_DOTS = 1200  # of one friction chart
+_DOTS = 800  # of one friction chart
 _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
 _PIXELS = 500  # spans closer than one of so many are one

@@ -166,6 +166,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.x = x;
     this.ys = ys;
     this.halves = halves;
+    this.place.setAttribute("aria-valuemin", x.length ? x[0] : 0);
+    this.place.setAttribute("aria-valuemax", x.length ? x[x.length - 1] : 1);
     this.stack();
     if (!this.plot) return;
     this.plot.setData(this.columns(), false);
