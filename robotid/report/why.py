@@ -14,7 +14,7 @@ __all__ = ["why_section"]
 _POINTS = 300  # of a chart
 _ALL_POINTS = 1800  # of one chart of every joint together
 _FEWEST_POINTS = 100
-_STILL = 30  # of them, in print
+_STILL, _STILL_SPLIT = 30, 80  # of them, in print
 _MOST = 12  # joints with all their charts; others have those that say something
 
 
@@ -59,7 +59,8 @@ def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str
     if not torque.used.any():
         return ""
     charts = why_charts(torque, link=link, points=points)
-    split = _chart(charts.pop("split"), "Torque in parts, stacked; shaded: rows not used")
+    said = "Torque in parts, stacked; shaded: rows not used"
+    split = _chart(charts.pop("split"), said, _STILL_SPLIT)
     sure = {d.name for d in torque.follows if d.is_sure}
     small = "".join(
         _chart(chart, _caption(torque, name))
@@ -69,8 +70,8 @@ def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str
     return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
 
 
-def _chart(chart: Chart, caption: str) -> str:
-    return chart_html(chart, caption, points=2 * len(chart.x), still=_STILL)
+def _chart(chart: Chart, caption: str, still: int = _STILL) -> str:
+    return chart_html(chart, caption, points=2 * len(chart.x), still=still)
 
 
 def _caption(torque: JointTorque, name: str) -> str:

@@ -101,7 +101,7 @@ def test_the_browser_draws_what_sums_to_the_prediction(section, browser, tmp_pat
 
 
 def test_the_section_stays_small(section):
-    assert len(section) < 6 * 75_000
+    assert len(section) < 6 * 90_000
 
 
 def test_of_many_joints_the_worst_have_all_charts_and_the_others_the_split(identified, monkeypatch):
