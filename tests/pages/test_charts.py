@@ -277,3 +277,21 @@ def test_without_scripts_the_still_pictures_stand_in_the_page(browser, demo):
     with visit(browser, demo, java_script_enabled=False) as seen:
         assert seen.page.locator("figure.chart svg").first.is_visible()
         assert seen.page.locator(".explore").count() == 0
+
+
+def test_labels_of_many_series_stay_inside_the_still_picture():
+    x, names = np.arange(3.0), ("gravity", "inertia", "Coriolis", "motor inertia", "friction")
+    every = (*names, "offset", "residual", "measured")
+    series = tuple(Series(name, x, "text") for name in every)
+    html = chart_html(Chart("many", x, series, "time [s]", "torque [N m]"), "")
+    _, _, width, height = map(float, re.search(r'viewBox="([^"]*)"', html)[1].split())
+    labels = {t: (float(a), float(b)) for a, b, t in re.findall(
+        r'<text x="([\d.]+)" y="([\d.]+)">([^<]*)</text>', html)}  # fmt: skip
+    assert set(every) < set(labels)
+    for name in every:
+        place, down = labels[name]
+        assert place + 6.2 * len(name) <= width
+        assert down < height
+    assert labels["measured"][1] > labels["gravity"][1]
+    few = chart_html(Chart("few", x, series[:2], "time [s]", "torque [N m]"), "")
+    assert float(re.search(r'viewBox="([^"]*)"', few)[1].split()[3]) < height
