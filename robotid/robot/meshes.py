@@ -288,7 +288,7 @@ def _cells(V: Array, solid: Array, cell: float) -> tuple[Array, Array]:
 
 def _proper(F: Array, patch: Array) -> tuple[Array, Array]:
     """Return the triangles that are none of a line, one of those on the same three corners."""
-    F, patch = (x[(F != np.roll(F, 1, axis=1)).all(axis=1)] for x in (F, patch))
+    F, patch = (x[(np.roll(F, 1, axis=1) != F).all(axis=1)] for x in (F, patch))
     _, first = np.unique(_keys(np.sort(F, axis=1)), return_index=True)
     first.sort()
     return F[first], patch[first]

@@ -41,7 +41,7 @@ function geometry(part) {
 
 function visible(colour) { // what is almost black would be a hole in the picture
   const made = new THREE.Color(colour), hsl = made.getHSL({});
-  return hsl.l < 0.2 ? made.setHSL(hsl.h, hsl.s, 0.2) : made;
+  return hsl.l < 0.27 ? made.setHSL(hsl.h, hsl.s, 0.27) : made;
 }
 
 class Robot { // the nodes of one robot in the viewer's tree, posed by a row of a motion
@@ -117,7 +117,7 @@ const floats = data.scene.nodes.some((node) => node.kind === "free");
 // ---- light and ground ------------------------------------------------------------------------
 
 const SKIES = { light: { top: [0.93, 0.95, 0.97], low: [0.72, 0.77, 0.82], line: "#8d98a3" },
-  dark: { top: [0.13, 0.15, 0.18], low: [0.06, 0.07, 0.09], line: "#46515c" } };
+  dark: { top: [0.22, 0.25, 0.29], low: [0.11, 0.12, 0.14], line: "#46515c" } };
 const darkness = matchMedia("(prefers-color-scheme: dark)");
 const cell = data.view.cell;
 let ground = null;
