@@ -70,7 +70,7 @@ def opened(browser, page):
 
 @pytest.fixture
 def still(opened):
-    """The page with its clock stopped at the start, 7 s; loading it takes the processor a second or two."""
+    """The page with its clock stopped at the start, 7 s; loading it takes a second or two."""
     opened.page.evaluate("replay.pause(); replay.seek(7); replay.pick(null)")
     yield opened
     assert opened.errors == []
