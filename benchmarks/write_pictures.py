@@ -28,9 +28,6 @@ def main():
             seen.page.screenshot(path=HERE / "report.png")
         with visit(browser, folder / "replay.html", size=(1200, 640)) as seen:
             seen.page.wait_for_timeout(3000)  # [ms] the robot is on its way
-            for body in ("wrist_1", "wrist_2", "wrist_3"):  # their ellipsoids hide the robot
-                for box in seen.page.get_by_label(f": {body}_link").all():
-                    box.uncheck()
             seen.page.mouse.move(400, 300)
             for _ in range(8):
                 seen.page.mouse.wheel(0, -100)  # nearer

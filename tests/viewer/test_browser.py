@@ -317,6 +317,46 @@ def test_the_heat_strip_is_the_residual_over_the_noise(still):
     assert sound[2] > sound[0] + 20
 
 
+def test_links_take_the_colour_of_their_residual_frames_and_names_show_when_asked(still, ur5):
+    seen = still
+    colour = "[...replay.robot.joints[4].skins.values()].map(m => '#' + m.color.getHexString())"
+    plain = seen.page.evaluate(colour)
+    seen.page.evaluate("replay.seek(10.5)")
+    seen.page.get_by_label("links coloured by residual").check()
+    seen.page.wait_for_timeout(150)
+    tinted = seen.page.evaluate("[...replay.robot.joints[4].skins.values()][0].color.toArray()")
+    k = int(np.argmin(np.abs(T - 10.5)))
+    share = 2 * min(abs(motion(6)[1][k, 3] - FIT[k, 3]) / NOISE[3] / 6.0, 1.0)  # of the ramp
+    wanted = np.array([255, 255, 191]) + (share - 1) * (np.array([215, 25, 28]) - [255, 255, 191])
+    assert share > 1
+    np.testing.assert_allclose(255 * np.array(tinted), wanted, atol=4)
+    seen.page.get_by_label("links coloured by residual").uncheck()
+    assert seen.page.evaluate(colour) == plain
+    shown = pixels(seen)
+    seen.page.get_by_label("frames").check()
+    seen.page.get_by_label("names").check()
+    assert (np.abs(shown - pixels(seen)).max(axis=2) > 30).mean() > 0.002
+    assert seen.page.locator("#names").inner_text().split() == list(ur5.joints)
+    seen.page.get_by_label("frames").uncheck()
+    seen.page.get_by_label("names").uncheck()
+    assert seen.page.locator("#names").is_hidden()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_fault(browser, page, scheme):
+    from axe_playwright_python.sync_playwright import Axe
+
+    # axe is put in from outside, which the page's own policy forbids
+    with visit(browser, page, color_scheme=scheme, bypass_csp=True, **OPEN) as seen:
+        seen.page.evaluate("replay.pick(3)")
+        tags = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa"]}}
+        found = Axe().run(seen.page, options=tags).response
+        faults = {v["id"]: [n["html"][:200] for n in v["nodes"]][:5] for v in found["violations"]}
+        assert faults == {}
+        assert len(found["passes"]) > 10
+        assert seen.errors == []
+
+
 def test_the_address_keeps_time_joint_and_camera(browser, page, ur5):
     with visit(browser, page, **OPEN) as seen:
         seen.page.evaluate("replay.seek(9.25); replay.pick(3)")

@@ -132,6 +132,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.live = element("div", { class: "explore" }, this.keys, this.place);
     parent.append(this.live);
     this.setData(what.x, what.series.map((s) => s.y), what.series.map((s) => s.half));
+    this.move(); // says that there is no cursor yet
     all.push(this);
     sight.observe(this.place);
     this.resized = new ResizeObserver(() => this.fit());
