@@ -293,7 +293,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       series: [{}, ...series.map(({ tone: colour, kind, faint }) => ({
         stroke: () => tone(colour), width: 1.3, alpha: faint ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
-      hooks: { drawAxes: [(u) => this.paint(u)], setSelect: [(u) => this.select(u)] },
+      hooks: { draw: [() => this.move()], drawAxes: [(u) => this.paint(u)], setSelect: [(u) => this.select(u)] },
     }, this.columns(), this.place);
     this.cursor = element("div", { class: "line", hidden: "" });
     this.plot.over.append(this.cursor);

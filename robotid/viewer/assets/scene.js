@@ -125,10 +125,10 @@ let ground = null;
 function light() {
   for (const name of ["PointLightNegativeX", "PointLightPositiveX", "AmbientLight", "FillLight"])
     viewer.set_property(["Lights", name], "visible", false);
-  const sky = new THREE.HemisphereLight("#ffffff", "#8a8078", 0.55);
+  const sky = new THREE.HemisphereLight("#ffffff", "#8a8078", 0.68);
   sky.position.set(0, 0, 1);
   viewer.set_object(["Lights", "Sky"], sky);
-  for (const [name, power, ...place] of [["key", 0.5, -1, 1.2, 1], ["fill", 0.22, 1.4, 0.1, 0.6]]) {
+  for (const [name, power, ...place] of [["key", 0.58, -1, 1.2, 1], ["fill", 0.28, 1.4, 0.1, 0.6]]) {
     const lamp = new THREE.DirectionalLight("#ffffff", power); // beside the camera, wherever it is
     lamp.name = name;
     lamp.position.set(...place);
