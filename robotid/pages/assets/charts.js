@@ -132,6 +132,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.live = element("div", { class: "explore" }, this.keys, this.place);
     parent.append(this.live);
     this.setData(what.x, what.series.map((s) => s.y), what.series.map((s) => s.half));
+    this.move(); // says that there is no cursor yet
     all.push(this);
     sight.observe(this.place);
     this.resized = new ResizeObserver(() => this.fit());
@@ -294,7 +295,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       series: [{}, ...series.map(({ tone: colour, kind, faint }, i) => ({ show: !this.hidden.has(i),
         stroke: () => tone(colour), width: 1.3, alpha: faint ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
-      hooks: { drawAxes: [(u) => this.paint(u)], setSelect: [(u) => this.select(u)] },
+      hooks: { draw: [() => this.move()], drawAxes: [(u) => this.paint(u)], setSelect: [(u) => this.select(u)] },
     }, this.columns(), this.place);
     this.cursor = element("div", { class: "line", hidden: "" });
     this.plot.over.append(this.cursor);
