@@ -23,6 +23,7 @@ from robotid.commands.flags import (
     refuse_log_flags,
     source_settings,
     source_words,
+    stated_noise,
 )
 from robotid.commands.printing import print_content, print_files, print_steps, say
 from robotid.exceptions import RobotIdError, SettingsError
@@ -248,6 +249,15 @@ def _doctor(options: argparse.Namespace) -> int:
     return 1 if alarming(findings, job.ignore) else 0
 
 
+def _preview(options: argparse.Namespace) -> None:
+    from robotid.commands.preview import preview_job
+
+    if options.given:
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+    stated = {"noise": stated_noise(options), "correlation": options.correlation}
+    _show(preview_job(job_from_flags(options), options.given, **stated), options, "preview")
+
+
 def _validate(options: argparse.Namespace) -> None:
     from robotid.commands.validate import validate_result
 
@@ -319,6 +329,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "inspect": ("joints, parameters and faults of a URDF", _inspect),
     "identify": ("identify a robot: JOB.toml, or URDF LOG [LOG ...]", _identify),
     "track": ("run over a log as if live: history, step changes", _track),
+    "preview": ("what a motion will tell, before it is recorded", _preview),
     "replay": ("play a log in the browser: robot, torques, what was identified", _replay),
     "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor),
     "validate": ("measure a result's prediction on other logs", _validate),

@@ -46,7 +46,7 @@ INSIDE_FUNCTIONS = {
     "distributed": {"workers"},
     "loky": {"workers"},
     "rich": {"commands"},
-    "matplotlib": {"report", "paper"},
+    "matplotlib": {"paper"},
     "clarabel": {"estimators"},
     "scs": {"estimators"},
 }

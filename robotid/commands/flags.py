@@ -77,6 +77,13 @@ _ONLINE = tuple(
     or (flag in _LOG and not key.startswith("signals."))
 )
 _SOURCE = ("--topic", "--effort", "--stamp")
+#: Flags that a motion without torques has a use for.
+_MOTION = tuple(
+    flag
+    for flag, (key, _) in _FLAGS.items()
+    if flag in _LOG and not key.startswith(("output.", "torque.", "doctor."))
+    if flag not in ("--effort", "--torque-delay")
+)
 _VERBOSE = "print notes, too; say on stderr the stages, what is chosen, and why"
 
 
@@ -109,6 +116,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_progress(parser)
         case "doctor":
             _add_job(parser)
+        case "preview":
+            _add_preview(parser)
         case "track":
             _add_robot_and_log(parser)
             _add_out(parser, "robotid-track")
@@ -158,6 +167,23 @@ def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
         add("--joints", metavar="A,B,...", help="joints to write; default: all")
         _add_settings(parser, _SOURCE)
     _add_json(parser)
+
+
+def _add_preview(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="JOB.toml | URDF")
+    add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
+    words = "a result.json or its folder: what its logs have said, and their noise"
+    add("--given", metavar="RESULT", help=words)
+    words = "standard deviation of a joint's torque [N m or N]; may be given again; default: that "
+    words += "of RESULT, or 1 %% of the joint's largest torque"
+    add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
+    words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
+    add("--correlation", metavar="S", type=float, help=words)
+    _add_json(parser)
+    flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
+    flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help="as of identify")
+    _add_settings(flags, _MOTION)
 
 
 def _add_payload(parser: argparse.ArgumentParser) -> None:
@@ -240,6 +266,18 @@ def _add_work(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--scheduler", metavar="ADDRESS", help=words)
     words = "go on from where an interrupted run in --out ended"
     flags.add_argument("--resume", action="store_true", help=words)
+
+
+def stated_noise(options: argparse.Namespace) -> dict[str, float]:
+    """Return the noise that was stated, by joint [N m or N].
+
+    Args:
+        options: The flags of the command "preview".
+
+    Raises:
+        SettingsError: If a word is not JOINT=NUMBER.
+    """
+    return _pairs(options.noise, "--noise")
 
 
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:

@@ -1,16 +1,18 @@
 """The logs of a job: each opened once, examined, and told from others by what made them."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from robotid._files import file_sha256
 from robotid._typing import STAGES, ProgressCallback, report_stage
-from robotid.commands.job import Job, LogEntry
+from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import check_locked
 from robotid.exceptions import DataError
+from robotid.export.result import load_result
 from robotid.findings import Finding, by_severity
 from robotid.identification.survey import SurveyedLog, survey_log
 from robotid.identification.verdict import check_ignored
@@ -19,7 +21,7 @@ from robotid.logs.table import Table
 from robotid.robot.model import RobotModel
 from robotid.versions import code_versions
 
-__all__ = ["checkpoint_inputs", "examine", "examine_logs", "survey_logs"]
+__all__ = ["checkpoint_inputs", "examine", "examine_logs", "job_of_result", "survey_logs"]
 
 _PIECES = 8  # pieces that the rows in memory are cut into: smoothing a piece takes some room
 _SHORTEST = 256  # rows of a piece
@@ -123,6 +125,32 @@ def examine_logs(
             findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
     first, second = ([look for log in logs for look in log.looks] for logs in (fitted, kept))
     return (*findings, *diagnose(model, first, second, job.signals))
+
+
+def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
+    """Return a job with the settings of a result, and the logs that this one fitted.
+
+    Args:
+        job: The robot and logs of their own.
+        path: A result.json, or its folder.
+        advice: What to do if a log is gone.
+
+    Raises:
+        DataError: If a log that was fitted is gone or was changed.
+        SettingsError: If the settings in the result are not usable.
+    """
+    result = load_result(path).content
+    settings = {key: value for key, value in result["settings"].items() if value != {}}
+    stated = job_from_settings(settings, Path(path).name, Path())
+    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    for entry in stated.identification:
+        if not entry.path.exists() or file_sha256(entry.path) not in hashes:
+            raise DataError(
+                f"{entry.path}, which {path} was fitted to, is not there any more or was changed; "
+                f"{advice}"
+            )
+    wanted = replace(stated, urdf=job.urdf, identification=job.identification)
+    return wanted, list(stated.identification)
 
 
 def checkpoint_inputs(job: Job) -> dict[str, Any]:
