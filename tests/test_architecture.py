@@ -18,7 +18,7 @@ LINES = [
     "",
     "exceptions _text _typing",
     "findings versions _files pages",
-    "_settings",
+    "_settings pages",
     "robot logs",
     "regressor",
     "estimators simulation workers",
