@@ -619,7 +619,7 @@ def _explained(found: Sequence[Finding]) -> Iterator[None]:
         yield
     except (DataError, NotConvergedError, RankDeficientError) as error:
         for finding in found:
-            if finding.severity != "note":
+            if finding.severity != "note" and finding.message != str(error):
                 error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
         raise
 

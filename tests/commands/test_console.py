@@ -164,3 +164,39 @@ def test_inspect_shows_base_parameters_where_they_are_asked_for(tmp_path, capsys
     long = capsys.readouterr().out
     assert long.index("error: ") < long.index("base parameters, inertial")
     assert len(long.splitlines()) > len(short.splitlines()) + 3
+
+
+def test_logs_of_one_name_are_named_by_their_paths(arm_logs, tmp_path, capsys):
+    other = tmp_path / "fit.csv"
+    other.write_bytes((arm_logs / "keep.csv").read_bytes())
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), str(other), "--estimator", "wls"]
+    words += ["--friction", "viscous", "--no-report", "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(rf"fitted: {arm_logs}/fit.csv 0-7.99 s, {other} 0-7.99 s", said)
+
+
+def test_compare_keeps_columns_apart_and_files_of_one_name_too(arm_logs, tmp_path, capsys):
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--validate", str(arm_logs / "keep.csv")]
+    for cutoff in ("8", "9"):
+        out = ["--cutoff", cutoff, "--estimator", "wls", "--no-report", "--friction", "viscous"]
+        assert main([*words, *out, "--out", str(tmp_path / cutoff)]) == 0
+    capsys.readouterr()
+    results = [str(tmp_path / cutoff / "result.json") for cutoff in ("8", "9")]
+    assert main(["compare", *results]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[-1] for line in lines[:2]] == results
+    assert "not fitted: keep.csv 0-7.99 s, error %" in lines
+    contents = [json.loads(Path(result).read_text()) for result in results]
+    by_name = [{e["name"]: e for e in content["base_parameters"]} for content in contents]
+    for name, entry in by_name[0].items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        _, first, second, *unit, difference = line.split()
+        assert float(first) == pytest.approx(entry["value"], abs=0.06 * entry["std_error"])
+        found = by_name[1][name]
+        assert float(second) == pytest.approx(found["value"], abs=0.06 * found["std_error"])
+        assert " ".join(unit) == entry["unit"]
+        error = np.hypot(entry["std_error"], found["std_error"])
+        assert float(difference) == pytest.approx(
+            (found["value"] - entry["value"]) / error, abs=0.06
+        )
