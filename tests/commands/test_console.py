@@ -20,6 +20,7 @@ from helpers.synthetic import exact_log, truth
 from robotid._typing import STAGES
 from robotid.cli import main
 from robotid.commands.console import terminal_progress
+from robotid.commands.printing import print_content
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -200,3 +201,36 @@ def test_compare_keeps_columns_apart_and_files_of_one_name_too(arm_logs, tmp_pat
         assert float(difference) == pytest.approx(
             (found["value"] - entry["value"]) / error, abs=0.06
         )
+
+
+def finding(joint, code, share, severity="warning"):
+    message = f"run.csv: {share:g} % of {joint}'s torque is odd"
+    evidence = {"share": share / 100}
+    return {"code": code, "severity": severity, "where": f"run.csv: {joint}", "message": message,
+            "evidence": evidence}  # fmt: skip
+
+
+def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
+    joints = ["arm_1", "arm_6", "arm_7"]
+    findings = [
+        *(finding(joint, "stepped", 20) for joint in ("arm_6", "arm_7")),
+        *(finding(joint, "odd", share) for joint, share in (("arm_6", 37), ("arm_7", 68))),
+        finding("arm_1", "noise", 1, "note"),
+    ]
+    content = {"findings": findings, "joints": joints}
+    print_content("doctor", content)
+    assert capsys.readouterr().out.splitlines() == [
+        "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
+        "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
+        "4 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
+    ]
+    findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
+    print_content("doctor", content, is_verbose=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
+    assert lines[-2:] == [
+        "note: noise: run.csv: 1 % of arm_1's torque is odd",
+        "6 findings, 4 causes; worst: arm_1",
+    ]
+    print_content("doctor", {"findings": [], "joints": joints})
+    assert capsys.readouterr().out == "nothing was found\n"
