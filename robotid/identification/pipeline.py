@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid._settings import Settings
-from robotid._typing import Array
+from robotid._typing import Array, ProgressCallback, report_stage
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
 from robotid.doctor.urdf_inertials import impossible_inertials
@@ -48,6 +48,7 @@ from robotid.identification.standard_errors import (
     Redraws,
     StandardErrors,
     measured_errors,
+    standard_of,
     with_wls_errors,
 )
 from robotid.identification.summary import (
@@ -516,6 +517,7 @@ def identify(
     friction: str | Mapping[str, str] = AUTO,
     doctor: bool = True,
     ignore: Sequence[str] = (),
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters from motion logs, as the command line does.
 
@@ -531,6 +533,7 @@ def identify(
             ``wanted_families``: "auto" has it chosen.
         doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
         ignore: Codes of errors and doubts that you know better.
+        progress: Called as each of ``STAGES`` begins: its name, stages done, in all, "stages".
 
     Raises:
         DataError: If a log cannot be read, does not fit the model or is too short.
@@ -541,6 +544,7 @@ def identify(
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
+    report_stage(progress, "reading logs")
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic)
@@ -549,9 +553,10 @@ def identify(
     if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (first, second))
+    report_stage(progress, "checking logs")
     found = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    return conclude(recordings, choice, found, ignore, friction=friction)
+    return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
 
 
 def conclude(
@@ -561,6 +566,7 @@ def conclude(
     ignore: Sequence[str] = (),
     *,
     friction: str | Mapping[str, str] = AUTO,
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters from recordings, in memory or not, and judge the result.
 
@@ -570,6 +576,7 @@ def conclude(
         found: What was found of them before, as by the doctor.
         ignore: Codes of findings that the verdict does not count.
         friction: As of ``identify``.
+        progress: As of ``identify``.
 
     Raises:
         DataError: If a row of a log cannot be used.
@@ -582,8 +589,10 @@ def conclude(
             "dynamics is 'static', which has friction 'none' or 'viscous+coulomb' (without the "
             "viscous), but more is stated; leave it out, or set dynamics = 'full'"
         )
+    report_stage(progress, "fitting")
     with _explained(found):
         fit = with_drives(recordings, choice, wanted)
+    report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"
@@ -674,7 +683,7 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
     ground = _ground(recordings, choice)
     prior, spread = ground.before.pi, ground.before.spread
     estimate, wls, errors = _measured(ground, choice)
-    standard, covariance = _standard(estimate, mapping, prior, spread)
+    standard, covariance = standard_of(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     if model.layout.remembering:  # what is written predicts the torque by its own load
         model = model.with_reference(standard)
@@ -722,7 +731,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     for step in range(_MOST_LOADS):
         ground = _ground(recordings, choice)
         before = ground.before
-        standard, _ = _standard(ground.rough, mapping, before.pi, before.spread)
+        standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
         moved = standard - recordings.model.carried_by
         if step >= _DAMPED:  # friction that takes a large share of the load may overshoot
             standard = standard - 0.5 * moved
@@ -731,7 +740,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         if (loads[0] <= _SETTLED * loads[1]).all():
             if make_estimator(choice, model, mapping, before).reads == "factors":
                 estimate, _, _ = _run(choice, ground)
-                standard, _ = _standard(estimate, mapping, before.pi, before.spread)
+                standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
             return recordings.with_model(model.with_reference(standard))
     raise NotConvergedError(
         f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
@@ -832,17 +841,3 @@ def _run(
         estimate = with_wls_errors(estimate, ground.rough)
     fit = consistent_fit(choice, model, mapping, before)
     return fit.project(estimate), fit, estimator.weighing
-
-
-def _standard(
-    estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
-) -> tuple[Array, Array]:
-    """Return the standard parameters and their covariance, prior included."""
-    if estimate.names == mapping.names:
-        return estimate.theta, estimate.covariance
-    G, K = mapping.gain(spread), mapping.K
-    before = np.diag(spread**2)
-    # what the data leave open (infinite variance) stays as wide as the prior has it
-    base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
-    covariance = before - G @ K @ before + G @ base @ G.T
-    return mapping.to_standard(estimate.theta, prior, spread), covariance

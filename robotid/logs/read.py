@@ -46,6 +46,7 @@ def read_log(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    is_motion: bool = False,
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
 
@@ -62,6 +63,7 @@ def read_log(
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
         transmissions: The motors and gears, where the file has columns of motors.
+        is_motion: Whether it is read for its motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -70,7 +72,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions,
+        source=source, transmissions=transmissions, is_motion=is_motion,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -78,7 +80,11 @@ def read_log(
 
 
 def read_logs(
-    given: Readable | Sequence[Readable], joints: Sequence[str], *, prismatic: Collection[str] = ()
+    given: Readable | Sequence[Readable],
+    joints: Sequence[str],
+    *,
+    prismatic: Collection[str] = (),
+    is_motion: bool = False,
 ) -> tuple[Log, ...]:
     """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
 
@@ -86,6 +92,7 @@ def read_logs(
         given: A log, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
         prismatic: Names of joints that slide; the others turn.
+        is_motion: Whether they are read for their motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If it is something else, or does not hold what is wanted.
@@ -98,7 +105,10 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        log if isinstance(log, Log) else read_log(log, joints, prismatic=prismatic) for log in logs
+        log
+        if isinstance(log, Log)
+        else read_log(log, joints, prismatic=prismatic, is_motion=is_motion)
+        for log in logs
     )
 
 
@@ -152,7 +162,8 @@ class LogLayout:
             for kind, names in self.columns.items()
         }
         slides = np.isin(self.joints, self.prismatic)
-        values["tau"] = values["tau"] * np.array(self.factors)
+        if "tau" in values:
+            values["tau"] = values["tau"] * np.array(self.factors)
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
@@ -171,7 +182,7 @@ class LogLayout:
             q=values["q"],
             v=values.get("dq"),
             a=values.get("ddq"),
-            tau=values["tau"],
+            tau=values.get("tau", np.zeros_like(values["q"])),
             joints=self.joints,
             path=self.path,
             notes=self.notes,
@@ -204,6 +215,7 @@ def lay_out(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    is_motion: bool = False,
 ) -> tuple[LogLayout, Table]:
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
@@ -216,6 +228,8 @@ def lay_out(
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
         transmissions: As of ``read_log``.
+        is_motion: Whether the file is read for its motion alone: its torques, if it has any, are
+            ignored, and those of the log are 0.
 
     Raises:
         DataError: If the file does not hold what is wanted.
@@ -234,14 +248,15 @@ def lay_out(
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     finder = _Finder(
-        where, opened.names, stated, tuple(joints), gains or {}, source, gears, [*opened.notes]
-    )
+        where, opened.names, stated, tuple(joints), gains or {}, source, gears, is_motion,
+        [*opened.notes],
+    )  # fmt: skip
     found = finder.find_all()  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
         columns=found,
-        factors=finder.factors(found["tau"]),
+        factors=finder.factors(found.get("tau", [])),
         units=units,
         prismatic=tuple(prismatic),
         source=source,
@@ -284,20 +299,25 @@ class _Finder:
     gains: Mapping[str, float]
     source: LogSource
     gears: tuple[Transmission, ...]
+    is_motion: bool = False
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
     def find_all(self) -> dict[str, list[str]]:
-        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete."""
+        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete.
+
+        Of a motion there is no tau.
+        """
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
             "q": [column or self._missing(*at) for at, column in self._each("q")],
-            "tau": [
+        }
+        if not self.is_motion:
+            found["tau"] = [
                 self._find_torque(self.joints[j], is_motor)
                 for j, is_motor in enumerate(self.of_motors("tau"))
-            ],
-        }
+            ]
         found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
         extra = [name for name in self.names if name not in self.seen]
         if extra:
@@ -516,7 +536,8 @@ class _Finder:
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has a position, and a torque or a current, of a joint."""
-        return self._has("q", joint) and (self._has("tau", joint) or self._has("current", joint))
+        has_torque = self._has("tau", joint) or self._has("current", joint)
+        return self._has("q", joint) and (self.is_motion or has_torque)
 
     def _has(self, kind: str, joint: str) -> bool:
         """Return whether the file has a quantity of a joint."""

@@ -20,7 +20,7 @@ DETERMINED = {
     "bound": "at its bound",
 }
 _FIRST = 3  # reasons of the verdict that are seen at once
-_ROWS = 12  # joints whose errors are seen at once
+_ROWS = 10  # joints whose errors are seen at once
 _WIDEST = 150.0  # [%] at the end of the scale; what is beyond stands there
 _TICKS = (1.0, 5.0, GOOD, POOR, 100.0, _WIDEST)  # [%] of the scale
 #: Other predictions of the same torque, each with its mark: a path about (0, 9) and its style.

@@ -11,16 +11,18 @@ from robotid.identification.pipeline import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.pages.charts import chart_html
 from robotid.pages.html import code, folded, percent
+from robotid.report.summary_screen import joint_errors
 
 __all__ = ["torques_section"]
 
 _ROWS = 24_000  # of all charts together: about half a MB
 _LONGEST = 2000  # rows of one chart
+_OPEN = 6  # joints that are open at most
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 
 
 def torques_section(found: Identification) -> str:
-    """Return torques and residuals over time; the joints that are not good are open.
+    """Return torques and residuals over time; joints that are not good are open, the worst few.
 
     Args:
         found: The identification.
@@ -29,7 +31,7 @@ def torques_section(found: Identification) -> str:
     shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
     points = min(_LONGEST, max(200, _ROWS // (2 * model.n_rows * len(shown))))
     bands = [found.band(evaluation) for evaluation in shown]
-    parts = [_said(found, shown, evaluations[len(shown) :])]
+    parts, worst = [_said(found, shown, evaluations[len(shown) :])], [*joint_errors(found)][:_OPEN]
     for row, name in enumerate(model.row_names):
         verdict = found.verdict.joints.get(name)
         said = "" if verdict is None else verdict_cell(name, asdict(verdict))
@@ -38,7 +40,7 @@ def torques_section(found: Identification) -> str:
             for k, (evaluation, band) in enumerate(zip(shown, bands, strict=True))
         )
         summary = f"<strong>{code(name).html}</strong> {escape(said)}"
-        is_bad = said.startswith(("poor", "usable"))
+        is_bad = said.startswith(("poor", "usable")) and name in worst
         parts.append(folded(f"torque-{row}", summary, charts, is_open=is_bad))
     return "".join(parts)
 

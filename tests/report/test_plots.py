@@ -1,6 +1,9 @@
 """The report's charts: the data in the page against the series they claim."""
 
+import pickle
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -153,6 +156,20 @@ def test_singular_values_are_those_of_the_regressor(report, identified):
     np.testing.assert_allclose(what["x"], np.arange(1, len(values) + 1), atol=1e-6)
     np.testing.assert_allclose(what["series"][0]["y"], values, rtol=1e-3)
     assert identified.wls.rank == len(values)
+
+
+def test_a_report_needs_no_matplotlib(identified, tmp_path):
+    (tmp_path / "found.pickle").write_bytes(pickle.dumps(identified))
+    code = (
+        "import pickle, sys\nfrom pathlib import Path\nsys.modules['matplotlib'] = None\n"
+        "from robotid.report.document import write_report\n"
+        "found = pickle.loads(Path('found.pickle').read_bytes())\n"
+        "write_report(found, 'report.html')"
+    )
+    words = [sys.executable, "-c", code]
+    run = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert '<figure class="chart"' in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_correlations_are_drawn_in_their_cell_with_their_sign_and_strength(report, identified):

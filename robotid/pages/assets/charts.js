@@ -151,6 +151,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       { type: "button", tabindex: -1, "aria-pressed": true }, swatch, series.label, value);
     button.onclick = () => this.toggle(i);
     this.keys.append(button);
+    if (series.half) value.className = "wide";
     return value;
   }
 
@@ -403,7 +404,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.index = shown ? this.near(x) : -1;
     this.at.textContent = shown ? this.where(this.x[this.index]) : "";
     this.values.forEach((value, i) => {
-      value.textContent = shown ? words(this.ys[i][this.index]) : "";
+      value.textContent = shown ? this.value(i) : "";
     });
     const said = this.what.series.map((s, i) => `${s.label} ${this.values[i].textContent}`);
     this.place.setAttribute("aria-valuenow", shown ? this.x[this.index] : 0);
@@ -415,6 +416,11 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     if (!this.cursor.hidden) {
       this.cursor.style.transform = `translateX(${this.plot.valToPos(x, "x")}px)`;
     }
+  }
+
+  value(i) { // of a series under the cursor, with half the width of its band
+    const y = this.ys[i][this.index], half = this.halves[i] && this.halves[i][this.index];
+    return `${words(y)}${Number.isFinite(y) && Number.isFinite(half) ? ` ± ${words(half, 2)}` : ""}`;
   }
 
   where(x) { // an x in words
