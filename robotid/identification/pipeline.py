@@ -20,6 +20,7 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.estimators.estimator import Weighing
 from robotid.exceptions import (
     DataError,
+    ModelError,
     NotConvergedError,
     RankDeficientError,
     SettingsError,
@@ -523,9 +524,9 @@ def identify(
 
     Args:
         model: The robot; or the path of its URDF, all of whose joints move.
-        logs: Recordings to fit: a ``Log`` of the model's joints in its order, the path of a file,
-            a DataFrame with the columns of such a file, or several of these. Files are read
-            whole, as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
+        logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
+            DataFrame with the columns of such a file, or several of these. Files are read whole,
+            as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
         validation: Recordings kept apart to measure the prediction with, likewise.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
@@ -538,6 +539,7 @@ def identify(
 
     Raises:
         DataError: If a log cannot be read, does not fit the model or is too short.
+        ModelError: If the model is no model, nor the path of a URDF that can be used.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
@@ -546,7 +548,11 @@ def identify(
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")
-    model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
+    if not isinstance(model, RobotModel):
+        if not isinstance(model, str | Path):
+            kind = type(model).__name__
+            raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
+        model = RobotModel.from_urdf(model)
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic)
         for some in (logs, validation)
