@@ -12,7 +12,7 @@ from robotid.robot.drives import Bristles, DriveMotion, DriveTerm, Lag, LoadFric
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["RobotPlant", "rk4"]
+__all__ = ["Friction", "RobotPlant", "rk4"]
 
 _ITERATIONS = 200  # of the load and its friction, which shrink by the size of the parameter
 _SETTLED = 1e-12  # relative change of the load that ends them
@@ -24,13 +24,23 @@ class _Group:
     """Drives that have one term in common."""
 
     term: DriveTerm
-    drives: Array  # their numbers, shape (k,), int
+    drives: Array | slice  # their k numbers
     theta: Array  # its parameters, shape (k,)
     states: slice  # their places among the states of bristles; empty without any
+    none: Array  # zeros, shape (k,)
+    one: Array  # ones, shape (k,)
+
+    def torque(self, angle: Array, w: Array) -> Array:
+        """Return what it adds, for positive direction and unit load, shape (k,)."""
+        d = self.drives
+        column = self.term.column(
+            DriveMotion(angle[d], w[d], self.none, self.one, self.one, self.none)
+        )
+        return self.theta * column
 
 
 @dataclass(frozen=True)
-class _Friction:
+class Friction:
     """The torque of drives that move, ``along * sign(w) + rest``, all of shape (d,).
 
     Beside it ``loaded * sign(w)`` times the size of the load of each.
@@ -71,11 +81,15 @@ class RobotPlant:
         self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
         self._groups = _grouped(model, pi)
         self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
-        self._is_loaded = any(isinstance(g.term, LoadFriction) for g in self._groups)
+        self.is_loaded = any(isinstance(g.term, LoadFriction) for g in self._groups)
         G, A = model.velocity_map, self.armature
         # joints that are Pinocchio's own, each with a rotor of its own: its ABA does it all
-        self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(A, np.diag(A.diagonal()))
-        self._is_angle = model.pin_model.nq == model.pin_model.nv and not model.position_offset.any()
+        self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
+            A, np.diag(A.diagonal())
+        )
+        self._is_angle = (
+            model.pin_model.nq == model.pin_model.nv and not model.position_offset.any()
+        )
         self._driven = pin.Model(self._bodies.pin_model)
         if self._is_plain:
             self._driven.armature = A.diagonal().copy()
@@ -101,10 +115,7 @@ class RobotPlant:
             v: Joint velocities, shape (n,) [rad/s or m/s].
         """
         rigid = self.bodies_torque(q, v, 0.0 * v)
-        F, w = self.friction(q, v), self.ratios @ v
-        along = F.along + F.loaded * np.abs(self._share @ rigid)
-        torque: Array = rigid + self.ratios.T @ (along * np.tanh(w / _SIGN_SPEED) + F.rest)
-        return torque
+        return rigid + self.friction_torque(self.friction(q, v), v, rigid)
 
     def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the torque that the bodies alone ask for, shape (n,) [N m or N].
@@ -118,7 +129,7 @@ class RobotPlant:
         rigid: Array = G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a)
         return rigid
 
-    def friction(self, q: Array, v: Array, z: Array | None = None) -> _Friction:
+    def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
         """Return the torque of the drives but for their inertia and the sign of their speed.
 
         Args:
@@ -128,21 +139,43 @@ class RobotPlant:
         """
         angle, w = self.ratios @ q, self.ratios @ v
         along, rest, loaded = np.zeros((3, len(w)))
-        one, none = np.ones_like(w), np.zeros_like(w)
         for group in self._groups:
-            d = group.drives
-            if z is not None and isinstance(group.term, Bristles):
-                rest[d] += group.theta * z[group.states]
-                continue
-            moving = DriveMotion(angle[d], w[d], none[d], one[d], one[d], none[d])
-            torque = group.theta * group.term.column(moving)
-            if isinstance(group.term, LoadFriction):
-                loaded[d] += torque
-            elif group.term.follows_direction:
-                along[d] += torque
+            term = group.term
+            if z is not None and isinstance(term, Bristles):
+                rest[group.drives] += group.theta * z[group.states]
+            elif isinstance(term, LoadFriction):
+                loaded[group.drives] += group.torque(angle, w)
+            elif term.follows_direction:
+                along[group.drives] += group.torque(angle, w)
             else:
-                rest[d] += torque
-        return _Friction(along, rest, loaded)
+                rest[group.drives] += group.torque(angle, w)
+        return Friction(along, rest, loaded)
+
+    def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
+        """Return the torque of the drives but for their inertia, shape (n,) [N m or N].
+
+        Args:
+            F: As of ``friction``.
+            v: As of ``friction``.
+            load: Torque of the bodies, shape (n,) [N m or N].
+        """
+        along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
+        torque: Array = self.ratios.T @ (along * np.tanh(self.ratios @ v / _SIGN_SPEED) + F.rest)
+        return torque
+
+    def chord(self, F: Friction, v: Array, load: Array) -> Array:
+        """Return the friction that follows the sign of the speed, over the speed, shape (n, n).
+
+        Args:
+            F: As of ``friction``.
+            v: As of ``friction``.
+            load: As of ``friction_torque``.
+        """
+        along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
+        x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
+        slope = np.maximum(along, 0.0) * np.tanh(x) / (x * _SIGN_SPEED)
+        over: Array = (self.ratios.T * slope) @ self.ratios
+        return over
 
     def taking_up(self, v: Array) -> tuple[Array, Array]:
         """Return how presliding is taken up, dz/dt = r (g sign(w) - z): r [1/s], g sign(w).
@@ -160,14 +193,14 @@ class RobotPlant:
                 end[group.states] = np.sign(speed) * level
         return rate, end
 
-    def acceleration(self, q: Array, v: Array, u: Array, z: Array | None = None) -> Array:
+    def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
         """Return the acceleration of a torque, D(q)^-1 (u - C(q, v)) [rad/s^2 or m/s^2], as q.
 
         Args:
             q: Joint coordinates, shape (n,), or (R, n) for R robots [rad or m].
             v: Joint velocities, shape as q [rad/s or m/s].
             u: Torque, shape as q [N m or N].
-            z: As of ``friction``, of one robot.
+            F: Friction of one robot, if it is known.
 
         Raises:
             NotConvergedError: If friction that grows with the load would hold any load.
@@ -177,11 +210,11 @@ class RobotPlant:
         """
         if q.ndim == 2:
             return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
-        F = self.friction(q, v, z)
+        F = self.friction(q, v) if F is None else F
         sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
         free = u - self.ratios.T @ (F.along * sign + F.rest)
         a = self.free_acceleration(q, v, free)
-        return self._loaded(q, free, a, F.loaded * sign) if self._is_loaded else a
+        return self._loaded(q, free, a, F.loaded * sign) if self.is_loaded else a
 
     def free_acceleration(self, q: Array, v: Array, tau: Array, *, rotors: bool = True) -> Array:
         """Return the acceleration of bodies and rotors that a torque leaves, shape (n,).
@@ -236,9 +269,19 @@ def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
             terms.setdefault(term, []).append(k)
     groups, states = [], 0
     for term, numbers in terms.items():
-        drives = np.array([model.layout.drive_parameters[k][0] for k in numbers])
+        drives = [model.layout.drive_parameters[k][0] for k in numbers]
+        is_all = drives == list(range(len(model.layout.drives)))
         more = len(numbers) if isinstance(term, Bristles) else 0
-        groups.append(_Group(term, drives, theta[numbers], slice(states, states + more)))
+        groups.append(
+            _Group(
+                term,
+                slice(None) if is_all else np.array(drives),
+                theta[numbers],
+                slice(states, states + more),
+                np.zeros(len(numbers)),
+                np.ones(len(numbers)),
+            )
+        )
         states += more
     return tuple(groups)
 
