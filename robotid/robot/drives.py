@@ -92,6 +92,7 @@ class DriveTerm:
         preference: How much it is favoured as the name of a base parameter [-].
         usual: From where to where it usually lies, for simulated robots.
         dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
+        part: What it counts as where a torque is split: "friction", "spring" and the like.
     """
 
     seen: tuple[float, float] = _ANYWHERE
@@ -109,6 +110,7 @@ class DriveTerm:
     preference: ClassVar[float] = 1.0
     usual: ClassVar[tuple[float, float]] = (0.2, 0.9)
     dynamics: ClassVar[str | None] = None
+    part: ClassVar[str] = "friction"
 
     @property
     def name(self) -> str:
@@ -149,6 +151,7 @@ class Armature(DriveTerm):
     is_friction = False
     preference = 0.3
     usual = (0.1, 0.5)
+    part = "motor inertia"
 
     def _column(self, motion: DriveMotion) -> Array:
         return motion.a
@@ -190,6 +193,7 @@ class Offset(DriveTerm):
     is_shared = False
     is_friction = False
     usual = (-0.3, 0.3)
+    part = "offset"
 
     def _column(self, motion: DriveMotion) -> Array:
         return np.ones_like(motion.v)
@@ -322,6 +326,7 @@ class Harmonic(DriveTerm):
 
     is_shared = False
     guards = "q"
+    part = "ripple"
 
     @property
     def name(self) -> str:
@@ -436,6 +441,7 @@ class Spring(DriveTerm):
     is_shared = False
     is_friction = True
     guards = "q"
+    part = "spring"
 
     def _column(self, motion: DriveMotion) -> Array:
         return motion.q
@@ -452,6 +458,7 @@ class Hat(DriveTerm):
 
     is_shared = False
     guards = "q"
+    part = "spring"
 
     @property
     def name(self) -> str:
@@ -481,6 +488,7 @@ class Counterbalance(DriveTerm):
     is_nonnegative = True
     is_shared = False
     usual = (50.0, 90.0)
+    part = "spring"
 
     def _column(self, motion: DriveMotion) -> Array:
         turned = motion.q - self.angle
@@ -499,6 +507,7 @@ class Lag(DriveTerm):
     remembers = True
     is_friction = True
     usual = (0.005, 0.02)
+    part = "delay"
 
     def _column(self, motion: DriveMotion) -> Array:
         return -motion.rate
