@@ -13,7 +13,7 @@ from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
 from robotid.logs.data import Log
-from robotid.logs.read import LogLayout, lay_out, read_log
+from robotid.logs.read import LogLayout, lay_out, read_log, read_motion
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
@@ -265,6 +265,18 @@ class Job(Settings):
             DataError: If the file cannot be used.
         """
         return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
+
+    def read_motion(self, path: Path, model: "RobotModel") -> Log:
+        """Return the motion in a file, of the model's joints in its order; it has no torques.
+
+        Args:
+            path: A log, or a designed motion.
+            model: The job's robot.
+
+        Raises:
+            DataError: If the file cannot be used.
+        """
+        return read_motion(path, **self._reading(model))
 
     def lay_out(self, entry: LogEntry, model: "RobotModel") -> tuple[LogLayout, Table]:
         """Return which columns of a log's file are read, before any is, and the opened file.

@@ -109,6 +109,46 @@ def _no_log(thing: object) -> DataError:
     )
 
 
+def read_motion(
+    path: str | Path,
+    joints: Sequence[str],
+    *,
+    gains: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: LogUnits = _SI,
+    prismatic: Collection[str] = (),
+    source: LogSource = _WHOLE,
+    transmissions: Sequence[Transmission] = (),
+) -> Log:
+    """Return the motion in a file, of a log or of a design, which needs no torques.
+
+    Args:
+        path: As of ``read_log``.
+        joints: As of ``read_log``.
+        gains: As of ``read_log``; no current is read.
+        columns: As of ``read_log``.
+        units: As of ``read_log``.
+        prismatic: As of ``read_log``.
+        source: As of ``read_log``.
+        transmissions: As of ``read_log``.
+
+    Returns:
+        The motion, with torques of 0.
+
+    Raises:
+        DataError: If the file does not hold what is wanted, or looks like other units.
+        SettingsError: If columns or the source name what is not read.
+        MissingDependencyError: If a package that reads the file is not installed.
+    """
+    layout, table = lay_out(
+        path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
+        source=source, transmissions=transmissions, has_torque=False,
+    )  # fmt: skip
+    log = layout.to_log(table.read(layout.wanted))
+    check_units(log, units, prismatic)
+    return log
+
+
 @dataclass(frozen=True)
 class LogLayout:
     """Which columns of a file make up a log, and how."""
@@ -152,7 +192,8 @@ class LogLayout:
             for kind, names in self.columns.items()
         }
         slides = np.isin(self.joints, self.prismatic)
-        values["tau"] = values["tau"] * np.array(self.factors)
+        torque = values.get("tau", np.zeros_like(values["q"]))  # a motion has none
+        values["tau"] = torque * np.array(self.factors)
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
@@ -204,6 +245,7 @@ def lay_out(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    has_torque: bool = True,
 ) -> tuple[LogLayout, Table]:
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
@@ -216,6 +258,7 @@ def lay_out(
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
         transmissions: As of ``read_log``.
+        has_torque: Whether torques are wanted.
 
     Raises:
         DataError: If the file does not hold what is wanted.
@@ -236,12 +279,12 @@ def lay_out(
     finder = _Finder(
         where, opened.names, stated, tuple(joints), gains or {}, source, gears, [*opened.notes]
     )
-    found = finder.find_all()  # names of columns by kind
+    found = finder.find_all(has_torque=has_torque)  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
         columns=found,
-        factors=finder.factors(found["tau"]),
+        factors=finder.factors(found.get("tau", [""] * len(joints))),
         units=units,
         prismatic=tuple(prismatic),
         source=source,
@@ -287,17 +330,18 @@ class _Finder:
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
-    def find_all(self) -> dict[str, list[str]]:
+    def find_all(self, *, has_torque: bool) -> dict[str, list[str]]:
         """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete."""
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
             "q": [column or self._missing(*at) for at, column in self._each("q")],
-            "tau": [
+        }
+        if has_torque:
+            found["tau"] = [
                 self._find_torque(self.joints[j], is_motor)
                 for j, is_motor in enumerate(self.of_motors("tau"))
-            ],
-        }
+            ]
         found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
         extra = [name for name in self.names if name not in self.seen]
         if extra:

@@ -278,24 +278,40 @@ def by_joint(value: PerJoint | None, joints: Sequence[str], name: str, other: fl
     return np.array([float(value.get(joint, other)) for joint in joints])
 
 
-def read_simulation(path: str | Path) -> tuple[Simulation, dict[str, Any]]:
+def read_simulation(
+    path: str | Path | None, given: Mapping[str, Any]
+) -> tuple[Simulation, dict[str, Any]]:
     """Return the settings in a TOML file, and its table of further drive terms by joint.
 
     Args:
-        path: The file; ``drives`` in it is that of a job file.
+        path: The file; ``drives`` in it is that of a job file. None: all is as usual.
+        given: Settings that stand over those of the file, in its shape.
 
     Raises:
         SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
     """
-    source = Path(path)
-    if not source.is_file():
-        raise SettingsError(missing_file(source, "file of a plant"))
+    table: dict[str, Any] = {}
+    if path is not None:
+        if not Path(path).is_file():
+            raise SettingsError(missing_file(Path(path), "file of a plant"))
+        try:
+            table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        except (ValueError, RecursionError) as error:
+            raise SettingsError(f"{Path(path).name} is not valid TOML: {error}") from error
+    where = "command line" if path is None else Path(path).name
+    schema = Simulation.schema() | {"drives": (dict,)}
+    check_keys(table, schema, where)
+    check_keys(given, schema, "command line")
     try:
-        table = tomllib.loads(source.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise SettingsError(f"{source.name} is not valid TOML: {error}") from error
-    check_keys(table, Simulation.schema() | {"drives": (dict,)}, source.name)
-    try:
-        return Simulation.from_dict(table), table.get("drives", {})
+        return Simulation.from_dict(_over(table, given)), table.get("drives", {})
     except SettingsError as error:
-        raise SettingsError(f"{source.name}: {error}") from error
+        raise SettingsError(f"{where}: {error}") from error
+
+
+def _over(table: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table with others' entries in the place of its own, tables inside it likewise."""
+    merged = dict(table)
+    for key, value in given.items():
+        inside = merged.get(key, {})
+        merged[key] = _over(inside, value) if isinstance(value, Mapping) else value
+    return merged
