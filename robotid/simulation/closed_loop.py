@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 
 from robotid._typing import Array, ProgressCallback, ignore_progress
 from robotid.exceptions import DataError, SettingsError
@@ -404,7 +403,8 @@ class _Gear:
         self.k = by_joint(actuator.stiffness, joints, "actuator: stiffness", np.inf)
         self.d = by_joint(actuator.damping, joints, "actuator: damping")
         self.play = by_joint(actuator.backlash, joints, "actuator: backlash") / 2
-        for joint in np.array(joints)[np.isinf(self.k)]:
+        if np.isinf(self.k).any():
+            joint = joints[int(np.argmax(np.isinf(self.k)))]
             raise SettingsError(
                 f"actuator: stiffness is not stated for {joint!r}; state it for every joint"
             )
@@ -439,8 +439,8 @@ class _Torque:
     """The controller: it knows the bodies of the URDF, its gains suit the true mass matrix."""
 
     def __init__(self, model: RobotModel, settings: Controller, mass: Array) -> None:
-        self.model, self.kind, self.w = model, settings.kind, settings.bandwidth
-        self.data = model.pin_model.createData()
+        self.kind, self.w = settings.kind, settings.bandwidth
+        self.nominal = RobotPlant(model, model.standard_parameters())
         inertia = np.maximum(mass.diagonal(), _LEAST_INERTIA)
         stated = [
             by_joint(x, model.joints, f"controller: {name}", np.nan)
@@ -453,21 +453,15 @@ class _Torque:
         """Return the torque that is fed forward along a motion, shape (N, n)."""
         if self.kind != "feedforward":
             return np.zeros_like(q)
-        return np.stack([self._inverse(*one) for one in zip(q, v, a, strict=True)])
+        return np.stack([self.nominal.bodies_torque(*one) for one in zip(q, v, a, strict=True)])
 
     def of(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array, ahead: Array) -> Array:
         """Return the torque that is asked of the drives, shape (n,)."""
         if self.kind == "computed_torque":
             w = self.w
-            return self._inverse(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
+            return self.nominal.bodies_torque(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
         u: Array = ahead + self.kp * (q_r - q) + self.kd * (v_r - v)
         return u
-
-    def _inverse(self, q: Array, v: Array, a: Array) -> Array:
-        G = self.model.velocity_map
-        x = self.model.configurations(q[None])[0]
-        tau: Array = G.T @ pin.rnea(self.model.pin_model, self.data, x, G @ v, G @ a)
-        return tau
 
 
 def _limits(model: RobotModel, actuator: Actuator) -> Array:

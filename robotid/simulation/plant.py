@@ -16,7 +16,7 @@ __all__ = ["Friction", "RobotPlant", "rk4"]
 
 _ITERATIONS = 200  # of the load and its friction, which shrink by the size of the parameter
 _SETTLED = 1e-12  # relative change of the load that ends them
-_SIGN_SPEED = 2e-3  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
+_SIGN_SPEED = 2e-4  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Friction:
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives' terms are those of the model; sign(v) is tanh(v / 2 mm/s), so that it can be
+    The drives' terms are those of the model; sign(v) is tanh(v / 0.2 mm/s), so that it can be
     integrated; drives that turn with several joints load all of them. Friction that grows with the
     load knows the load of this very instant. What presliding has taken up, z, is a state of the
     plant with the rate of ``taking_up``; where it is not given, the drives have slid for long.
@@ -241,6 +241,8 @@ class RobotPlant:
         bare = self._share @ (free - self.armature @ a)  # load of the drives without it
         slope = self._share @ (self.ratios.T * coefficient - self.armature @ lost)
         load = bare
+        if not np.isfinite(bare).all():  # of a state that has diverged
+            return a
         for _ in range(_ITERATIONS):
             before, load = load, bare - slope @ np.abs(load)
             if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
