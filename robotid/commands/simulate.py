@@ -9,7 +9,7 @@ import numpy as np
 
 from robotid._files import check_file, file_sha256, write_json
 from robotid._typing import Array, ProgressCallback, ignore_progress
-from robotid.commands.job import Job
+from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import SettingsError
 from robotid.export.urdf import write_urdf
 from robotid.logs.data import Log
@@ -108,7 +108,7 @@ def simulate_log(
 
 
 def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion:
-    table = job.read_motion(files.motion, model)
+    table = job.read(LogEntry(files.motion), model, is_motion=True)
     if files.cutoff is None:
         return SampledMotion(table.t, table.q, table.v, table.a)
     smooth = process(

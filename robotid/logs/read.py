@@ -46,6 +46,7 @@ def read_log(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    is_motion: bool = False,
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
 
@@ -62,6 +63,7 @@ def read_log(
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
         transmissions: The motors and gears, where the file has columns of motors.
+        is_motion: Whether it is read for its motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -70,7 +72,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions,
+        source=source, transmissions=transmissions, is_motion=is_motion,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -78,7 +80,11 @@ def read_log(
 
 
 def read_logs(
-    given: Readable | Sequence[Readable], joints: Sequence[str], *, prismatic: Collection[str] = ()
+    given: Readable | Sequence[Readable],
+    joints: Sequence[str],
+    *,
+    prismatic: Collection[str] = (),
+    is_motion: bool = False,
 ) -> tuple[Log, ...]:
     """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
 
@@ -86,6 +92,7 @@ def read_logs(
         given: A log, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
         prismatic: Names of joints that slide; the others turn.
+        is_motion: Whether they are read for their motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If it is something else, or does not hold what is wanted.
@@ -98,7 +105,10 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        log if isinstance(log, Log) else read_log(log, joints, prismatic=prismatic) for log in logs
+        log
+        if isinstance(log, Log)
+        else read_log(log, joints, prismatic=prismatic, is_motion=is_motion)
+        for log in logs
     )
 
 
@@ -107,46 +117,6 @@ def _no_log(thing: object) -> DataError:
         f"a log is a {type(thing).__name__}, wanted a robotid.Log, the path of a file, a "
         "DataFrame, or a list of these; Log(t=t, q=q, tau=tau, joints=names) makes one of arrays"
     )
-
-
-def read_motion(
-    path: str | Path,
-    joints: Sequence[str],
-    *,
-    gains: Mapping[str, float] | None = None,
-    columns: Mapping[str, str] | None = None,
-    units: LogUnits = _SI,
-    prismatic: Collection[str] = (),
-    source: LogSource = _WHOLE,
-    transmissions: Sequence[Transmission] = (),
-) -> Log:
-    """Return the motion in a file, of a log or of a design, which needs no torques.
-
-    Args:
-        path: As of ``read_log``.
-        joints: As of ``read_log``.
-        gains: As of ``read_log``; no current is read.
-        columns: As of ``read_log``.
-        units: As of ``read_log``.
-        prismatic: As of ``read_log``.
-        source: As of ``read_log``.
-        transmissions: As of ``read_log``.
-
-    Returns:
-        The motion, with torques of 0.
-
-    Raises:
-        DataError: If the file does not hold what is wanted, or looks like other units.
-        SettingsError: If columns or the source name what is not read.
-        MissingDependencyError: If a package that reads the file is not installed.
-    """
-    layout, table = lay_out(
-        path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions, has_torque=False,
-    )  # fmt: skip
-    log = layout.to_log(table.read(layout.wanted))
-    check_units(log, units, prismatic)
-    return log
 
 
 @dataclass(frozen=True)
@@ -192,8 +162,8 @@ class LogLayout:
             for kind, names in self.columns.items()
         }
         slides = np.isin(self.joints, self.prismatic)
-        torque = values.get("tau", np.zeros_like(values["q"]))  # a motion has none
-        values["tau"] = torque * np.array(self.factors)
+        if "tau" in values:
+            values["tau"] = values["tau"] * np.array(self.factors)
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
@@ -212,7 +182,7 @@ class LogLayout:
             q=values["q"],
             v=values.get("dq"),
             a=values.get("ddq"),
-            tau=values["tau"],
+            tau=values.get("tau", np.zeros_like(values["q"])),
             joints=self.joints,
             path=self.path,
             notes=self.notes,
@@ -245,7 +215,7 @@ def lay_out(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
-    has_torque: bool = True,
+    is_motion: bool = False,
 ) -> tuple[LogLayout, Table]:
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
@@ -258,7 +228,8 @@ def lay_out(
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
         transmissions: As of ``read_log``.
-        has_torque: Whether torques are wanted.
+        is_motion: Whether the file is read for its motion alone: its torques, if it has any, are
+            ignored, and those of the log are 0.
 
     Raises:
         DataError: If the file does not hold what is wanted.
@@ -277,14 +248,15 @@ def lay_out(
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     finder = _Finder(
-        where, opened.names, stated, tuple(joints), gains or {}, source, gears, [*opened.notes]
-    )
-    found = finder.find_all(has_torque=has_torque)  # names of columns by kind
+        where, opened.names, stated, tuple(joints), gains or {}, source, gears, is_motion,
+        [*opened.notes],
+    )  # fmt: skip
+    found = finder.find_all()  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
         columns=found,
-        factors=finder.factors(found.get("tau", [""] * len(joints))),
+        factors=finder.factors(found.get("tau", [])),
         units=units,
         prismatic=tuple(prismatic),
         source=source,
@@ -327,17 +299,21 @@ class _Finder:
     gains: Mapping[str, float]
     source: LogSource
     gears: tuple[Transmission, ...]
+    is_motion: bool = False
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
-    def find_all(self, *, has_torque: bool) -> dict[str, list[str]]:
-        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete."""
+    def find_all(self) -> dict[str, list[str]]:
+        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete.
+
+        Of a motion there is no tau.
+        """
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
             "q": [column or self._missing(*at) for at, column in self._each("q")],
         }
-        if has_torque:
+        if not self.is_motion:
             found["tau"] = [
                 self._find_torque(self.joints[j], is_motor)
                 for j, is_motor in enumerate(self.of_motors("tau"))
@@ -475,13 +451,34 @@ class _Finder:
         if tau and has_gain:
             self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
         if current and not has_gain:
-            raise DataError(
-                f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
-                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains; "
-                f"CLI --gain {joint}=...)",
-                code="missing_gain",
-            )
+            raise self._no_gain(joint, current)
         return tau or current or self._missing(f"tau{m}", joint)
+
+    def _no_gain(self, joint: str, current: str) -> DataError:
+        """Return the error of a current without a gain, with all that the others lack, too."""
+        without = [joint]
+        if joint in self.joints:
+            logged = [other for other in self.joints if self._has("current", other)]
+            without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+        has = f"joint {joint!r} has the current {current!r}"
+        if len(without) > 1:
+            has = f"joints {listed(without)} have currents"
+        more = ", ..." if len(without) > 1 else ""
+        flags = " ".join(f"--gain {name}=..." for name in without)
+        absent = [x for x in self.joints if not (self._has("tau", x) or self._has("current", x))]
+        also = ""
+        if absent and joint in self.joints:
+            locks = " ".join(f"--lock {name}=0" for name in absent)
+            also = (
+                f". There is no torque of {listed(absent)} either; if they stood still, lock them "
+                f"where they stood, as with {locks}"
+            )
+        return DataError(
+            f"{self.where}: {has} but no gain; give it in N m/A: "
+            f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
+            f"{flags}){also}",
+            code="missing_gain",
+        )
 
     def _find_optional(self, kind: str) -> list[str]:
         """Return the columns of a quantity that every joint has; none if some joint lacks it."""
@@ -539,9 +536,10 @@ class _Finder:
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has a position, and a torque or a current, of a joint."""
+        has_torque = self._has("tau", joint) or self._has("current", joint)
+        return self._has("q", joint) and (self.is_motion or has_torque)
 
-        def has(kind: str) -> bool:
-            names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
-            return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
-
-        return has("q") and (has("tau") or has("current"))
+    def _has(self, kind: str, joint: str) -> bool:
+        """Return whether the file has a quantity of a joint."""
+        names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
+        return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)

@@ -89,8 +89,8 @@ def test_identify_finds_the_truth_that_stands_beside_the_log(folder, ur5, capsys
 def test_a_seed_gives_the_same_bytes_and_another_seed_others(folder):
     logs = []
     for seed, out in (("7", "a.csv"), ("7", "b.csv"), ("8", "c.csv")):
-        simulated(folder, "--seed", seed, "--rate", "50", "--noise", "0.02", "--duration", "1",
-                  out=out)  # fmt: skip
+        words = ["--rate", "50", "--torque-noise", "0.02", "--duration", "1"]
+        simulated(folder, "--seed", seed, *words, out=out)
         logs.append((folder / out).read_bytes())
     assert logs[0] == logs[1] != logs[2]
 

@@ -22,6 +22,7 @@ from robotid.estimators.consistent.penalties import (
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError
+from robotid.findings import listed
 from robotid.regressor.factors import Factors
 from robotid.robot.parameters import ParameterLayout
 
@@ -102,8 +103,8 @@ class Consistent(BatchEstimator):
             )
         if self.metric not in METRICS or self.solver not in SOLVERS:
             raise DataError(
-                f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
-                f"{self.solver!r}, wanted one of {list(SOLVERS)}"
+                f"metric is {self.metric!r}, wanted one of {listed(METRICS)}; solver is "
+                f"{self.solver!r}, wanted one of {listed(SOLVERS)}"
             )
         self.constraints.check(self.layout, self.prior, self.known_share)
 
@@ -238,7 +239,7 @@ class Consistent(BatchEstimator):
     @property
     def spread_before(self) -> Array:
         """Plausible standard deviation of each parameter by the prior alone, shape (p,)."""
-        covariance = self.programme.prior_covariance(self.prior_weight / self.pull)
+        covariance = self.programme.covariance_at_prior(self.prior_weight / self.pull)
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
