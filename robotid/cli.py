@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from robotid._files import check_file
-from robotid._typing import ignore_progress
 from robotid.commands.console import (
     Terminated,
     print_error,
@@ -317,7 +316,7 @@ def _simulate(options: argparse.Namespace) -> None:
     urdf = Path(options.urdf) if options.urdf else None
     files = SimulatedFiles(Path(options.motion), Path(options.out), urdf, options.cutoff)
     with terminal_progress(quiet=options.json) as progress:
-        content = simulate_log(job, files, settings, progress=progress or ignore_progress)
+        content = simulate_log(job, files, settings, progress=progress)
     _show(content, options, "simulate")
     if not options.json:
         print_files("", content["outputs"])

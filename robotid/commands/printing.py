@@ -397,8 +397,9 @@ def _print_simulation(content: dict[str, Any]) -> None:
         f"{content['robot']}: {content['samples']} samples over {content['duration']:g} s, seed "
         f"{content['settings']['seed']}"
     )
-    width = max(len("position's error"), *(len(joint) for joint in content["joints"]))
-    print(f"\n{"position's error":{width}}  rms, largest")
+    head = "error of the position"
+    width = max(len(head), *(len(joint) for joint in content["joints"]))
+    print(f"\n{head:{width}}  rms, largest")
     for joint in content["following"]:
         line = f"{joint['joint']:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g}"
         line += f" {joint['unit']}"

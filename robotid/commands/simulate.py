@@ -58,7 +58,7 @@ def simulate_log(
     files: SimulatedFiles,
     settings: Simulation,
     *,
-    progress: ProgressCallback = ignore_progress,
+    progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
     """Simulate a robot that follows a motion; write its log and the truth.
 
@@ -91,7 +91,7 @@ def simulate_log(
     pi = draw_parameters(model, settings.truth, rng)
     run = follow(
         model, pi, motion, rate=settings.rate, duration=duration, settings=settings,
-        progress=progress,
+        progress=progress or ignore_progress,
     )  # fmt: skip
     late = lateness(model, pi, settings)
     log = measure(run, settings.sensors, model.joints, rng, lateness=late)

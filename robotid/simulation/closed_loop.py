@@ -233,6 +233,11 @@ def _perfect(
 def lateness(model: RobotModel, pi: Array, settings: Simulation) -> Array:
     """Return how late the terms of the drives make each logged torque, shape (n,) [s].
 
+    Args:
+        model: The robot.
+        pi: Its true standard parameters, shape (p,).
+        settings: Those of the run; the torques of a perfect one are late already.
+
     Raises:
         SettingsError: If a drive that turns with several joints is late.
     """

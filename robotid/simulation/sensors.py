@@ -50,9 +50,9 @@ def measure(
     tau = _late(run.t, run.tau, sensors.torque_delay + lateness * np.ones(n))
     share = of(noise.tau, "noise.tau") * np.sqrt(np.mean(tau**2, axis=0))
     level = np.hypot(share, of(noise.torque, "noise.torque"))
-    q = run.q + of(noise.q, "noise.q") * rng.standard_normal(v.shape)
-    v = v + of(noise.v, "noise.v") * rng.standard_normal(v.shape)
-    tau = tau + level * rng.standard_normal(v.shape)
+    q = _noisy(run.q, of(noise.q, "noise.q"), rng)
+    v = _noisy(v, of(noise.v, "noise.v"), rng)
+    tau = _noisy(tau, level, rng)
     q, v, tau = (
         _rounded(x, of(size, f"step.{name}"))
         for x, size, name in ((q, step.q, "q"), (v, step.v, "v"), (tau, step.tau, "tau"))
@@ -86,6 +86,14 @@ def _late(t: Array, values: Array, delay: Array) -> Array:
         return values
     columns = [np.interp(t - d, t, x) for d, x in zip(delay, values.T, strict=True)]
     return np.column_stack(columns)
+
+
+def _noisy(values: Array, level: Array, rng: np.random.Generator) -> Array:
+    """Return values with white noise of a standard deviation by joint."""
+    if not level.any():
+        return values
+    noisy: Array = values + level * rng.standard_normal(values.shape)
+    return noisy
 
 
 def _rounded(values: Array, step: Array) -> Array:
