@@ -50,6 +50,7 @@ def print_content(
         "compare": _print_comparison,
         "export": _print_export,
         "convert": _print_conversion,
+        "simulate": _print_simulation,
     }
     prints[command](content)
 
@@ -400,3 +401,19 @@ def _print_paper(result: dict[str, Any]) -> None:
     print("\nrandom motions that converged to 1e-3")
     for name, found in result["trajectories"].items():
         print(f"  {name:10} {found['converged']} of {found['runs']}")
+
+
+def _print_simulation(content: dict[str, Any]) -> None:
+    print(
+        f"{content['robot']}: {content['samples']} samples over {content['duration']:g} s, seed "
+        f"{content['settings']['seed']}"
+    )
+    head = "error of the position"
+    width = max(len(head), *(len(joint) for joint in content["joints"]))
+    print(f"\n{head:{width}}  rms, largest")
+    for joint in content["following"]:
+        line = f"{joint['joint']:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g}"
+        line += f" {joint['unit']}"
+        if joint["at_limit"] > 0:
+            line += f"; at its effort limit for {100 * joint['at_limit']:.2g} % of the time"
+        print(line)
