@@ -20,7 +20,6 @@ the others; reported is what both together then give.
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
 
 import argparse
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -143,8 +142,12 @@ def main():
     parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
     options = parser.parse_args()
     runs = 3 if options.quick else options.runs
-    cases = [*itertools.product(["UR10", "panda"], ("white", "coloured"), ["plausible"])]
-    cases += [(name, "white", "near") for name in ("UR10", "panda")]
+    cases = [
+        ("UR10", "white", "plausible"),
+        ("panda", "white", "plausible"),
+        ("UR10", "coloured", "plausible"),
+        ("UR10", "white", "near"),
+    ]
     names = ["ur10e", "kinova_gen3", "tx40"]
     if options.quick:
         cases, names = cases[:1], names[-1:]
