@@ -279,7 +279,9 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
     for entry in content["base_parameters"]:
         pairs = zip(entry["values"], entry["std_errors"], strict=True)
         values = ["-" if x is None else in_digits_of(x, error)[0] for x, error in pairs]
-        differences = ["-" if x is None else f"{x:.1f}" for x in entry["differences"]]
+        differences = [
+            "-" if x is None else f"{round(x, 1) + 0.0:.1f}" for x in entry["differences"]
+        ]
         rows.append([entry["name"], *values, entry["unit"], *differences])
     heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
     print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))
@@ -377,10 +379,12 @@ def _print_track(found: dict[str, Any]) -> None:
 
 
 def _print_payload(content: dict[str, Any]) -> None:
+    from robotid.identification.summary import cell
+
     for found in content["payloads"]:
         _print_one_payload(found)
-    errors = content["relative_error_pct"].items()
-    say("torque left unexplained: " + ", ".join(f"{j} {e:.2g} %" for j, e in errors), "  ")
+    errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
+    say(f"torque left unexplained: {listed(errors)}", "  ")
     if "gains" in content:
         print("\n[torque.gains]")
         for joint, gain in content["gains"].items():

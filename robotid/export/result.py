@@ -425,7 +425,9 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
     }
     missing = [name for name in model.layout.names if name not in stated]
     if missing:
-        raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
+        raise ModelError(
+            f"the result has no value of {listed(missing, 5)}: the URDF has changed since"
+        )
     return np.array([stated[name] for name in model.layout.names])
 
 

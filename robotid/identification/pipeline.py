@@ -24,7 +24,7 @@ from robotid.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.bands import (
     FrictionCurve,
     TorqueBand,
@@ -40,6 +40,7 @@ from robotid.identification.metrics import Metrics
 from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
 from robotid.identification.model_error import settled_shapes, with_model_error
 from robotid.identification.parameter_table import parameter_entries, parameter_table
+from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -56,6 +57,7 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.survey import hold_log
+from robotid.identification.torque_split import joint_torques
 from robotid.identification.verdict import (
     Doubt,
     Verdict,
@@ -65,9 +67,12 @@ from robotid.identification.verdict import (
     judge,
     refuted,
 )
+from robotid.identification.why_pictures import why_charts
 from robotid.identification.witness import Witness, call_witness
+from robotid.logs.data import suggestion
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
+from robotid.pages.plots import Plot
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
 from robotid.regressor.prediction import predict_instants
@@ -266,6 +271,80 @@ class Identification:
         ``model.velocity_map`` lead to Pinocchio's coordinates.
         """
         return pinocchio_model(self.model, self.standard)
+
+    def plot_torques(self, *joints: str, recording: Evaluation | None = None) -> Plot:
+        """Return charts of measured and identified torque over time, and of the residual.
+
+        Args:
+            joints: The joints; all if none is named.
+            recording: One of ``fitted`` or ``validation``; None: the first that was kept apart,
+                or the first fitted without any.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("torques.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        shown = shown_evaluation(self) if recording is None else recording
+        band, rows = (
+            self.band(shown),
+            [self._row(joint) for joint in joints or self.model.row_names],
+        )
+        charts = []
+        for row in rows:
+            torque, residual = torque_charts(self, shown, row, band=band)
+            name = self.model.row_names[row]
+            charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
+        return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+
+    def plot_friction(self, *joints: str) -> Plot:
+        """Return charts of friction against speed, measured and identified, with its band.
+
+        Args:
+            joints: The joints; all if none is named.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("friction.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint, or none that moved.
+        """
+        names = [self.model.row_names[self._row(joint)] for joint in joints or self.model.joints]
+        charts = [(friction_chart(self, name), f"{name}: friction and offset") for name in names]
+        shown = tuple((chart, caption) for chart, caption in charts if chart is not None)
+        if not shown:
+            raise DataError(f"{listed(names)}: no rows used, so there is no friction to show")
+        return Plot(f"Friction of {listed(names)} against speed", shown)
+
+    def plot_why(self, joint: str) -> Plot:
+        """Return charts of what a joint's torque consists of, and of what its residual follows.
+
+        Args:
+            joint: The joint.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("why.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        torque = joint_torques(self)[self._row(joint)]
+        charts = why_charts(torque)
+        about = {name: f"residual against {name}" for name in charts}
+        about |= {"split": torque.sentence, "power": "mechanical power"}
+        shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
+        return Plot(f"Why {joint} is predicted as it is", shown)
+
+    def _row(self, joint: str) -> int:
+        """Return the number of a joint's torque row."""
+        names = self.model.row_names
+        if joint not in names:
+            raise DataError(
+                f"joint {joint!r} is not among those identified: {listed(names)}"
+                f"{suggestion(joint, names)}"
+            )
+        return names.index(joint)
 
     def save(self, folder: str | Path, *, report: bool = True) -> Path:
         """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.

@@ -451,13 +451,34 @@ class _Finder:
         if tau and has_gain:
             self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
         if current and not has_gain:
-            raise DataError(
-                f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
-                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains; "
-                f"CLI --gain {joint}=...)",
-                code="missing_gain",
-            )
+            raise self._no_gain(joint, current)
         return tau or current or self._missing(f"tau{m}", joint)
+
+    def _no_gain(self, joint: str, current: str) -> DataError:
+        """Return the error of a current without a gain, with all that the others lack, too."""
+        without = [joint]
+        if joint in self.joints:
+            logged = [other for other in self.joints if self._has("current", other)]
+            without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+        has = f"joint {joint!r} has the current {current!r}"
+        if len(without) > 1:
+            has = f"joints {listed(without)} have currents"
+        more = ", ..." if len(without) > 1 else ""
+        flags = " ".join(f"--gain {name}=..." for name in without)
+        absent = [x for x in self.joints if not (self._has("tau", x) or self._has("current", x))]
+        also = ""
+        if absent and joint in self.joints:
+            locks = " ".join(f"--lock {name}=0" for name in absent)
+            also = (
+                f". There is no torque of {listed(absent)} either; if they stood still, lock them "
+                f"where they stood, as with {locks}"
+            )
+        return DataError(
+            f"{self.where}: {has} but no gain; give it in N m/A: "
+            f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
+            f"{flags}){also}",
+            code="missing_gain",
+        )
 
     def _find_optional(self, kind: str) -> list[str]:
         """Return the columns of a quantity that every joint has; none if some joint lacks it."""
@@ -515,9 +536,10 @@ class _Finder:
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has a position, and a torque or a current, of a joint."""
+        has_torque = self._has("tau", joint) or self._has("current", joint)
+        return self._has("q", joint) and (self.is_motion or has_torque)
 
-        def has(kind: str) -> bool:
-            names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
-            return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
-
-        return has("q") and (self.is_motion or has("tau") or has("current"))
+    def _has(self, kind: str, joint: str) -> bool:
+        """Return whether the file has a quantity of a joint."""
+        names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
+        return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
