@@ -133,7 +133,7 @@ def test_the_density_of_noise_counts_and_not_the_rate_of_the_rows(ur5, motion):
 def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
     log = motion[0]
     free = preview(ur5, [log], noise=white(), estimator="wls")
-    kept = preview(ur5, [log], noise=white())
+    kept = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1.0))
     assert (kept.base_error <= free.base_error * 1.001).all()
     assert (kept.base_error <= kept.plausible * 1.001).all()
     light = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1e-9))
