@@ -204,6 +204,8 @@ def _add_preview(parser: argparse.ArgumentParser) -> None:
     words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
     _add_json(parser)
+    words = "print standard parameters and whole expressions, too; say on stderr what is chosen"
+    parser.add_argument("--verbose", action="store_true", help=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
     flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help="as of identify")
     _add_settings(flags, _MOTION)

@@ -1,5 +1,6 @@
 """What the commands found as text: lines that fit the terminal, columns, a little colour."""
 
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
     from robotid.identification.advice import Step
 
 __all__ = ["print_content", "print_files", "print_steps", "say"]
+
+
+_TERM = re.compile(r" [+-] ")  # what stands before each further term of an expression
 
 
 def say(text: str, hang: str = "", tone: str = "") -> None:
@@ -42,6 +46,7 @@ def print_content(
         "paper": _print_paper,
         "inspect": partial(_print_inspection, is_verbose=is_verbose, with_base=with_base),
         "identify": partial(_print_result, is_verbose=is_verbose),
+        "preview": partial(_print_preview, is_verbose=is_verbose),
         "track": _print_track,
         "doctor": partial(_print_examination, is_verbose=is_verbose),
         "validate": _print_validation,
@@ -292,6 +297,75 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
         rows.append([entry["name"], *values, entry["unit"], *differences])
     heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
     print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))
+
+
+def _print_preview(content: dict[str, Any], *, is_verbose: bool) -> None:
+    motions = [_recording(entry) for entry in content["motions"]]
+    count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
+    say(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
+    say("\nbase parameters: standard errors to be expected, and the share of the plausible spread")
+    keys = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
+            "ratio": "ratio"}  # fmt: skip
+    keys = {key: head for key, head in keys.items() if key in content["base_parameters"][0]}
+    rows = []
+    for entry in content["base_parameters"]:
+        error, more = entry["std_error"], len(_TERM.findall(entry["expression"]))
+        short = f"{entry['name']} + {more} more" if more else entry["name"]
+        left = "open" if error is None else f"{100 * min(error / entry['plausible'], 1):.0f} %"
+        name = entry["expression"] if is_verbose else short
+        rows.append([name, _two_digits(error), entry["unit"], left,
+                     *(_two_digits(entry[key]) for key in keys)])  # fmt: skip
+    print("\n".join(columns(["", "+-", "", "left", *keys.values()], rows, left=(0, 2))))
+    parameters = [*content["standard_parameters"], *content["drive_parameters"]]
+    sources = [entry["source"] for entry in parameters]
+    counts = [f"{sources.count(source)} {source}" for source in dict.fromkeys(sources)]
+    say(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
+    if is_verbose:
+        rows = [
+            [e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"], e["source"]]
+            for e in parameters
+        ]
+        print("\n".join(columns(["", "prior", "+-", "", "by"], rows, left=(0, 3, 4))))
+    else:
+        say("each of them, and what is in each base parameter: --verbose")
+    _print_expected_torque(content)
+    say(f"\n{content['words']}", "  ")
+    if "achieved" in content:
+        achieved = content["achieved"]
+        say(
+            f"\nthese logs were identified: {achieved['count']} standard errors became "
+            "{:.2f} to {:.2f} times what was expected, eight of ten; median {:.2f}".format(
+                *achieved["range_80"], achieved["median"]
+            )
+        )
+
+
+def _print_expected_torque(content: Mapping[str, Any]) -> None:
+    """Print each joint's torque with its band, and the noise that all rests on."""
+    say(
+        "\ntorque of the motion, 95 % band of a measurement about its prediction, and the part of "
+        "that which is due to the parameters"
+    )
+    rows, noises = [], content["noise"].values()
+    found = ["achieved"] if all("achieved" in noise for noise in noises) else []
+    for (joint, torque), noise in zip(content["torque"].items(), noises, strict=True):
+        cells = [f"{torque[key]:.3g}" for key in ("rms", "half_width", "of_parameters")]
+        achieved = [_two_digits(noise[key]) for key in found]
+        rows.append([joint, *cells, _two_digits(noise["std"]), *achieved, torque["unit"],
+                     f"{noise['correlation']:.2g} s", noise["is"]])  # fmt: skip
+    heads = ["joint", "torque", "band", "part", "noise", *found, "", "over", ""]
+    print("\n".join(columns(heads, rows, left=(0, len(heads) - 3, len(heads) - 1))))
+    if any(noise["is"] == "assumed" for noise in noises):
+        say(
+            "assumed noise is 1 % of the URDF's effort limit, or of the bodies' largest torque "
+            "where there is none. Standard errors are in proportion to it: state it with --noise "
+            "JOINT=N_M, or take it from a run before with --given RESULT",
+            "  ",
+        )
+
+
+def _two_digits(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"
 
 
 def _print_track(found: dict[str, Any]) -> None:
