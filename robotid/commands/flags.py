@@ -385,7 +385,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
             )
         return read_job(options.source)
     if not options.logs:
-        raise SettingsError("no log was given: robotid identify URDF LOG [LOG ...], or JOB.toml")
+        raise SettingsError("no log was given; wanted URDF LOG [LOG ...], or JOB.toml")
     kept = getattr(options, "validate", None) or ()
     table = {
         "urdf": options.source,
