@@ -1,0 +1,409 @@
+"""The motion that tells the most of a robot within its limits, found by its gradient.
+
+The information about the base parameters of a motion q = Phi C is the sum of W^T W / sigma^2 over
+its instants, in units of what the URDF leaves open, plus 1, or plus what earlier runs told. An
+augmented Lagrangian keeps the limits: at each instant, (used share)^2 - 1 <= 0 of each limit, and
+distances at least the clearance.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import NotConvergedError, SettingsError
+from robotid.excitation.basis import Basis, DesignedMotion
+from robotid.excitation.clearance import Clearance, Contact
+from robotid.excitation.information import MotionInformation, MotionRows, criterion
+from robotid.excitation.limits import LIMITS, MotionLimits
+
+__all__ = ["Design", "Designer"]
+
+_PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
+_FINER = 10  # times as many at which limits are checked in the end
+_ROUNDS = 10  # of the augmented Lagrangian
+_STEPS = 40  # of L-BFGS in each
+_GROWTH = 2.0  # of the weight of what is violated from one round to the next
+_SETTLED = 1e-3  # change of the criterion below which a design has converged
+_HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
+_SPARE = 0.003  # of limits that a design leaves for what lies between its instants
+_SPARE_WAY = 0.002  # [m] the same of distances
+_NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part in the design
+_SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
+_TRIED = 200  # random postures until one is found that the robot can rest in
+_STARTED = 10  # random motions of which the best is a start
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A motion and what it is good for.
+
+    Attributes:
+        motion: The motion.
+        objective: Its criterion, the smaller the better.
+        condition: Condition number of the base problem, columns in units of what the URDF leaves
+            open.
+        used: Largest share that is used of each limit, by joint, shape (6, n); 0 where there is
+            none.
+        contact: Where it comes nearest to a collision; None if nowhere near.
+        seconds: How long it took [s].
+        starts: Starts that were followed to the end.
+        is_converged: Whether the best of them had settled.
+        history: Time since the beginning [s] and criterion of each better motion.
+    """
+
+    motion: DesignedMotion
+    objective: float
+    condition: float
+    used: Array
+    contact: Contact | None = None
+    seconds: float = 0.0
+    starts: int = 0
+    is_converged: bool = False
+    history: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Designer:
+    """Looks for the motion that tells the most.
+
+    Attributes:
+        information: The rows of the base problem, and their gradient.
+        limits: What the robot may do.
+        basis: Functions that motions are sums of.
+        sigma: Noise of each joint's torque, shape (n,) [N m or N].
+        spread: How far base parameters may be from what is known, shape (b,).
+        given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
+        name: The criterion, as of ``criterion``.
+        clearance: What keeps it from collisions; None: they are not looked at.
+    """
+
+    information: MotionInformation
+    limits: MotionLimits
+    basis: Basis
+    sigma: Array
+    spread: Array
+    given: Array | None = None
+    name: str = "D"
+    clearance: Clearance | None = None
+    _functions: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_functions", self._on_grid(1))
+
+    def _on_grid(self, finer: int) -> Array:
+        """Return the basis functions and three derivatives, shape (4, N, h)."""
+        count = finer * round(_PER_PERIOD * self.basis.duration / self.basis.shortest)
+        return self.basis.derivatives(np.linspace(0.0, self.basis.duration, count + 1), 3)
+
+    def design(
+        self,
+        rng: np.random.Generator,
+        *,
+        starts: int = 3,
+        seconds: float = np.inf,
+        progress: Callable[[int, float], None] | None = None,
+    ) -> Design:
+        """Return the best motion that was found, checked on a ten times finer grid.
+
+        Args:
+            rng: Source of the starts.
+            starts: How many starts are followed to the end.
+            seconds: Time after which the best motion so far is returned [s].
+            progress: Called with the number of the start and the best criterion.
+
+        Raises:
+            SettingsError: If the robot cannot even rest within its limits.
+        """
+        begun = time.monotonic()
+        history: list[tuple[float, float]] = []
+        best: tuple[Array, float] | None = None
+        is_converged, done = False, 0
+
+        def is_over() -> bool:
+            return best is not None and time.monotonic() - begun > seconds
+
+        for start in range(starts):
+            random = [self.random(rng) for _ in range(_STARTED)]
+            C = min(random, key=lambda C: self._looked_at(C)[0])
+            settled = _Settled()
+            for kept, objective in self._search(C, is_over, settled):
+                if best is None or objective < best[1]:
+                    best, is_converged = (kept, objective), False
+                    history.append((time.monotonic() - begun, objective))
+                if progress is not None:
+                    progress(start, best[1])
+            is_converged |= best is not None and settled.at == best[1]
+            done += 1
+            if is_over():
+                break
+        if best is None:
+            raise NotConvergedError("no motion was found", "max_iterations")
+        return replace(
+            self.checked(best[0]),
+            seconds=time.monotonic() - begun,
+            starts=done,
+            is_converged=is_converged,
+            history=tuple(history),
+        )
+
+    def checked(self, C: Array) -> Design:
+        """Return a motion, scaled down until it keeps all limits between its instants, too.
+
+        Args:
+            C: Coefficients of a motion, shape (h, n).
+        """
+        fine = self._on_grid(_FINER)
+        C = self._feasible(C, fine, 1.0)
+        contact = None
+        if self.clearance is not None:
+            for _ in range(_HALVINGS):
+                contact = self.clearance.nearest(
+                    DesignedMotion(self.basis, C), self.basis.duration
+                )
+                if contact is None or contact.distance >= self.clearance.least:
+                    break
+                C = _scaled(C, 0.99)
+        objective, used, _, rows = self._looked_at(C)
+        _, finely, _, _ = self._looked_at(C, fine)
+        F = self.matrix(rows) - self._known
+        low, *_, high = np.linalg.eigvalsh(F)
+        return Design(
+            motion=DesignedMotion(self.basis, C),
+            objective=objective,
+            condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
+            used=np.abs(finely).max(axis=1),
+            contact=contact,
+        )
+
+    @property
+    def _known(self) -> Array:
+        return np.eye(len(self.spread)) if self.given is None else self.given
+
+    def matrix(self, rows: MotionRows) -> Array:
+        """Return the information of a motion and what was known, in units of the spread, (b, b).
+
+        Args:
+            rows: Its rows.
+        """
+        n, b, N = rows.W.shape
+        scaled = rows.W * (self.spread[:, None] / self.sigma[:, None, None])
+        flat = scaled.swapaxes(0, 1).reshape(b, n * N)
+        F: Array = flat @ flat.T
+        return F + self._known
+
+    def _looked_at(
+        self, C: Array, functions: Array | None = None
+    ) -> tuple[float, Array, float, MotionRows]:
+        """Return criterion, shares of limits used (6, N, n), least distance and rows."""
+        q, v, a, jerk = (self._functions if functions is None else functions) @ C
+        rows = self.information.rows(q, v, a)
+        used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
+        distance = np.inf
+        if self.clearance is not None:
+            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+            distance = float(near.distance.min(initial=np.inf))
+        return criterion(self.name, self.matrix(rows))[0], used, distance, rows
+
+    def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
+        """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
+
+        References:
+            Nocedal, Wright (2006), Numerical Optimization, section 17.4.
+        """
+        D = self._functions
+        q, v, a, jerk = D @ C
+        rows = self.information.rows(q, v, a)
+        torque = self.information.torque(rows)
+        value, by_F = criterion(self.name, self.matrix(rows))
+        used = self.limits.used(q, v, a, jerk, torque)
+        cost, pushed = multipliers.of_limits(used)
+        by_value = pushed * 2.0 * used / self.limits.sizes[:, None]
+        by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
+        by_v = by_v + by_power * torque
+        by_torque = by_torque + by_power * v
+        value += cost
+        if self.clearance is not None:
+            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+            cost, pushed = multipliers.of_distances(near.distance, self.clearance.least)
+            value += cost
+            along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
+            np.add.at(by_q, near.samples, along)
+        scale = self.spread[:, None] / self.sigma[:, None, None]  # (n, b, 1)
+        by_W = 2.0 * scale * np.einsum("bc,rcn->rbn", by_F, scale * rows.W, optimize=True)
+        by_W += self.information.beta[:, None] * by_torque.T[:, None]
+        along_q, along_v, along_a = self.information.pull(rows, by_W)
+        by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
+        gradient: Array = sum(
+            functions.T @ g for functions, g in zip(D, by_motion, strict=True)
+        )
+        return value, gradient
+
+    def random(self, rng: np.random.Generator) -> Array:
+        """Return the coefficients of a random motion that keeps the limits, shape (h, n).
+
+        Args:
+            rng: Source of the motion.
+
+        Raises:
+            SettingsError: If no posture that the robot can rest in is found.
+        """
+        n = len(self.limits.middle)
+        C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
+        C[0] = self._posture(rng)
+        return self._feasible(C, self._functions, 1.0 - _SPARE)
+
+    def _posture(self, rng: np.random.Generator) -> Array:
+        """Return a posture that keeps limits and distances at rest, shape (n,)."""
+        reach = rng.uniform(-0.8, 0.8, (_TRIED, len(self.limits.middle)))
+        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
+        q = self.limits.middle + reach * self.limits.sizes[0]
+        still = np.zeros_like(q)
+        rows = self.information.rows(q, still, still)
+        used = self.limits.used(q, still, still, still, self.information.torque(rows))
+        worst = np.abs(used).max(axis=(0, 2))
+        distance = np.full(len(q), np.inf)
+        if self.clearance is not None:
+            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+            distance = near.distance.min(axis=0, initial=np.inf)
+            is_clear = distance >= self.clearance.least + _SPARE_WAY
+        else:
+            is_clear = np.ones(len(q), dtype=bool)
+        good = np.flatnonzero((worst < 1.0 - _SPARE) & is_clear)
+        if not len(good):
+            raise SettingsError(self._why_not(np.abs(used), distance))
+        chosen: Array = q[good[0]]
+        return chosen
+
+    def _why_not(self, used: Array, distance: Array) -> str:
+        """Return which limit leaves no posture, and by how much."""
+        least = used.min(axis=1)  # (6, n)
+        kind, joint = np.unravel_index(int(np.argmax(least)), least.shape)
+        names = self.information.model.joints
+        tried = f"of {used.shape[1]} random postures none can be held at rest"
+        if least[kind, joint] >= 1.0 - _SPARE:
+            return (
+                f"{tried}: {names[joint]} needs {100 * least[kind, joint]:.0f} % of its "
+                f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
+                "load that it carries"
+            )
+        return (
+            f"{tried}: the nearest links or obstacles are at most "
+            f"{1e3 * float(distance.max()):.0f} mm apart, wanted "
+            f"{1e3 * (self.clearance.least if self.clearance else 0.0):.0f} mm; lower the "
+            "clearance, or move the floor and the boxes"
+        )
+
+    def _feasible(self, C: Array, functions: Array, most: float) -> Array:
+        """Return the largest share of a motion about its middle that keeps the limits, (h, n).
+
+        Each joint first keeps its own positions and speeds; then all are scaled as one.
+        """
+        room = most * self.limits.sizes[0] - np.abs(C[0] - self.limits.middle)
+        moving = np.abs(functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
+        over = np.vstack(
+            [moving[:1] / np.maximum(room, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
+        )
+        C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
+        least = -np.inf if self.clearance is None else self.clearance.least
+        low, high = 0.0, 1.0
+        for k in range(_HALVINGS):
+            share = 1.0 if k == 0 else (low + high) / 2
+            _, used, distance, _ = self._looked_at(_scaled(C, share), functions)
+            is_kept = np.abs(used).max() <= most and distance >= least
+            low, high = (share, high) if is_kept else (low, share)
+            if low == 1.0:
+                break
+        return _scaled(C, low)
+
+    def _search(
+        self, start: Array, is_over: Callable[[], bool], settled: "_Settled"
+    ) -> Iterator[tuple[Array, float]]:
+        """Yield motions that keep the limits, better and better as a rule, with their criterion."""
+        from scipy.optimize import minimize
+
+        unit = self.limits.sizes[0]
+        multipliers = _Multipliers(1.0 / self._functions.shape[1])
+        C, before = start, np.inf
+
+        def scaled(x: Array) -> tuple[float, Array]:
+            if is_over():
+                raise _OutOfTime
+            value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
+            return value, (gradient * unit).reshape(-1)
+
+        yield start, self._looked_at(start)[0]
+        for _ in range(_ROUNDS):
+            try:
+                found = minimize(
+                    scaled,
+                    (C / unit).reshape(-1),
+                    jac=True,
+                    method="L-BFGS-B",
+                    options={"maxiter": _STEPS, "maxcor": 20},
+                )
+            except _OutOfTime:
+                return
+            C = found.x.reshape(C.shape) * unit
+            _, used, _, rows = self._looked_at(C)
+            multipliers.raise_by(used)
+            if self.clearance is not None:
+                near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+                multipliers.raise_by_distances(near.distance, self.clearance.least)
+            kept = self._feasible(C, self._functions, 1.0 - _SPARE)
+            objective = self._looked_at(kept)[0]
+            yield kept, objective
+            if abs(before - objective) < _SETTLED and np.abs(used).max() < 1.01:
+                settled.at = objective
+                return
+            before = objective
+            multipliers.weight *= _GROWTH
+
+
+class _OutOfTime(Exception):
+    """The time of a design is over."""
+
+
+class _Settled:
+    """The criterion at which a search settled; None if it did not."""
+
+    at: float | None = None
+
+
+class _Multipliers:
+    """Multipliers of the limits at each instant, and of distances."""
+
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+        self._limits: Array | float = 0.0
+        self._distances: Array | float = 0.0
+
+    def of_limits(self, used: Array) -> tuple[float, Array]:
+        """Return the cost of limits and its slope by used^2, shape (6, N, n)."""
+        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self._limits)
+
+    def of_distances(self, distance: Array, least: float) -> tuple[float, Array]:
+        """Return the cost of distances and its slope by -distance / 5 cm, shape (pairs, N)."""
+        return self._cost((least + _SPARE_WAY - distance) / _SOFT, self._distances)
+
+    def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
+        pushed = np.maximum(0.0, multipliers + self.weight * over)
+        cost = float(np.sum(pushed**2 - np.square(multipliers))) / (2 * self.weight)
+        return cost, pushed
+
+    def raise_by(self, used: Array) -> None:
+        """Take the slopes as the new multipliers."""
+        self._limits = self.of_limits(used)[1]
+
+    def raise_by_distances(self, distance: Array, least: float) -> None:
+        """Take the slopes as the new multipliers."""
+        self._distances = self.of_distances(distance, least)[1]
+
+
+def _scaled(C: Array, share: float | Array) -> Array:
+    """Return a motion with its way about the middle scaled, shape (h, n)."""
+    scaled = C * share
+    scaled[0] = C[0]
+    return scaled
