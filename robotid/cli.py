@@ -19,7 +19,13 @@ from robotid.commands.console import (
     terminations_raised,
     unheard_in_silence,
 )
-from robotid.commands.flags import add_flags, job_from_flags, refuse_log_flags, source_settings
+from robotid.commands.flags import (
+    add_flags,
+    job_from_flags,
+    refuse_log_flags,
+    source_settings,
+    source_words,
+)
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
@@ -55,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     """Run a command line, tell what stops it, and return its exit code."""
-    options = _parser(words).parse_args(words)
+    options = _parser(words).parse_args(words, argparse.Namespace(words=words))
     try:
         with terminations_raised(), shown_log(is_verbose=getattr(options, "verbose", False)):
             code: int | None = options.run(options)
@@ -147,7 +153,8 @@ def _identify(options: argparse.Namespace) -> int:
     workers = job.workers if options.workers is None else options.workers
     with terminal_progress(quiet=options.json, force=options.progress) as progress:
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
-        _, result = run_job(job, options.out, plan=plan)
+        source = source_words(options.words)
+        _, result = run_job(job, options.out, plan=plan, source=source)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
     return 1 if result["verdict"]["alarms"] else 0
 

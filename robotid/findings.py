@@ -1,11 +1,13 @@
 """What a user should know of logs, of a robot or of a result."""
 
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["Finding", "by_severity", "listed", "log_finding"]
+__all__ = ["Cause", "Finding", "by_severity", "grouped", "listed", "log_finding"]
 
 _RANK = {"error": 0, "warning": 1, "note": 2}
+_NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,25 @@ class Finding:
     where: str
     message: str
     evidence: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Findings of one code, which one thing most likely explains.
+
+    Attributes:
+        code: The code.
+        severity: That of the gravest.
+        joints: The joints that they are about, in the order of the robot; none: about all of it.
+        messages: What they say; those that differ in names and figures only are one sentence.
+        findings: The findings, the gravest first.
+    """
+
+    code: str
+    severity: str
+    joints: tuple[str, ...]
+    messages: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def log_finding(
@@ -74,3 +95,56 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         The same, sorted.
     """
     return tuple(sorted(findings, key=lambda finding: _RANK[finding.severity]))
+
+
+def grouped(findings: Iterable[Finding], joints: Sequence[str] = ()) -> tuple[Cause, ...]:
+    """Return findings by their cause, the gravest first.
+
+    Args:
+        findings: The findings.
+        joints: Names of the robot's joints, in its order.
+
+    Returns:
+        One cause for each code.
+    """
+    by_code: dict[str, list[Finding]] = {}
+    for finding in by_severity(findings):
+        by_code.setdefault(finding.code, []).append(finding)
+    causes = []
+    for code, found in by_code.items():
+        about = {joint for finding in found for joint in _joints_of(finding, joints)}
+        named = tuple(joint for joint in joints if joint in about)
+        messages = _merged(found, joints)
+        causes.append(Cause(code, found[0].severity, named, messages, tuple(found)))
+    return tuple(causes)
+
+
+def _joints_of(finding: Finding, joints: Sequence[str]) -> set[str]:
+    """Return the joints that a finding's place names, by themselves, a channel or a parameter."""
+    parts = finding.where.rpartition(": ")[2].split(", ")
+    names = {x for p in parts for x in (p, p.partition("_")[2], p.rpartition(".")[0])}
+    return names.intersection(joints)
+
+
+def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the messages, one for all that differ in names of joints and logs, and figures."""
+    logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
+    names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
+    named = "|".join(rf"(?<!\w){re.escape(name)}(?!\w)" for name in names)
+    slot = re.compile(f"({named}|{_NUMBER})" if named else f"({_NUMBER})")
+    alike: dict[tuple[str, ...], list[list[str]]] = {}
+    for finding in findings:
+        parts = slot.split(finding.message)  # text, slot, text, slot, ..., text
+        alike.setdefault(tuple(parts[::2]), []).append(parts[1::2])
+    merged = []
+    for texts, filled in alike.items():
+        words = [_in_one(list(dict.fromkeys(values))) for values in zip(*filled, strict=True)]
+        merged.append("".join(a + b for a, b in zip(texts, [*words, ""], strict=True)))
+    return tuple(merged)
+
+
+def _in_one(values: list[str]) -> str:
+    """Return names with commas, or the range of numbers."""
+    if len(values) == 1 or not all(re.fullmatch(_NUMBER, value) for value in values):
+        return ", ".join(values)
+    return f"{min(values, key=float)} to {max(values, key=float)}"

@@ -59,6 +59,6 @@ def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]
         identification=(entries[0],),
         validation=(entries[1],),
     )
-    identification, result = run_job(job, target)
+    identification, result = run_job(job, target, beside={"replay": "replay.html"})
     replay_identified(identification).write(target / "replay.html")
     return identification, result, identification.mapping.to_base(truth)

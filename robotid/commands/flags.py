@@ -11,7 +11,7 @@ from robotid.exceptions import SettingsError
 if TYPE_CHECKING:
     from robotid.commands.job import Job
 
-__all__ = ["add_flags", "job_from_flags", "refuse_log_flags", "source_settings"]
+__all__ = ["add_flags", "job_from_flags", "refuse_log_flags", "source_settings", "source_words"]
 
 
 def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -266,6 +266,23 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
         **_stated(options, list(_FLAGS)),
     }
     return job_from_settings(table, "command line", Path())
+
+
+def source_words(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the words of a command line that say what is identified, and how.
+
+    Args:
+        words: The words after ``robotid``.
+
+    Returns:
+        Those after the name of the command but for ``--out`` and what is only shown.
+    """
+    _, *rest = words
+    kept, shown = list[str](), ("--json", "--progress", "--verbose", "--resume")
+    for before, word in zip(words, rest, strict=False):
+        if before != "--out" and word not in (*shown, "--out") and not word.startswith("--out="):
+            kept.append(word)
+    return tuple(kept)
 
 
 def refuse_log_flags(options: argparse.Namespace, why: str) -> None:

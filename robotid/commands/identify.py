@@ -1,34 +1,44 @@
 """A job from its files to the folder of results."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
-from robotid.commands.job import Job
+from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import write_urdf
+from robotid.identification.advice import Origin
+from robotid.identification.drive_choice import wanted_families
+from robotid.identification.evaluation import Evaluation
 from robotid.identification.findings import locked_findings
 from robotid.identification.pipeline import Identification, conclude
 from robotid.identification.recordings import Recordings
 from robotid.identification.verdict import check_ignored
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.report.document import write_report
+from robotid.robot.drives import AUTO, DriveTerm
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["run_job"]
+__all__ = ["run_job", "save_result"]
 
 _log = logging.getLogger(__name__)
 
 
 def run_job(
-    job: Job, folder: str | Path, *, plan: WorkPlan | None = None
+    job: Job,
+    folder: str | Path,
+    *,
+    plan: WorkPlan | None = None,
+    source: Sequence[str] = (),
+    beside: Mapping[str, str] | None = None,
 ) -> tuple[Identification, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
@@ -39,6 +49,8 @@ def run_job(
         job: What to do.
         folder: Where to write; made if it is missing.
         plan: Who works on long logs; as the job says, in this process, if None.
+        source: What follows ``robotid identify`` to run it again, for the report.
+        beside: Further files that the folder will hold, by what they are, for the report.
 
     Returns:
         The identification and the content of result.json.
@@ -52,29 +64,121 @@ def run_job(
         WorkerError: If a worker ends before its work.
     """
     model, target = job.model(), Path(folder)
-    name = f"{Path(model.tree.path).stem}.identified.urdf"
-    sidecar = str(Path(name).with_suffix(".drive.json"))
-    files = ["report.html", name, sidecar]
-    check_folder(target, ["result.json", *files])
+    check_folder(target, ["result.json", *_names(model)])
     identification, checkpoint = _identify(job, model, target, plan)
+    asked = replace(identification.asked, job=job)
+    found = replace(identification, asked=asked)
+    saved = _write(found, job, target, source=source, beside=beside)
+    if checkpoint is not None:
+        checkpoint.remove()
+    return saved
+
+
+def save_result(identification: Identification, folder: str | Path, *, report: bool = True) -> Path:
+    """Write an identification as ``run_job`` does; see ``Identification.save``.
+
+    Args:
+        identification: What was found.
+        folder: Where to write; made if it is missing.
+        report: Whether report.html is written.
+
+    Returns:
+        Path of the result.json.
+
+    Raises:
+        ModelError: If the URDF that the robot was read from is gone.
+        SettingsError: If the folder is a file, or cannot be written to.
+    """
+    target = Path(folder)
+    check_folder(target, ["result.json", *_names(identification.model)])
+    asked = identification.asked
+    job = asked.job if isinstance(asked.job, Job) else _job_of(identification)
+    _write(identification, replace(job, report=report), target)
+    return target / "result.json"
+
+
+def _names(model: RobotModel) -> tuple[str, str, str]:
+    """Return the names of report, URDF and sidecar."""
+    name = f"{Path(model.tree.path).stem}.identified.urdf"
+    return "report.html", name, str(Path(name).with_suffix(".drive.json"))
+
+
+def _write(
+    identification: Identification,
+    job: Job,
+    target: Path,
+    *,
+    source: Sequence[str] = (),
+    beside: Mapping[str, str] | None = None,
+) -> tuple[Identification, dict[str, Any]]:
+    """Write all files of a result; return the identification with its report, and result.json."""
+    report, name, sidecar = _names(identification.model)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
         outputs = {}
+        written = {"urdf": name, "sidecar": sidecar} if identification.has_urdf else {}
         if job.report:
-            write_report(identification, partial / "report.html")
-            outputs["report"] = "report.html"
-            identification = replace(identification, report=str(target / "report.html"))
-        if identification.has_urdf:
+            links = {"result": "result.json", **written, **(beside or {})}
+            origin = Origin(tuple(source), str(target))
+            write_report(identification, partial / report, files=links, origin=origin)
+            outputs["report"] = report
+            identification = replace(identification, report=str(target / report))
+        if written:
             write_urdf(
                 identification.model, identification.standard, partial / name, dynamics=job.dynamics
             )
-            outputs |= {"urdf": name, "sidecar": sidecar}
+            outputs |= written
         result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")
-    _remove_stale(target / other for other in files if other not in outputs.values())
-    if checkpoint is not None:
-        checkpoint.remove()
+    others = {report, name, sidecar} - set(outputs.values())
+    _remove_stale(target / other for other in sorted(others))
     return identification, result
+
+
+def _job_of(identification: Identification) -> Job:
+    """Return the job that an identification made in Python comes from, as far as it is known.
+
+    Logs in memory have no file, and gains, units and names of columns are not in a ``Log``.
+    """
+    model, asked = identification.model, identification.asked
+    chosen = {drive.joint: drive for drive in identification.drives}
+    wanted = wanted_families(asked.friction, model.joints)
+    is_auto = all(names is None for names in wanted.values())
+    drives: dict[str, tuple[str | DriveTerm, ...]] = {}
+    for drive in model.layout.drives:
+        name, own = drive.name, model.layout.own.get(drive.name, ())
+        found = chosen.get(name)
+        stated = [term for term in own if found is None or term not in found.terms]
+        families = (wanted.get(name) or ()) if found is None else found.families
+        entries: tuple[str | DriveTerm, ...] = (*(() if is_auto else families), *stated)
+        if entries:
+            drives[name] = entries
+    options = model.options
+    return Job(
+        urdf=Path(model.tree.path),
+        joints=model.joints,
+        locked=options["locked"],
+        gravity=tuple(options["gravity"]),
+        mimic=model.mimic,
+        snap_angles=read_tree(model.tree.path).joints != model.tree.joints,
+        signals=asked.signals,
+        terms=(*model.layout.terms, *([AUTO] if is_auto else [])),
+        model_dynamics=model.dynamics,
+        drives=drives,
+        couplings=model.layout.couplings,
+        estimator=identification.estimator,
+        identification=_entries(identification.fitted),
+        validation=_entries(identification.validation),
+        ignore=asked.ignore,
+    )
+
+
+def _entries(evaluations: Sequence[Evaluation]) -> tuple[LogEntry, ...]:
+    """Return the windows of the logs that are in files."""
+    recordings = [evaluation.recording for evaluation in evaluations]
+    return tuple(
+        LogEntry(Path(r.log.path), r.extent.start, r.extent.end) for r in recordings if r.log.path
+    )
 
 
 def _remove_stale(files: Iterable[Path]) -> None:

@@ -79,13 +79,21 @@ def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, l
 
 def _load_couplings(tables: Sequence[Mapping[str, Any]]) -> tuple[Coupling, ...]:
     return tuple(
-        Coupling(table["name"], tuple((j, float(r)) for j, r in table["ratios"].items()))
+        Coupling(
+            table["name"],
+            tuple((j, float(r)) for j, r in table["ratios"].items()),
+            table.get("replaces", False),
+        )
         for table in tables
     )
 
 
 def _dump_couplings(couplings: Sequence[Coupling]) -> list[dict[str, Any]]:
-    return [{"name": coupling.name, "ratios": dict(coupling.ratios)} for coupling in couplings]
+    return [
+        {"name": coupling.name, "ratios": dict(coupling.ratios)}
+        | ({"replaces": True} if coupling.replaces else {})
+        for coupling in couplings
+    ]
 
 
 def _motors(gear: Transmission) -> list[Coupling]:
@@ -153,9 +161,10 @@ class Job(Settings):
     )
     couplings: tuple[Coupling, ...] = setting(
         (),
-        "drives that turn with several joints, each with a name and its ratios by joint [-]",
+        "drives that turn with several joints, each with a name and its ratios by joint [-]; with "
+        "replaces = true in the place of the drive of the joint whose name it has",
         at="coupling",
-        reads=[{"name": (str,), "ratios": Entries(dict, (int, float))}],
+        reads=[{"name": (str,), "ratios": Entries(dict, (int, float)), "replaces": (bool,)}],
         load=_load_couplings,
         dump=_dump_couplings,
     )

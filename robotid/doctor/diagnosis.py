@@ -19,6 +19,7 @@ from robotid.doctor.urdf_base import rounded_robot
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, log_finding
 from robotid.logs.data import Log, Trajectory
+from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -35,26 +36,32 @@ CODES = (
 
 def check_logs(
     model: RobotModel,
-    logs: Sequence[Log],
+    logs: Readable | Sequence[Readable],
     *,
-    validation: Sequence[Log] = (),
+    validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
 ) -> tuple[Finding, ...]:
     """Ask the doctor what is wrong with logs, before anything is identified from them.
 
     Args:
         model: The robot.
-        logs: Logs to fit, of the model's joints in its order.
-        validation: Logs kept apart.
+        logs: Logs to fit, one or several: of the model's joints in its order, or paths or
+            DataFrames that hold them.
+        validation: Logs kept apart, likewise.
         signals: How logs become trajectories; the defaults if None.
 
     Returns:
         The findings, errors first: each with a code, a severity, where, and what to do.
 
     Raises:
+        DataError: If a file or a DataFrame does not hold a log.
         SettingsError: If a setting does not fit a log.
     """
-    return diagnose(model, logs, validation, signals or SignalSettings())
+    first, second = (
+        read_logs(some, model.joints, prismatic=model.layout.prismatic)
+        for some in (logs, validation)
+    )
+    return diagnose(model, first, second, signals or SignalSettings())
 
 
 def diagnose(

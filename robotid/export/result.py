@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robotid._files import file_sha256, read_json
 from robotid._settings import Range
@@ -17,14 +18,19 @@ from robotid.exceptions import DataError, ModelError
 from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
-from robotid.identification.bands import REACH
+from robotid.findings import listed
+from robotid.identification.bands import REACH, FrictionCurve, usual_friction
 from robotid.identification.drive_choice import DriveChoice
 from robotid.identification.evaluation import Evaluation
+from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.pipeline import SOURCES, Identification
 from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
+from robotid.logs.data import suggestion
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -100,6 +106,7 @@ def build_result(
         outputs: Files written beside it, by kind.
     """
     model, size = identification.model, identification.model.layout.n_inertial
+    bodies, drives = parameter_entries(identification)
     return {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
@@ -125,14 +132,10 @@ def build_result(
             "stretches": identification.errors.stretches,
             "inflation": identification.errors.inflation,
         },
-        "standard_parameters": _entries(identification, range(size)),
+        "standard_parameters": bodies,
         "drive_parameters": [
             entry | {"with_urdf": float(value)}
-            for entry, value in zip(
-                _entries(identification, range(size, len(identification.standard))),
-                identification.urdf_with_drives[size:],
-                strict=True,
-            )
+            for entry, value in zip(drives, identification.urdf_with_drives[size:], strict=True)
         ],
         "motors": _motors(identification, settings),
         "own_terms": model.options["own_terms"],
@@ -215,6 +218,61 @@ class Result:
     def parameters(self) -> Array:
         """Its standard parameters, shape (p,), SI units, in ``robot.layout.names`` order."""
         return self.identified[1]
+
+    def predict(
+        self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
+    ) -> Array:
+        """Return the torques that the result predicts; see ``Identification.predict``.
+
+        Args:
+            q: Positions, shape (n,) or (N, n) [rad, m].
+            v: Velocities, likewise [rad/s, m/s]; None: at rest.
+            a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+
+        Returns:
+            Torques, likewise [N m, N].
+
+        Raises:
+            DataError: If a shape does not fit, or the result has no URDF.
+        """
+        return predict_instants(*self.identified, q, v, a)
+
+    def friction(self, joint: str) -> FrictionCurve:
+        """Return friction and offset of a joint against its speed, as it was in the fitted logs.
+
+        Args:
+            joint: The joint.
+
+        Raises:
+            DataError: If the result states none of it.
+        """
+        curves = {
+            name: about["curve"]
+            for name, about in self.content.get("friction", {}).items()
+            if "curve" in about
+        }
+        if joint not in curves:
+            raise DataError(
+                f"{self.path.name} states no friction curve of {joint!r}; joints with one: "
+                f"{listed(curves)}{suggestion(joint, curves)}"
+            )
+        curve = curves[joint]
+        v, torque, std = (np.array(curve[key]) for key in ("v", "torque", "std_error"))
+        return FrictionCurve(v, torque, std, curve["load"])
+
+    def table(self) -> Any:  # noqa: ANN401
+        """Return the parameters as a table; see ``Identification.table``."""
+        return parameter_table(
+            self.content["standard_parameters"], self.content["drive_parameters"]
+        )
+
+    def pinocchio_model(self) -> Any:  # noqa: ANN401
+        """Return Pinocchio's model of the robot; see ``Identification.pinocchio_model``.
+
+        Raises:
+            DataError: If the result has no URDF.
+        """
+        return pinocchio_model(*self.identified)
 
     @property
     def verdict(self) -> Mapping[str, Any]:
@@ -358,9 +416,19 @@ def _friction(found: Identification, drive: DriveChoice) -> dict[str, Any]:
     return {
         "terms": [*own, *drive.families],
         **told,
+        **_curve(found, drive.joint),
         "on_misfit": [name for name in found.on_misfit if name.startswith(f"{drive.joint}.")],
         "tried": [{"terms": [*own, *tried["families"]], **tried} for tried in told["tried"]],
     }
+
+
+def _curve(found: Identification, joint: str) -> dict[str, Any]:
+    """Return the friction of a joint against its speed; nothing of one that was never seen move."""
+    row = found.model.row_names.index(joint)
+    seen = [e.recording.trajectory.v[e.recording.mask[:, row], row] for e in found.fitted]
+    if not np.any(np.concatenate(seen)):
+        return {}
+    return {"curve": usual_friction(found, joint).to_dict()}
 
 
 def _inputs(identification: Identification) -> list[dict[str, Any]]:
@@ -393,22 +461,6 @@ def _base_parameters(found: Identification) -> list[dict[str, Any]]:
             "unit": units[i],
         }
         for k, (name, i) in enumerate(zip(mapping.base_names, mapping.independent, strict=True))
-    ]
-
-
-def _entries(found: Identification, numbers: range) -> list[dict[str, Any]]:
-    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    return [
-        {
-            "name": layout.names[i],
-            "value": float(found.standard[i]),
-            "std_error": _finite(found.standard_error[i]),
-            "unit": layout.units[i],
-            "prior": float(found.prior[i]),
-            "source": sources[i],
-            "at_bound": bool(at_bound[i]),
-        }
-        for i in numbers
     ]
 
 

@@ -4,6 +4,7 @@ Only the inertials of the original file change, every other byte stays. What a U
 for, armature and friction of coupled drives above all, goes into ``<name>.drive.json`` beside it.
 """
 
+import difflib
 import hashlib
 import json
 import math
@@ -34,6 +35,7 @@ __all__ = [
     "numbers_text",
     "read_sidecar",
     "terms_from_facts",
+    "urdf_changes",
     "write_urdf",
 ]
 
@@ -82,11 +84,7 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     written = link_parameters(model, pi)
     _check_target(source, goal)
     original, places = source.read_bytes(), link_places(model)
-    document = xml_splice.parse(original, source.name)
-    edits = _inertial_edits(document, written, places) + _angle_edits(document, model)
-    if dynamics:
-        edits += _dynamics_edits(document, model, pi)
-    content = xml_splice.apply(document, edits)
+    content = _content(original, model, pi, written, dynamics=dynamics)
     sidecar = goal.with_name(f"{goal.stem}.drive.json")
     readers = ["robotid", "yourdfpy"] if _suits_yourdfpy(source) else ["robotid"]
     facts = {
@@ -107,6 +105,32 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
         if "yourdfpy" in readers:
             _check_masses(partial / goal.name)
     return sidecar
+
+
+def urdf_changes(model: RobotModel, pi: Array, *, dynamics: bool = False) -> list[str]:
+    """Return how the URDF that ``write_urdf`` writes differs from the original, line by line.
+
+    Args:
+        model: The robot; the file it was read from is compared.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``.
+
+    Returns:
+        A unified diff without context; empty if the original is gone.
+
+    Raises:
+        DataError: If pi does not have p finite entries.
+        ModelError: If a link or a drive would be physically impossible, or the original cannot be
+            edited.
+    """
+    source = Path(model.tree.path)
+    if not source.is_file():
+        return []
+    original, written = source.read_bytes(), link_parameters(model, pi)
+    texts = original, _content(original, model, pi, written, dynamics=dynamics)
+    before, after = (text.decode("utf-8", errors="replace").splitlines() for text in texts)
+    names = source.name, f"{source.stem}.identified.urdf"
+    return list(difflib.unified_diff(before, after, *names, n=0, lineterm=""))
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any]:
@@ -181,6 +205,17 @@ def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[
         SettingsError: If there is no such term.
     """
     return {name: [term_from_dict(term) for term in terms] for name, terms in tables.items()}
+
+
+def _content(
+    original: bytes, model: RobotModel, pi: Array, written: Mapping[str, Array], *, dynamics: bool
+) -> bytes:
+    """Return the original URDF with the parameters of its links, written, and of its drives."""
+    document = xml_splice.parse(original, Path(model.tree.path).name)
+    edits = _inertial_edits(document, written, link_places(model)) + _angle_edits(document, model)
+    if dynamics:
+        edits += _dynamics_edits(document, model, pi)
+    return xml_splice.apply(document, edits)
 
 
 def _digest(content: bytes) -> str:

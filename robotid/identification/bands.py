@@ -1,14 +1,18 @@
 """How far predicted torques can be trusted: their bands from the covariance of the parameters."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.identification.model_error import shape_slope
-from robotid.logs.data import Trajectory
+from robotid.logs.data import Trajectory, suggestion
 from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.memory import drive_motion_along
 from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
@@ -16,10 +20,18 @@ from robotid.robot.model import RobotModel
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["REACH", "FrictionCurve", "TorqueBand", "friction_curve", "torque_band"]
+__all__ = [
+    "REACH",
+    "FrictionCurve",
+    "TorqueBand",
+    "friction_curve",
+    "torque_band",
+    "usual_friction",
+]
 
 #: Standard deviations that a 95 % band reaches.
 REACH = 1.96
+_SPEEDS = 20  # of a friction curve, either way
 _MOST = 500  # samples that a band is computed at, spread over the trajectory
 
 
@@ -78,7 +90,7 @@ def torque_band(
 
 @dataclass(frozen=True, eq=False)
 class FrictionCurve:
-    """Friction and offset of a joint's own drive while it moves steadily.
+    """Friction and offset of a drive while it moves steadily.
 
     Attributes:
         v: Speeds, shape (k,) [rad/s or m/s].
@@ -92,21 +104,86 @@ class FrictionCurve:
     std: Array
     load: float
 
+    @property
+    def half_width(self) -> Array:
+        """Half the width of the 95 % band about the torque, shape (k,) [N m or N]."""
+        return REACH * self.std
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as ``curve`` of a joint's friction in result.json has them."""
+        return {
+            "v": self.v.tolist(),
+            "torque": self.torque.tolist(),
+            "std_error": self.std.tolist(),
+            "load": self.load,
+        }
+
+
+def usual_friction(
+    found: "Identification",
+    joint: str,
+    v: ArrayLike | None = None,
+    *,
+    q: float | None = None,
+    load: float | None = None,
+) -> FrictionCurve:
+    """Return friction and offset of a drive as it was in the fitted logs; see ``friction_curve``.
+
+    Args:
+        found: The identification.
+        joint: The joint that the drive turns, or the name of a coupling.
+        v: Speeds, shape (k,) [rad/s or m/s]; None: 20 either way, from the slowest to the fastest.
+        q: Position [rad or m]; None: the median.
+        load: Torque of the bodies that the gear carries [N m or N]; None: its root mean square if
+            the friction grows with it, else 0.
+
+    Raises:
+        DataError: If there is no such drive; or without speeds, if it stood still.
+    """
+    layout, d = found.model.layout, _drive_number(found, joint)
+    ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
+    rows = [e.recording.mask[:, first:][:, ratios != 0.0].all(axis=1) for e in found.fitted]
+    motions = [e.recording.trajectory for e in found.fitted]
+    if v is None:
+        used = zip(motions, rows, strict=True)
+        speeds = np.concatenate([np.abs(m.v[kept, first:] @ ratios) for m, kept in used])
+        if not speeds.any():
+            raise DataError(
+                f"{joint} stood still in the fitted logs, so no speeds are known to show its "
+                "friction at; state them, friction(joint, v)"
+            )
+        side = np.linspace(speeds.min(), speeds.max(), _SPEEDS)
+        v = np.append(-side[::-1], side)
+    if q is None:
+        places = [m.q[kept] @ ratios for m, kept in zip(motions, rows, strict=True)]
+        q = float(np.median(np.concatenate(places))) if np.any(np.concatenate(rows)) else 0.0
+    if load is None:
+        load = 0.0
+        if any(term.name == "load" for term in layout.own.get(joint, ())):
+            carried = [drive_motion_along(found.model, m).load[d] for m in motions]
+            load = float(np.sqrt(np.mean(np.concatenate(carried)[np.concatenate(rows)] ** 2)))
+    return friction_curve(found, joint, np.asarray(v, dtype=float), q=q, load=load)
+
 
 def friction_curve(
     found: "Identification", joint: str, v: Array, *, q: float = 0.0, load: float = 0.0
 ) -> FrictionCurve:
-    """Return friction and offset of a joint against its speed.
+    """Return friction and offset of a drive against its speed, with the band of its parameters.
+
+    Friction that depends on the past is that of a drive which has moved one way for long.
 
     Args:
         found: The identification.
-        joint: The joint.
+        joint: The joint that the drive turns, or the name of a coupling.
         v: Speeds, shape (k,) [rad/s or m/s].
         q: Position, of which some friction depends [rad or m].
         load: Torque of the bodies that the gear carries [N m or N].
+
+    Raises:
+        DataError: If there is no such drive.
     """
-    layout = found.model.layout
-    d, none = layout.joints.index(joint), np.zeros_like(v)
+    layout, d = found.model.layout, _drive_number(found, joint)
+    none = np.zeros_like(v)
     motion = DriveMotion(q + none, v, none, np.sign(v), load + none, none)
     own = [
         (k, term)
@@ -126,3 +203,13 @@ def friction_curve(
             variance += np.einsum("ij,jk,ik->i", bent, C, bent)
             variance -= np.einsum("ij,jk,ik->i", moved, C, moved)
     return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)
+
+
+def _drive_number(found: "Identification", joint: str) -> int:
+    names = [drive.name for drive in found.model.layout.drives]
+    if joint not in names:
+        raise DataError(
+            f"{joint!r} is no drive of {found.model.name}; drives: {listed(names)}"
+            f"{suggestion(joint, names)}"
+        )
+    return names.index(joint)

@@ -14,7 +14,7 @@ from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
 from robotid.identification.recordings import Recordings
 from robotid.identification.survey import hold_log
-from robotid.logs.data import Log
+from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
@@ -165,8 +165,8 @@ class PayloadFit:
 
 def identify_payload(
     model: RobotModel,
-    logs: Sequence[Log],
-    reference: Sequence[Log],
+    logs: Readable | Sequence[Readable],
+    reference: Readable | Sequence[Readable],
     *,
     links: Sequence[str] = (),
     masses: Mapping[str, float] | None = None,
@@ -180,8 +180,8 @@ def identify_payload(
 
     Args:
         model: The robot, from its URDF.
-        logs: Recordings with the payloads.
-        reference: Recordings without them; whatever both have counts to the robot.
+        logs: Recordings with the payloads: a ``Log``, the path of a file, a DataFrame, or several.
+        reference: Recordings without them, likewise; whatever both have counts to the robot.
         links: Links that the payloads hang on, which may be fixed to a moving one; the last
             moving link if empty.
         masses: Masses that are known, by link [kg].
@@ -201,7 +201,10 @@ def identify_payload(
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     loaded, without = (
         Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
-        for some in (logs, reference)
+        for some in (
+            read_logs(given, model.joints, prismatic=model.layout.prismatic)
+            for given in (logs, reference)
+        )
     )
     links = links or model.layout.bodies[-1:]
     return fit_payloads(

@@ -5,9 +5,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from robotid._settings import Settings
 from robotid._typing import Array
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
@@ -22,7 +25,12 @@ from robotid.exceptions import (
     SettingsError,
 )
 from robotid.findings import Finding
-from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.bands import (
+    FrictionCurve,
+    TorqueBand,
+    torque_band,
+    usual_friction,
+)
 from robotid.identification.baselines import urdf_with_drives
 from robotid.identification.drive_choice import DriveChoice, choose_drives, wanted_families
 from robotid.identification.evaluation import Evaluation, evaluate_logs, hidden_joints, pool
@@ -31,6 +39,7 @@ from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
 from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
 from robotid.identification.model_error import settled_shapes, with_model_error
+from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -56,10 +65,12 @@ from robotid.identification.verdict import (
     refuted,
 )
 from robotid.identification.witness import Witness, call_witness
-from robotid.logs.data import Log
+from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.bodies import held_parameters
 from robotid.robot.drives import AUTO
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
@@ -67,7 +78,15 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.robot.prior import prior_spread
 
-__all__ = ["SOURCES", "EstimatorSettings", "Identification", "conclude", "identify", "with_drives"]
+__all__ = [
+    "SOURCES",
+    "Asked",
+    "EstimatorSettings",
+    "Identification",
+    "conclude",
+    "identify",
+    "with_drives",
+]
 
 #: What may have determined a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
@@ -81,6 +100,23 @@ _MOST_LOADS = 20  # fits until the load of the gears is that of the bodies found
 _DAMPED = 3  # of them, after which they go half way only
 _SETTLED = 1e-3  # of the torque, by which they may still move it
 _AT_BOUND = 1e-6  # of its spread: a drive term that small is at its bound of 0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an identification was asked for, beside robot, logs and estimator.
+
+    Attributes:
+        signals: How logs become trajectories.
+        friction: As of ``identify``.
+        ignore: As of ``identify``.
+        job: The job that was run; None if there was none.
+    """
+
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    friction: str | Mapping[str, str] = AUTO
+    ignore: tuple[str, ...] = ()
+    job: Settings | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +148,7 @@ class Identification:
         drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
         misfits: Terms that the model of its drives still lacks.
         on_misfit: Names of drive parameters whose errors grew by these.
+        asked: Signals, friction and findings to ignore, as they were asked for.
     """
 
     model: RobotModel
@@ -138,6 +175,7 @@ class Identification:
     drives: tuple[DriveChoice, ...] = ()
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
+    asked: Asked = field(default_factory=Asked)
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def __repr__(self) -> str:
@@ -151,6 +189,105 @@ class Identification:
         return identification_text(self)
 
     __str__ = summary
+
+    def predict(
+        self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
+    ) -> Array:
+        """Return the torques of motion, by the identified bodies, drives and chosen friction.
+
+        Friction acts by the sign of the speed: at rest, where it holds any torque up to its size,
+        it counts as 0. Drives whose friction has a memory (presliding) have moved one way for
+        long, and a torque that comes late (lag) is told as of an instant at which it stays.
+
+        Args:
+            q: Positions in the order of ``model.joints``, shape (n,) or (N, n) [rad, m].
+            v: Velocities, likewise [rad/s, m/s]; None: at rest.
+            a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+
+        Returns:
+            Torques, likewise [N m, N].
+
+        Raises:
+            DataError: If a shape does not fit, or a value is not finite.
+        """
+        return predict_instants(self.model, self.standard, q, v, a)
+
+    def friction(
+        self,
+        joint: str,
+        v: ArrayLike | None = None,
+        *,
+        q: float | None = None,
+        load: float | None = None,
+    ) -> FrictionCurve:
+        """Return friction and offset of a joint's drive against its speed, with their band.
+
+        Args:
+            joint: The joint, or the name of a coupling.
+            v: Speeds, shape (k,) [rad/s or m/s]; None: 20 either way, from the slowest to the
+                fastest of the fitted rows.
+            q: Position, of which some friction depends [rad or m]; None: the median.
+            load: Torque of the bodies that the gear carries, of which some friction depends
+                [N m or N]; None: its root mean square in the fitted logs.
+
+        Returns:
+            The curve: ``v``, ``torque``, ``std``, ``half_width`` of the 95 % band, ``load``.
+
+        Raises:
+            DataError: If there is no such drive; or without speeds, if it stood still.
+        """
+        return usual_friction(self, joint, v, q=q, load=load)
+
+    def table(self) -> Any:  # noqa: ANN401
+        """Return the standard parameters as a table: a row for each, links first, then drives.
+
+        Returns:
+            A pandas DataFrame if pandas is installed, else a list of dictionaries. Columns:
+            "part" (link or drive), "parameter", "urdf", "value", "std_error", "source" (as of
+            ``sources``), "unit". A URDF has no value of drives that is used, and a parameter at
+            its bound no standard error: None, or NaN in a DataFrame.
+        """
+        return parameter_table(*parameter_entries(self))
+
+    def pinocchio_model(self) -> Any:  # noqa: ANN401
+        """Return a ``pinocchio.Model`` with the identified inertias, armature and friction.
+
+        ``damping`` has the viscous friction; ``lowerDryFrictionLimit`` and
+        ``upperDryFrictionLimit``, -Fc - offset and Fc - offset, have Coulomb friction and offset.
+        ``rnea`` knows of inertias and armature only; the torque of joints that move is
+
+        ``rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
+
+        which is that of ``predict``. Drives that turn with several joints, and friction that
+        depends on load, position, past or, other than linearly, on speed have no place in it: a
+        warning names them. Locked joints are part of the links that carry them; with mimic
+        joints, or joints in another order than the URDF's, ``model.configurations(q)`` and
+        ``model.velocity_map`` lead to Pinocchio's coordinates.
+        """
+        return pinocchio_model(self.model, self.standard)
+
+    def save(self, folder: str | Path, *, report: bool = True) -> Path:
+        """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
+
+        ``robotid.load_result(folder)``, ``robotid validate`` and ``robotid replay`` read it.
+        Every file is made in a folder of its own first and put in place when all are complete.
+        A result that cannot be right has no URDF. Logs in files are named, with their hashes;
+        how their columns were read by hand (gains, units, names) is not known to it.
+
+        Args:
+            folder: Where to write; made if it is missing.
+            report: Whether report.html is written.
+
+        Returns:
+            Path of the result.json.
+
+        Raises:
+            ModelError: If the URDF that the robot was read from is gone.
+            SettingsError: If the folder is a file, or cannot be written to.
+        """
+        from robotid.commands.identify import save_result
+
+        return save_result(self, folder, report=report)
 
     @property
     def is_consistent(self) -> bool:
@@ -291,10 +428,10 @@ class Identification:
 
 
 def identify(
-    model: RobotModel,
-    logs: Sequence[Log],
+    model: RobotModel | str | Path,
+    logs: Readable | Sequence[Readable],
     *,
-    validation: Sequence[Log] = (),
+    validation: Readable | Sequence[Readable] = (),
     signals: SignalSettings | None = None,
     estimator: EstimatorSettings | str = "consistent",
     friction: str | Mapping[str, str] = AUTO,
@@ -304,9 +441,11 @@ def identify(
     """Identify a robot's parameters from motion logs, as the command line does.
 
     Args:
-        model: The robot, from its URDF.
-        logs: Recordings to fit; their joints must be the model's, in its order.
-        validation: Recordings kept apart to measure the prediction with.
+        model: The robot; or the path of its URDF, all of whose joints move.
+        logs: Recordings to fit: a ``Log`` of the model's joints in its order, the path of a file,
+            a DataFrame with the columns of such a file, or several of these. Files are read
+            whole, as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
+        validation: Recordings kept apart to measure the prediction with, likewise.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
         friction: What friction joints have beside viscous and Coulomb's, as of
@@ -315,7 +454,7 @@ def identify(
         ignore: Codes of errors and doubts that you know better.
 
     Raises:
-        DataError: If a log does not fit the model or is too short.
+        DataError: If a log cannot be read, does not fit the model or is too short.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
@@ -323,10 +462,15 @@ def identify(
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
-    if not logs:
+    model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
+    first, second = (
+        read_logs(some, model.joints, prismatic=model.layout.prismatic)
+        for some in (logs, validation)
+    )
+    if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
-    fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (logs, validation))
-    found = diagnose(model, logs, validation, settings) if doctor else ()
+    fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (first, second))
+    found = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
     return conclude(recordings, choice, found, ignore, friction=friction)
 
@@ -376,6 +520,7 @@ def conclude(
         findings=tuple(findings),
         alarms=tuple(finding.message for finding in alarms),
         doubts=doubts_of(counted, model.joints, names, is_robust=is_robust),
+        asked=Asked(recordings.fitted[0].asked, friction, tuple(ignore)),
     )
 
 

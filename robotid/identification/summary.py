@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ __all__ = [
     "identification_html",
     "identification_line",
     "identification_text",
+    "joint_reason",
     "verdict_cell",
     "verdict_lines",
 ]
@@ -117,13 +118,20 @@ def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
         joint: The joint.
         verdict: Its status and reasons, as in result.json.
     """
-    status, reasons = verdict["status"], verdict["reasons"]
-    if status == "good" or not reasons:
-        return str(status)
-    why = reasons[0]
-    if why.partition(": ")[0] == joint or joint in why.partition(": ")[0].split(", "):
-        why = why.partition(": ")[2]
-    return f"{status}: {why}"
+    status, why = verdict["status"], joint_reason(joint, verdict["reasons"])
+    return str(status) if status == "good" or not why else f"{status}: {why}"
+
+
+def joint_reason(joint: str, reasons: Sequence[str]) -> str:
+    """Return the first reason of the verdict on a joint without its name; "" if there is none.
+
+    Args:
+        joint: The joint.
+        reasons: Why, the worst first.
+    """
+    why = reasons[0] if reasons else ""
+    about, _, said = why.partition(": ")
+    return said if joint in about.split(", ") else why
 
 
 def cell(value: float | None, width: int = 7) -> str:

@@ -15,23 +15,29 @@ from robotid.identification.witness import Witness
 
 __all__ = [
     "DOUBTFUL",
+    "GOOD",
+    "POOR",
     "Doubt",
     "JointVerdict",
     "Verdict",
     "alarming",
     "check_ignored",
     "doubts_of",
+    "is_beaten",
     "is_outvoted",
     "judge",
     "refuted",
 ]
 
+#: [%] a joint predicted within this on kept recordings is predicted well.
+GOOD = 15.0
+#: [%] a joint predicted worse than this is not usable.
+POOR = 50.0
+
 _BEATEN = 1.05  # the URDF with fitted drives is better if it misses this many times less, ...
 _TIE = 0.3  # [%] ... and by this share of the torque
 _REFUTED = 5.0  # [%] a hypothesis on columns or masses is refuted by a prediction so good
 _SCALED = 2.0  # a gravity within this factor of the URDF's refutes another unit of the torque
-_GOOD = 15.0  # [%] a joint predicted within this on kept recordings is predicted well
-_POOR = 50.0  # [%] a joint predicted worse than this is not usable
 _OPTIMISM = 2.0  # an error this many times the fitted one on kept recordings shows over-fitting
 _WRONG = 2.0  # a fit that misses this many times what WLS misses ...
 _HARMLESS = 1.0  # [%] ... is doubtful, but not below this share of the torque
@@ -215,7 +221,7 @@ def judge(
     poor = sorted((reason for worse, _, _ in found.values() for reason in worse), key=_rank)
     reasons = [*alarms, *poor]
     if not validation:
-        held = f"{list(refitted)} hold rows that were fitted"
+        held = f"{listed(refitted)} hold rows that were fitted"
         why = held if refitted else "no validation log given"
         reasons.append(f"the prediction of a new motion was not evaluated: {why}")
     reasons += [reason for _, doubt, _ in found.values() for reason in doubt]
@@ -381,6 +387,16 @@ def is_outvoted(finding: Finding) -> bool:
     return finding.code == "spikes" and finding.where.rsplit(": ", 1)[-1].startswith("tau_")
 
 
+def is_beaten(measured: JointMetrics) -> bool:
+    """Return whether the URDF's bodies with fitted drives predict a joint clearly better.
+
+    Args:
+        measured: How well it is predicted.
+    """
+    driven = measured.baselines.get("urdf_with_drives")
+    return driven is not None and _error(measured) > max(_BEATEN * driven, driven + _TIE)
+
+
 def _without(metrics: Metrics, joints: Sequence[str]) -> Metrics:
     """Return metrics without those of some joints."""
     kept = {joint: m for joint, m in metrics.per_joint.items() if joint not in joints}
@@ -458,17 +474,17 @@ def _judge_joint(
         return [f"{joint}: worse than a constant torque on {log}: {why}"], []
     if urdf is not None and error > urdf:
         return [f"{joint}: {error:.1f} % on {log}, worse than the URDF's {urdf:.1f} %"], []
-    if error > _POOR:
+    if error > POOR:
         return [f"{joint}: predicted to {error:.1f} % only on {log}"], []
-    if error > _GOOD:
-        why = f"predicted to {error:.1f} % on {log} (wanted: {_GOOD:g} %)"
+    if error > GOOD:
+        why = f"predicted to {error:.1f} % on {log} (wanted: {GOOD:g} %)"
         return [], [f"{joint}: {why}; see in the report what its residual holds"]
     if fitted is not None and error > max(_OPTIMISM * _error(fitted), 5.0):
         return [], [
             f"{joint}: {error:.1f} % on {log} against {_error(fitted):.1f} % where it was fitted; "
             "record a richer motion to fit"
         ]
-    if _is_beaten(measured):
+    if is_beaten(measured):
         driven = measured.baselines["urdf_with_drives"]
         why = f"{error:.1f} % on {log}, {driven:.1f} % by the URDF with fitted drives"
         return [], [f"{joint}: {why}: leave its link at the URDF"]
@@ -481,7 +497,7 @@ def _left_to_urdf(validation: Mapping[str, Metrics]) -> list[str]:
         joint
         for metrics in validation.values()
         for joint, measured in metrics.per_joint.items()
-        if _is_beaten(measured)
+        if is_beaten(measured)
     ]
     if not worse:
         return []
@@ -490,12 +506,6 @@ def _left_to_urdf(validation: Mapping[str, Metrics]) -> list[str]:
         "identified bodies: leave the links of these joints at the URDF, as pinned in "
         "[estimator.constraints]"
     ]
-
-
-def _is_beaten(measured: JointMetrics) -> bool:
-    """Return whether the URDF's bodies with fitted drives predict clearly better."""
-    driven = measured.baselines.get("urdf_with_drives")
-    return driven is not None and _error(measured) > max(_BEATEN * driven, driven + _TIE)
 
 
 def _rank(reason: str) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place, RowReader, Table, WritableFormat, topic_note
+from robotid.logs.table import Place, RowReader, Table, WritableFormat
 
 __all__ = ["CsvFormat"]
 
@@ -30,7 +30,7 @@ class CsvFormat(WritableFormat):
     def open(self, path: Path, source: LogSource) -> Table:
         names, separator = _csv_header(path)
         rows = _CsvRows(path, names, separator)
-        return Table(names, rows.read_all, topic_note(path, source), rows)
+        return Table(names, rows.read_all, (), rows)
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         rows = np.column_stack(list(table.values()))

@@ -9,6 +9,7 @@ from robotid.exceptions import DataError
 from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
 from robotid.logs.bags import BagFormat
 from robotid.logs.csv_files import CsvFormat
+from robotid.logs.foreign_tables import with_own_names
 from robotid.logs.parquet_files import ParquetFormat
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Format, Table, WritableFormat
@@ -40,7 +41,10 @@ def open_table(path: Path, source: LogSource) -> Table:
         DataError: If the file is missing, of another suffix or broken, or its table is not found.
         MissingDependencyError: If a package that reads it is not installed.
     """
-    table = _format_of(path).open(path, source)
+    form = _format_of(path)
+    table = form.open(path, source)
+    if isinstance(form, CsvFormat | ParquetFormat):  # which have no places in them
+        table = with_own_names(table, path.name, f"{path.suffix} files", source)
     for name in table.names:
         if len(name) > _LONGEST_NAME:
             raise DataError(

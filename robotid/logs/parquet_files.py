@@ -13,7 +13,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
 from robotid.logs.settings import LogSource
-from robotid.logs.table import Place, RowReader, Table, WritableFormat, told, topic_note
+from robotid.logs.table import Place, RowReader, Table, WritableFormat, told
 
 __all__ = ["ParquetFormat", "load_pyarrow"]
 
@@ -27,7 +27,7 @@ class ParquetFormat(WritableFormat):
     def open(self, path: Path, source: LogSource) -> Table:
         with _open(path) as file:
             names = list(file.schema_arrow.names)
-        return Table(names, partial(_read, path), topic_note(path, source), _ParquetRows(path))
+        return Table(names, partial(_read, path), (), _ParquetRows(path))
 
     def write(self, table: Mapping[str, Array], path: Path) -> None:
         pa = load_pyarrow("writing Parquet")

@@ -6,9 +6,10 @@ transmission, `qm_<motor>`, `taum_<motor>` [N m] and the like of the motors stan
 """
 
 import difflib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +17,17 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
 from robotid.logs.data import Log, repeated, require_finite, require_increasing, suggestion
+from robotid.logs.foreign_tables import Frame, is_frame, open_frame, with_own_names
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
 from robotid.logs.table import Table, prefixes
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
 
-__all__ = ["LogLayout", "lay_out", "read_log", "write_log"]
+__all__ = ["LogLayout", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
+
+#: What is a log, or holds one: a file or a DataFrame with the columns of a log.
+Readable = Log | str | Path | Frame
 
 _NOUNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque or current"}
 _SI = LogUnits()
@@ -30,7 +35,7 @@ _WHOLE = LogSource()
 
 
 def read_log(
-    path: str | Path,
+    path: str | Path | Frame,
     joints: Sequence[str],
     *,
     gains: Mapping[str, float] | None = None,
@@ -42,11 +47,11 @@ def read_log(
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
 ) -> Log:
-    """Return the log in a file, in SI units; its notes tell what was ignored.
+    """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
 
     Args:
-        path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, or the folder of
-            a ROS 2 bag.
+        path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, the folder of
+            a ROS 2 bag, or a DataFrame of pandas or polars with the same columns.
         joints: Names of the joints wanted, in the order wanted.
         gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
             current with a gain is preferred to a torque column.
@@ -70,6 +75,38 @@ def read_log(
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
     return log if start is None and end is None else log.window(start, end)
+
+
+def read_logs(
+    given: Readable | Sequence[Readable], joints: Sequence[str], *, prismatic: Collection[str] = ()
+) -> tuple[Log, ...]:
+    """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
+
+    Args:
+        given: A log, a path, a DataFrame, or a sequence of these.
+        joints: Names of the joints wanted, in the order wanted.
+        prismatic: Names of joints that slide; the others turn.
+
+    Raises:
+        DataError: If it is something else, or does not hold what is wanted.
+    """
+    logs: list[Any]
+    if isinstance(given, Log | str | Path | Mapping) or is_frame(given):
+        logs = [given]
+    elif isinstance(given, Iterable):
+        logs = list(given)
+    else:
+        raise _no_log(given)
+    return tuple(
+        log if isinstance(log, Log) else read_log(log, joints, prismatic=prismatic) for log in logs
+    )
+
+
+def _no_log(thing: object) -> DataError:
+    return DataError(
+        f"a log is a {type(thing).__name__}, wanted a robotid.Log, the path of a file, a "
+        "DataFrame, or a list of these; Log(t=t, q=q, tau=tau, joints=names) makes one of arrays"
+    )
 
 
 @dataclass(frozen=True)
@@ -123,12 +160,12 @@ class LogLayout:
                 is_length = slides & ~np.array(is_motor)
                 values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
             values[kind] = self._of_joints(kind, values[kind])
-        t = self.stamps(values["time"][:, 0])
+        t, where = self.stamps(values["time"][:, 0]), Path(self.path).name or "log"
         for kind, array in values.items():
             names = ["time"] if kind == "time" else [f"{kind}_{joint}" for joint in self.joints]
-            require_finite(array, t, names, Path(self.path).name, first)
+            require_finite(array, t, names, where, first)
             array.flags.writeable = False  # so that the log need not copy it
-        require_increasing(t, Path(self.path).name, first)
+        require_increasing(t, where, first)
         return Log(
             t=t,
             q=values["q"],
@@ -158,7 +195,7 @@ class LogLayout:
 
 
 def lay_out(
-    path: str | Path,
+    path: str | Path | Frame,
     joints: Sequence[str],
     *,
     gains: Mapping[str, float] | None = None,
@@ -171,7 +208,7 @@ def lay_out(
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
     Args:
-        path: The file.
+        path: The file, or a DataFrame.
         joints: Names of the joints wanted, in the order wanted.
         gains: As of ``read_log``.
         columns: As of ``read_log``.
@@ -185,19 +222,23 @@ def lay_out(
         SettingsError: If gains, columns or the source name what is not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
-    file = Path(path)
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
-    opened = open_table(file, source)
+    if isinstance(path, str | Path):
+        where, opened = Path(path).name, open_table(Path(path), source)
+    elif is_frame(path):
+        where, opened = "log", with_own_names(open_frame(path), "log", "DataFrames", source)
+    else:
+        raise _no_log(path)
     check_transmissions(transmissions, joints)
     gears = tuple(transmissions)
+    stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     finder = _Finder(
-        file.name, opened.names, columns or {}, tuple(joints), gains or {}, source, gears,
-        [*opened.notes],
-    )  # fmt: skip
+        where, opened.names, stated, tuple(joints), gains or {}, source, gears, [*opened.notes]
+    )
     found = finder.find_all()  # names of columns by kind
     layout = LogLayout(
-        path=str(file),
+        path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
         columns=found,
         factors=finder.factors(found["tau"]),
@@ -446,7 +487,11 @@ class _Finder:
         if not logged:
             return ""
         locks = " ".join(f"--lock {joint}=0" for joint in absent)
-        return f" where it stood, as with --joints {','.join(logged)} {locks}"
+        held = ", ".join(f"{joint!r}: 0" for joint in absent)
+        return (
+            f" where it stood, as with --joints {','.join(logged)} {locks}; in Python "
+            f"RobotModel.from_urdf(..., locked={{{held}}})"
+        )
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has a position, and a torque or a current, of a joint."""

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from robotid._typing import Array
@@ -20,7 +20,6 @@ __all__ = [
     "choose",
     "prefixes",
     "told",
-    "topic_note",
 ]
 
 _PREFIXES = {
@@ -80,6 +79,7 @@ class Table:
     read: Callable[[Sequence[str]], dict[str, Array]]  # some by name, (N,); NaN where missing
     notes: tuple[str, ...] = ()  # what the reader should know
     rows: RowReader | None = None  # reads row by row; None if the format is only read whole
+    renamed: Mapping[str, str] = field(default_factory=dict)  # to the names above, from the file's
 
 
 class Format(ABC):
@@ -147,18 +147,6 @@ def choose(where: str, found: Sequence[str], noun: str, listing: str) -> str:
         f"{where} holds {len(names)} {noun}: {listed(names)}; {listing}. State one: topic = "
         f'"{names[0]}" (job file table [log], CLI --topic, Python source=LogSource(topic=...))'
     )
-
-
-def topic_note(path: Path, source: LogSource) -> tuple[str, ...]:
-    """Return the note that a topic is stated for a format that has one table, if it is.
-
-    Args:
-        path: The file.
-        source: Where in it.
-    """
-    if source.topic is None:
-        return ()
-    return (f"the topic {source.topic!r} is not used: {path.suffix} files have none",)
 
 
 @contextmanager

@@ -4,15 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.findings import listed
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import trajectory_values
+from robotid.regressor.columns import friction_directions, trajectory_values
 from robotid.regressor.compiled import work_per_sample
-from robotid.regressor.rows import COMPILED, TrajectoryRows, trajectory_rows
+from robotid.regressor.rows import BLOCK, COMPILED, TrajectoryRows, trajectory_rows
+from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = ["predict"]
+__all__ = ["predict", "predict_instants", "rigid_parts"]
 
 _START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
 
@@ -49,6 +53,90 @@ def predict(
     return _from_rows(source, np.column_stack(list(parameters)))
 
 
+def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
+    """Return gravity, inertia and velocity torques of the bodies, each (N, n_rows) [N m, N].
+
+    They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
+    tau(q, 0, a), so that their sum is the torque of the bodies.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), possible ones or not; those of drives add nothing.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+
+    Raises:
+        DataError: If q does not fit the model.
+    """
+    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+    rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
+    still = np.zeros_like(v)
+    g, g_and_Ma, whole = (rigid(model, bodies, q, *x) for x in ((still, still), (still, a), (v, a)))
+    return [g, g_and_Ma - g, whole - g_and_Ma]
+
+
+def _rows_by_pi(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+    """Return Y pi, shape (N, n_rows), without drives that remember, block by block."""
+    torque, memory = np.empty_like(v), np.zeros((len(v), len(model.layout.remembering)))
+    for start in range(0, len(v), BLOCK):
+        k = slice(start, start + BLOCK)
+        Y = joint_torque_regressor(model, q[k], v[k], a[k], memory=memory[k])
+        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque
+
+
+def predict_instants(
+    model: RobotModel,
+    pi: Array,
+    q: ArrayLike,
+    v: ArrayLike | None = None,
+    a: ArrayLike | None = None,
+) -> Array:
+    """Return the torques that parameters predict at instants that need not follow each other.
+
+    Friction acts by the sign of the speed: at rest, where it holds any torque up to its size, it
+    counts as 0. Drives whose friction has a memory have slid for long one way, under the load that
+    the bodies make, and nothing comes late. Velocities and accelerations of a robot whose
+    ``dynamics`` is "static" have no part but for the sign of friction.
+
+    Args:
+        model: The robot; its reference tells the load of the gears.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        q: Joint coordinates in the model's order, shape (n,) or (N, n) [rad, m]; seven more first
+            with a floating base.
+        v: Velocities, shape (n_rows,) or (N, n_rows) [rad/s, m/s]; None: at rest.
+        a: Accelerations, likewise [rad/s^2, m/s^2]; None: 0.
+
+    Returns:
+        Torques, shape (n_rows,) or (N, n_rows) [N m, N].
+
+    Raises:
+        DataError: If a shape does not fit, or a value is not finite.
+    """
+    q = np.asarray(q, dtype=float)
+    wanted = (*q.shape[:-1], model.n_rows)
+    if q.ndim not in (1, 2):
+        raise DataError(f"q has shape {q.shape}, wanted ({model.n_rows},) or (N, {model.n_rows})")
+    given = [np.zeros(wanted) if x is None else np.asarray(x, dtype=float) for x in (v, a)]
+    for name, x in zip("va", given, strict=True):
+        if x.shape != wanted:
+            raise DataError(
+                f"{name} has shape {x.shape}, wanted {wanted}, as q is {q.shape}: a column for "
+                f"each of {listed(model.row_names)}"
+            )
+    q, v, a = (np.atleast_2d(x) for x in (q, *given))
+    direction = friction_directions(model.layout, v, None)
+    if model.is_static:
+        v, a = np.zeros_like(v), np.zeros_like(a)
+    torque = np.empty(v.shape)
+    for start in range(0, len(v), BLOCK):
+        part = slice(start, start + BLOCK)
+        Y = joint_torque_regressor(model, q[part], v[part], a[part], direction[part])
+        torque[part] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque.reshape(wanted)
+
+
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:
     """Return the rows times the columns of (p, k), k arrays of shape (N, n_rows)."""
     torques = np.empty((stacked.shape[1], source.samples, len(source.columns)))
@@ -74,18 +162,21 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
 
 def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
     """Return the torque by the recursive Newton-Euler algorithm and the drives' terms."""
-    G, v, a = model.velocity_map, trajectory.v, trajectory.a
-    pin_model, rnea = model.with_parameters(pi).pin_model, pin.rnea
+    m, layout, theta = trajectory, model.layout, pi[model.layout.n_inertial :]
+    torque = _newton_euler(model, pi, m.q, m.v, m.a)
+    if theta.any():
+        values = trajectory_values(layout, m)
+        torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
+    return torque
+
+
+def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
+    """Return the torque of the bodies, shape (N, n_rows)."""
+    G, pin_model, rnea = model.velocity_map, model.with_parameters(pi).pin_model, pin.rnea
     data, torque = pin_model.createData(), np.empty((len(v), pin_model.nv))
     is_plain = np.array_equal(G, np.eye(len(G)))
     rates, changes = (v, a) if is_plain else (v @ G.T, a @ G.T)
-    configurations = np.ascontiguousarray(model.configurations(trajectory.q))
+    configurations = np.ascontiguousarray(model.configurations(q))
     for torque_k, *motion_k in zip(torque, configurations, rates, changes, strict=True):
         torque_k[:] = rnea(pin_model, data, *motion_k)
-    if not is_plain:
-        torque = torque @ G  # tau = G^T tau_pinocchio
-    layout, theta = model.layout, pi[model.layout.n_inertial :]
-    if theta.any():
-        values = trajectory_values(layout, trajectory)
-        torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
-    return torque
+    return torque if is_plain else torque @ G  # tau = G^T tau_pinocchio

@@ -1,19 +1,31 @@
 """The report: one HTML file that reads without a network, on a screen, a phone or paper."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
 
 from robotid._files import write_text
 from robotid.findings import listed
+from robotid.identification.advice import Origin
 from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
 from robotid.identification.summary import verdict_cell
 from robotid.logs.settings import SignalSettings
-from robotid.pages.html import code, figure, number, page, percent, table, text
+from robotid.pages.html import (
+    Section,
+    code,
+    figure,
+    folded,
+    number,
+    page,
+    percent,
+    table,
+    text,
+)
+from robotid.report.causes import findings_line, findings_section
 from robotid.report.diagnosis import (
     body_figures,
     drive_figures,
@@ -21,8 +33,10 @@ from robotid.report.diagnosis import (
     residual_section,
 )
 from robotid.report.plots import plot_torque
+from robotid.report.summary_screen import summary_screen
 from robotid.report.svg import svg_element
 from robotid.report.tables import tables
+from robotid.report.why import why_section
 from robotid.versions import __version__
 
 __all__ = ["write_report"]
@@ -30,10 +44,15 @@ __all__ = ["write_report"]
 _POINTS = 120_000  # points of all lines together: about 2 MB
 _LONGEST = 2000  # points of one line
 _MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
-_SEVERITIES = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 
 
-def write_report(identification: Identification, target: str | Path) -> Path:
+def write_report(
+    identification: Identification,
+    target: str | Path,
+    *,
+    files: Mapping[str, str] | None = None,
+    origin: Origin | None = None,
+) -> Path:
     """Write what an identification found, and how far to trust it, as one HTML file.
 
     The file fetches nothing. It is made beside its target and then put in place.
@@ -41,6 +60,9 @@ def write_report(identification: Identification, target: str | Path) -> Path:
     Args:
         identification: What was found.
         target: The file to write.
+        files: Files beside it to link to, by what they are, as "URDF".
+        origin: How it was identified and where its results are, for the commands that it shows;
+            none are shown that need what is not said.
 
     Returns:
         Path of the file.
@@ -48,29 +70,46 @@ def write_report(identification: Identification, target: str | Path) -> Path:
     Raises:
         DataError: If the folder of the target does not exist.
     """
-    made = tables(identification)
+    found, made = identification, tables(identification)
+    header = summary_screen(found, origin or Origin(), files or {}) + _made(found)
+    joints = len(found.verdict.joints)
+    counts = [found.sources.count(source) for source in ("data", "mixed")]
     sections = {
-        "errors": ("Prediction errors", _errors(identification)),
-        "torques": ("Torques over time", _torques(identification)),
-        "residuals": ("What the residuals hold", residual_section(identification)),
-        "drives": ("Drive parameters", drive_figures(identification) + made["drives"]),
+        "errors": Section("Errors", _errors(found), f"{joints} joints, by recording", False),
+        "findings": Section("Findings", findings_section(found), findings_line(found), False),
+        "torques": Section("Torques", _torques(found)),
+        "why": Section("Why each joint", why_section(found), "what its torque is made of", False),
+        "parameters": Section(
+            "Parameters",
+            made["parameters"] + folded("changes", "Changes of the URDF", made["changes"]),
+            f"{sum(counts)} of {len(found.sources)} determined by motion, in part or whole",
+            False,
+        ),
+        "appendix": Section("Appendix", _appendix(found, made)),
+    }
+    title = f"{found.model.name}: identified parameters"
+    return write_text(page(title, header, sections), target)
+
+
+def _appendix(found: Identification, made: Mapping[str, str]) -> str:
+    parts = {
+        "residuals": ("What the residuals hold", residual_section(found)),
+        "drives": ("Friction and drives", drive_figures(found)),
+        "bodies": ("Bodies beside the URDF's", body_figures(found)),
         "base": ("Base parameters", made["base"]),
-        "standard": ("Standard parameters", _standard(identification) + made["standard"]),
         "consistency": ("Physical consistency", made["consistency"]),
-        "information": ("Excitation and correlation", information_section(identification)),
+        "information": ("Excitation and correlation", information_section(found)),
         "open": ("What the data do not determine", made["open"]),
-        "warnings": ("Warnings and notes", _warnings(identification)),
         "settings": ("Settings", made["settings"]),
         "inputs": ("Inputs", made["inputs"]),
         "versions": ("Versions", made["versions"]),
     }
-    title = f"{identification.model.name}: identified parameters"
-    return write_text(page(title, _summary(identification), sections), target)
+    return "".join(folded(key, title, html) for key, (title, html) in parts.items() if html)
 
 
-def _summary(found: Identification) -> str:
-    verdict, fitted, kept = found.verdict, found.fitted, found.validation
-    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
+def _made(found: Identification) -> str:
+    """Return what was fitted to what, and figures beside which a verdict is read."""
+    fitted, kept = found.fitted, found.validation
     samples = sum(e.recording.extent.smooth for e in fitted)
     rows = sum(e.recording.extent.rows_used for e in fitted)
     chains = sorted({_chain(e.recording.signals) for e in (*fitted, *kept)})
@@ -81,13 +120,12 @@ def _summary(found: Identification) -> str:
         + (f"Kept apart for validation: {_names(kept)}. " if kept else "No log was kept apart. ")
         + f"Signals: {'; or '.join(chains)}."
     )
-    return (
-        f"<h1>{escape(found.model.name)}</h1>\n"
-        f'<div class="verdict {verdict.status}"><p>Verdict: <strong>{verdict.status}</strong></p>'
-        f"<ul>{reasons}</ul></div>\n<p>{escape(said)}</p>\n<p>{escape(_beside(found))}</p>\n"
-        f'<p class="note">Written by robotid {__version__}. SI units throughout; inertial '
-        "parameters in Pinocchio's order, inertias about the joint frame.</p>\n"
+    units = (
+        f"Written by robotid {__version__}. SI units throughout; inertial parameters in "
+        "Pinocchio's order, inertias about the joint frame."
     )
+    words = "".join(f"<p>{escape(text)}</p>\n" for text in (said, _beside(found)))
+    return folded("made", "How it was made", f'{words}<p class="note">{units}</p>\n')
 
 
 def _beside(found: Identification) -> str:
@@ -131,13 +169,13 @@ def _errors(found: Identification) -> str:
         "<p>error = 100 |τ − prediction| / |τ| over the rows used. For comparison, the error of "
         "unconstrained weighted least squares (WLS) on the same rows, of the URDF as shipped "
         "without drive parameters, of the URDF's bodies with drive terms fitted to the same rows, "
-        "of the URDF's gravity torque alone, and of predicting zero.</p>\n" + "".join(parts)
+        "and of the URDF's gravity torque alone; predicting zero scores 100.</p>\n" + "".join(parts)
     )
 
 
 def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metrics) -> str:
-    headers = ["joint", "error %", "RMSE", "unit", "R²", "rows", "WLS %", "URDF %"]
-    headers += ["URDF + drives %", "gravity only %", "zero %", "verdict", "remark"]
+    headers = ["joint", "error %", "verdict", "RMSE", "unit", "R²", "rows", "WLS %", "URDF %"]
+    headers += ["URDF + drives %", "gravity only %"]
     rows, verdicts = [], found.verdict.joints
     for name in found.model.row_names:
         m, status = ours.per_joint.get(name), "–"
@@ -145,13 +183,15 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
             status = verdict_cell(name, asdict(verdicts[name]))
         if m is None:
             dash = number(None)
-            nothing = text("does not move: no rows used")
-            rows.append([code(name), dash, dash, text(""), *[dash] * 7, text(status), nothing])
+            nothing = text(f"{status}; no rows used")
+            rows.append([code(name), dash, nothing, dash, text(""), *[dash] * 6])
             continue
+        said = "; ".join([status, *(remark for remark in _remarks(m) if remark not in status)])
         rows.append(
             [
                 code(name),
                 percent(m.relative_error_pct),
+                text(said, flag=said != status or status.startswith("poor")),
                 number(m.rmse, ".3g"),
                 text(m.unit),
                 number(m.r2, ".3f"),
@@ -160,25 +200,21 @@ def _error_table(caption: str, found: Identification, ours: Metrics, wls: Metric
                 percent(m.baselines["urdf"]),
                 percent(m.baselines.get("urdf_with_drives")),
                 percent(m.baselines["gravity_only"]),
-                percent(None if m.relative_error_pct is None else 100.0),
-                text(status, flag=status.startswith("poor")),
-                text(_remark(m), flag=True),
             ]
         )
-    return table(caption, headers, rows)
+    return table(caption, headers, rows, is_data=True)
 
 
-def _remark(measured: JointMetrics) -> str:
-    remarks = []
-    if not measured.better_than_constant:
-        remarks.append("worse than a constant")
+def _remarks(measured: JointMetrics) -> list[str]:
+    remarks = [] if measured.better_than_constant else ["worse than a constant"]
     error, urdf = measured.relative_error_pct, measured.baselines["urdf"]
     if error is not None and urdf is not None and error > urdf:
         remarks.append("worse than the URDF")
-    return ", ".join(remarks)
+    return remarks
 
 
 def _torques(found: Identification) -> str:
+    """Return the torques of each joint, those that are not good open."""
     model, evaluations = found.model, found.validation or found.fitted
     shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
     points = min(_LONGEST, max(200, _POINTS // (3 * model.n_rows * len(shown))))
@@ -191,23 +227,32 @@ def _torques(found: Identification) -> str:
     ]
     if not found.validation:
         parts.append("<p>No log was kept apart: these are the fitted logs.</p>\n")
-    for k, evaluation in enumerate(shown):
-        kind = "not fitted" if found.validation else "fitted"
-        parts.append(f"<h3>{escape(evaluation.recording.name)}: {kind}</h3>\n")
+    for evaluation in shown:
         if evaluation.recording.is_partial:
             seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth
             parts.append(
-                f"<p>A long log: {seen} of its {whole} samples are drawn, from its beginning, "
-                "middle and end; errors are of all.</p>\n"
+                f"<p>Of {escape(evaluation.recording.name)}, a long log, {seen} of its {whole} "
+                "samples are drawn, from its beginning, middle and end; errors are of all.</p>\n"
             )
-        band = found.band(evaluation)
-        figures = "".join(
-            _torque_figure(evaluation, band, row, name, unit, f"tau{k}-{row}", points)
-            for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True))
-        )
-        parts.append(f'<div class="plots">\n{figures}</div>\n')
     if left := evaluations[len(shown) :]:
         parts.append(f"<p>Not drawn, to keep the file small: {escape(_names(left))}.</p>\n")
+    bands = [found.band(evaluation) for evaluation in shown]
+    verdicts = found.verdict.joints
+    for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True)):
+        figures = "".join(
+            _torque_figure(evaluation, band, row, name, unit, f"tau{k}-{row}", points)
+            for k, (evaluation, band) in enumerate(zip(shown, bands, strict=True))
+        )
+        said = verdict_cell(name, asdict(verdicts[name])) if name in verdicts else ""
+        is_bad = said.startswith(("poor", "usable"))
+        parts.append(
+            folded(
+                f"torque-{row}",
+                f"<strong>{code(name).html}</strong> {escape(said)}",
+                f'<div class="plots">\n{figures}</div>\n',
+                is_open=is_bad,
+            )
+        )
     return "".join(parts)
 
 
@@ -226,27 +271,3 @@ def _torque_figure(
     title = f"Measured and predicted torque and residual of {name} over time; {said}"
     svg = svg_element(plot_torque(e, row, band, unit=unit, points=points), title, key)
     return figure(f"<strong>{escape(name)}</strong>: {said}", svg)
-
-
-def _standard(found: Identification) -> str:
-    return (
-        "<p>One of many sets with the same torque: the data fix the base parameters only, the "
-        "rest follows the URDF. Source: data, where the standard error is below 30 % of the "
-        "spread assumed before the fit; prior, above 90 %; mixed between.</p>\n"
-        + body_figures(found)
-    )
-
-
-def _warnings(found: Identification) -> str:
-    if not found.findings:
-        return "<p>None.</p>\n"
-    html = ""
-    for severity, title in _SEVERITIES.items():
-        rows = [
-            [code(f.code), text(f.message, flag=severity == "error"), code(f.where)]
-            for f in found.findings
-            if f.severity == severity
-        ]
-        if rows:
-            html += table(f"{title}: {len(rows)}", ["code", "message", "about"], rows)
-    return html

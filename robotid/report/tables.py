@@ -1,17 +1,20 @@
-"""The report's tables as HTML: parameters, consistency, what is open, settings, inputs."""
+"""The report's tables as HTML: parameters, changes, consistency, what is open, settings, inputs."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from robotid._files import file_sha256
+from robotid.export.urdf import urdf_changes
 from robotid.findings import listed
 from robotid.identification.evaluation import Recording
 from robotid.identification.pipeline import SOURCES, Identification
-from robotid.pages.html import Cell, code, number, percent, table, text
+from robotid.pages.html import Cell, code, number, percent, table, text, with_error
+from robotid.report.summary_screen import DETERMINED
 from robotid.robot.parameters import pseudo_inertia
 from robotid.versions import versions
 
@@ -35,9 +38,9 @@ def tables(found: Identification) -> dict[str, str]:
         found: The identification.
     """
     return {
-        "drives": _drive_table(found),
+        "parameters": _parameter_table(found),
+        "changes": _change_section(found),
         "base": _base_table(found),
-        "standard": _standard_table(found),
         "consistency": _consistency_section(found),
         "open": _open_section(found),
         "settings": _settings_tables(found),
@@ -46,59 +49,79 @@ def tables(found: Identification) -> dict[str, str]:
     }
 
 
-def _drive_table(found: Identification) -> str:
-    """Return the table of the drive parameters."""
-    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    if not layout.drive_names:
-        return "<p>None was identified.</p>\n"
-    rows = [
-        [
-            code(layout.names[i]),
-            *_value(found.standard[i], found.standard_error[i], at_bound=bool(at_bound[i])),
-            text(layout.units[i]),
-            text(
-                f"{sources[i]}, on a misfit" if layout.names[i] in found.on_misfit else sources[i]
-            ),
-        ]
-        for i in range(layout.n_inertial, len(layout.names))
-    ]
-    headers = ["parameter", "value", "standard error", "relative %", "unit", "from"]
-    return table("Armature, friction and torque offset", headers, rows)
+def _parameter_table(found: Identification) -> str:
+    """Return every parameter of the links and drives: before, after, and what determined it."""
+    layout, prior, error = found.model.layout, found.prior, found.standard_error
+    rows = []
+    for i, (name, source) in enumerate(zip(layout.names, found.sources, strict=True)):
+        owner, term = name.rsplit(".", 1)
+        value, uncertain = with_error(found.standard[i], error[i])
+        change, _ = with_error(found.standard[i] - prior[i], error[i], sign="+")
+        if not set("123456789") & set(change.html):
+            change = replace(change, html="0")
+        words = DETERMINED[source] + (", on a misfit" if name in found.on_misfit else "")
+        rows.append(
+            [
+                code(owner),
+                text(term),
+                number(prior[i]),
+                value,
+                uncertain,
+                change,
+                text(words),
+                text(layout.units[i]),
+            ]
+        )
+    headers = ["link or drive", "parameter", "URDF", "identified", "± error", "change"]
+    headers += ["determined by", "unit"]
+    return (
+        "<p>One of many sets with the same torque: the data fix the base parameters only, the "
+        "rest follows the URDF. ±: one standard error. Determined by motion, where it is below "
+        "30 % of the spread assumed before the fit; by the prior, above 90 %, which is the URDF; "
+        "at its bound, where physics allows no more.</p>\n"
+        + table("Parameters of links and drives", headers, rows, is_data=True)
+    )
+
+
+def _change_section(found: Identification) -> str:
+    """Return the lines of the URDF that change, with the name of the link before each."""
+    if not found.has_urdf:
+        return "<p>No URDF was written.</p>\n"
+    lines = urdf_changes(found.model, found.standard)
+    if not lines:
+        return "<p>The URDF is no longer where it was read.</p>\n"
+    kinds = {"-": "del", "+": "ins"}
+    html = "".join(
+        f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n" if line[0] in kinds
+        else f"<b>{escape(line)}</b>\n"
+        for line in lines[2:]
+    )  # fmt: skip
+    title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])
+    return (
+        f"<p>Of {escape(title)}; every other byte is the same.</p>\n"
+        f'<pre class="diff" tabindex="0">{html}</pre>\n'
+    )
 
 
 def _base_table(found: Identification) -> str:
     """Return the table of the base parameters."""
     mapping, units = found.mapping, found.model.layout.units
-    rows = [
-        [code(name), *_value(found.base[k], found.base_error[k]), text(units[i]), code(expression)]
-        for k, (name, i, expression) in enumerate(
-            zip(mapping.base_names, mapping.independent, mapping.expressions, strict=True)
-        )
-    ]
-    headers = ["parameter", "value", "standard error", "relative %", "unit", "stands for"]
+    open_ = set(found.determination.undetermined)
+    rows = []
+    for k, (name, i, expression) in enumerate(
+        zip(mapping.base_names, mapping.independent, mapping.expressions, strict=True)
+    ):
+        error = math.inf if name in open_ else float(found.base_error[k])
+        value, uncertain = with_error(found.base[k], error)
+        share = _relative(found.base[k], error)
+        rows.append([code(name), value, uncertain, share, text(units[i]), code(expression)])
+    headers = ["parameter", "value", "± error", "relative %", "unit", "stands for"]
     return (
         "<p>The combinations of parameters that torque depends on. Each is named after one of "
-        "its terms; a dash as standard error: not determined by the data. Standard errors rest "
-        f"on {escape(found.errors.method)}.</p>\n" + table("Base parameters", headers, rows)
+        "its terms; a dash as error: not determined by the data by itself. Errors are standard "
+        f"errors, which rest on {escape(found.errors.method)}.</p>\n"
+        + table("Base parameters", headers, rows, is_data=True)
     )
-
-
-def _standard_table(found: Identification) -> str:
-    """Return the table of the inertial parameters of the bodies."""
-    layout = found.model.layout
-    rows = [
-        [
-            code(name),
-            number(found.prior[i]),
-            number(found.standard[i]),
-            number(found.standard_error[i], ".2g"),
-            text(layout.units[i]),
-            text(found.sources[i]),
-        ]
-        for i, name in enumerate(layout.inertial_names)
-    ]
-    headers = ["parameter", "URDF", "identified", "standard error", "unit", "source"]
-    return table("Standard parameters of the bodies", headers, rows)
 
 
 def _consistency_section(found: Identification) -> str:
@@ -226,12 +249,11 @@ def _version_table() -> str:
     return table("Versions that ran", ["what", "version"], rows)
 
 
-def _value(value: float, error: float, *, at_bound: bool = False) -> list[Cell]:
-    if at_bound:
-        return [text("0, at its bound"), number(None), percent(None)]
+def _relative(value: float, error: float) -> Cell:
     relative = 100 * error / abs(value) if value and math.isfinite(error) else None
-    share = percent(relative) if relative is None or relative < 1000 else Cell("&gt; 999", "number")
-    return [number(value), number(error, ".2g"), share]
+    if relative is not None and relative >= 1000:
+        return Cell("&gt; 999", "number", relative)
+    return percent(relative)
 
 
 def _listed(title: str, names: Sequence[str]) -> str:

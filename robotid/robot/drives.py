@@ -89,6 +89,7 @@ class DriveTerm:
         preference: How much it is favoured as the name of a base parameter [-].
         usual: From where to where it usually lies, for simulated robots.
         dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
+        part: What it counts as where a torque is split: "friction", "spring" and the like.
     """
 
     seen: tuple[float, float] = _ANYWHERE
@@ -106,6 +107,7 @@ class DriveTerm:
     preference: ClassVar[float] = 1.0
     usual: ClassVar[tuple[float, float]] = (0.2, 0.9)
     dynamics: ClassVar[str | None] = None
+    part: ClassVar[str] = "friction"
 
     @property
     def name(self) -> str:
@@ -146,6 +148,7 @@ class Armature(DriveTerm):
     is_friction = False
     preference = 0.3
     usual = (0.1, 0.5)
+    part = "motor inertia"
 
     def _column(self, motion: DriveMotion) -> Array:
         return motion.a
@@ -187,6 +190,7 @@ class Offset(DriveTerm):
     is_shared = False
     is_friction = False
     usual = (-0.3, 0.3)
+    part = "offset"
 
     def _column(self, motion: DriveMotion) -> Array:
         return np.ones_like(motion.v)
@@ -319,6 +323,7 @@ class Harmonic(DriveTerm):
 
     is_shared = False
     guards = "q"
+    part = "ripple"
 
     @property
     def name(self) -> str:
@@ -425,6 +430,7 @@ class Spring(DriveTerm):
     is_shared = False
     is_friction = True
     guards = "q"
+    part = "spring"
 
     def _column(self, motion: DriveMotion) -> Array:
         return motion.q
@@ -441,6 +447,7 @@ class Hat(DriveTerm):
 
     is_shared = False
     guards = "q"
+    part = "spring"
 
     @property
     def name(self) -> str:
@@ -470,6 +477,7 @@ class Counterbalance(DriveTerm):
     is_nonnegative = True
     is_shared = False
     usual = (50.0, 90.0)
+    part = "spring"
 
     def _column(self, motion: DriveMotion) -> Array:
         turned = motion.q - self.angle
@@ -488,6 +496,7 @@ class Lag(DriveTerm):
     remembers = True
     is_friction = True
     usual = (0.005, 0.02)
+    part = "delay"
 
     def _column(self, motion: DriveMotion) -> Array:
         return -motion.rate

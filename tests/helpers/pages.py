@@ -1,5 +1,7 @@
 """What a page says, read back from its HTML: tables as text, plots in the units of their axes."""
 
+import base64
+import json
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -80,6 +82,30 @@ def percent(value):
     if value is None or not math.isfinite(value):
         return "–"
     return number(value, ".0f" if value >= 1000 else ".1f" if value >= 1 else ".2f")
+
+
+def charts(html):
+    """Return the data of a page's charts, decoded: what charts.js draws."""
+    found = []
+    for text in re.findall(
+        r'<figure class="chart">.*?<script type="application/json">(.*?)</script>', html, re.DOTALL
+    ):
+        what = json.loads(text)
+        what["x"] = _unpacked(what["x"])
+        for series in what["series"]:
+            series["y"] = _unpacked(series["y"])
+            series["half"] = None if series["half"] is None else _unpacked(series["half"])
+        found.append(what)
+    return found
+
+
+def _unpacked(packed):
+    """Return the numbers of an array in a page, the last code as NaN."""
+    codes = np.frombuffer(base64.b64decode(packed["data"]), f"<u{packed['bits'] // 8}")
+    last = 2 ** packed["bits"] - 1
+    values = packed["low"] + codes / (last - 1) * (packed["high"] - packed["low"])
+    values = np.where(codes == last, np.nan, values)
+    return 10.0**values if packed["log"] else values
 
 
 @dataclass

@@ -155,7 +155,7 @@ def test_kept_recordings_that_were_fitted_are_named():
     )
     assert found.status == "usable"
     (reason,) = found.reasons
-    assert reason.endswith("was not evaluated: ['x.csv'] hold rows that were fitted")
+    assert reason.endswith("was not evaluated: x.csv hold rows that were fitted")
 
 
 def test_a_torque_of_zero_is_no_prediction():

@@ -462,7 +462,8 @@ def test_joints_may_have_other_names_in_the_file(tmp_path):
     with refused(
         "run.csv has no column 'q_M3'; position columns found: q_M1, q_M2. Rename it, or "
         "pass columns={'q_elbow': ...}; if 'elbow' stood still, leave it out of joints and lock it "
-        "where it stood, as with --joints shoulder --lock elbow=0"
+        "where it stood, as with --joints shoulder --lock elbow=0; in Python "
+        "RobotModel.from_urdf(..., locked={'elbow': 0})"
     ):
         read_log(path, JOINTS, source=LogSource(joints={"shoulder": "M1", "elbow": "M3"}))
     with refused(

@@ -138,7 +138,8 @@ def test_missing_column_is_named_with_those_of_its_kind(run):
         f"{path.name} has no column 'tau_elbow'; torque or current columns found: "
         "tau_shoulder. Rename it, or pass columns={'tau_elbow': ...}; "
         "if 'elbow' stood still, leave it out of joints and lock it where it stood, as with "
-        "--joints shoulder --lock elbow=0"
+        "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
+        "locked={'elbow': 0})"
     ):
         read_log(path, JOINTS)
     path = run({k: v for k, v in make_table().items() if not k.startswith("q_")})
@@ -155,7 +156,8 @@ def test_misspelt_column_is_suggested(run):
         f"{path.name} has no column 'q_elbow'; position columns found: q_shoulder, q_elbow2. "
         "Did you mean 'q_elbow2'? Rename it, or pass columns={'q_elbow': 'q_elbow2'}; "
         "if 'elbow' stood still, leave it out of joints and lock it where it stood, as with "
-        "--joints shoulder --lock elbow=0"
+        "--joints shoulder --lock elbow=0; in Python RobotModel.from_urdf(..., "
+        "locked={'elbow': 0})"
     ):
         read_log(path, JOINTS)
     log = read_log(path, JOINTS, columns={"q_elbow": "q_elbow2"})
@@ -169,7 +171,8 @@ def test_the_column_of_another_joint_is_not_suggested(run):
         f"{path.name} has no column 'tau_joint_2'; torque or current columns found: "
         "tau_joint_1. Rename it, or pass columns={'tau_joint_2': ...}; "
         "if 'joint_2' stood still, leave it out of joints and lock it where it stood, as with "
-        "--joints joint_1 --lock joint_2=0"
+        "--joints joint_1 --lock joint_2=0; in Python RobotModel.from_urdf(..., "
+        "locked={'joint_2': 0})"
     ):
         read_log(path, ["joint_1", "joint_2"])
 

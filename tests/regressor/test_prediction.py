@@ -9,8 +9,9 @@ from robotid.regressor import prediction
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.columns import friction_speeds
 from robotid.regressor.compiled import is_installed
-from robotid.regressor.prediction import predict
+from robotid.regressor.prediction import predict, predict_instants
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import Lag, LoadFriction, Presliding, Stribeck
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -78,3 +79,56 @@ def test_bodies_that_are_none_keep_their_digits(mass, ur5, rng):
 def test_other_joints_are_refused(ur5, panda, rng):
     with pytest.raises(DataError, match="the trajectory has the joints"):
         predict(ur5, [ur5.standard_parameters()], motion(panda, rng, 5))
+
+
+def test_an_instant_is_predicted_as_by_inverse_dynamics_and_the_formulas_of_friction(ur5, rng):
+    terms = (LoadFriction(), Stribeck(speed=0.2), Presliding(), Lag())
+    model = ur5.with_terms({"elbow_joint": terms})
+    pi = model.standard_parameters()
+    values = dict(zip(model.layout.drive_names, rng.uniform(0.1, 0.4, 30), strict=False))
+    pi[model.layout.n_inertial :] = list(values.values())
+    m, j = motion(ur5, rng, 40), ur5.joints.index("elbow_joint")
+    rigid = predict(ur5, [ur5.standard_parameters()], m)[0]
+    expected = rigid.copy()
+    for k, joint in enumerate(ur5.joints):
+        Ia, Fv, Fc, off = (
+            values[f"{joint}.{term}"] for term in ("armature", "viscous", "coulomb", "offset")
+        )
+        expected[:, k] += Ia * m.a[:, k] + Fv * m.v[:, k] + Fc * np.sign(m.v[:, k]) + off
+    mu, hook, slide = (values[f"elbow_joint.{x}"] for x in ("load", "stribeck", "presliding"))
+    sign = np.sign(m.v[:, j])  # it has slid for long, and its torque does not change: no lag
+    expected[:, j] += sign * (mu * np.abs(rigid[:, j]) + slide)
+    expected[:, j] += hook * sign * np.exp(-np.abs(m.v[:, j]) / 0.2)
+    torque = predict_instants(model, pi, m.q, m.v, m.a)
+    np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    one = predict_instants(model, pi, m.q[3].tolist(), m.v[3], m.a[3])
+    assert one.shape == (6,)
+    np.testing.assert_array_equal(one, predict_instants(model, pi, m.q[3:4], m.v[3:4], m.a[3:4])[0])
+    at_rest = predict_instants(ur5, ur5.standard_parameters(), m.q)
+    still = predict_instants(ur5, ur5.standard_parameters(), m.q, 0 * m.v, 0 * m.a)
+    np.testing.assert_array_equal(at_rest, still)
+    many = np.tile(m.q, (20, 1))  # more than are computed at once
+    np.testing.assert_array_equal(
+        predict_instants(ur5, ur5.standard_parameters(), many)[-40:], at_rest
+    )
+
+
+def test_a_static_robot_is_predicted_by_gravity_and_the_sign_of_friction(rng):
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), dynamics="static")
+    pi, m = model.standard_parameters(), motion(model, rng, 10)
+    pi[model.layout.n_inertial :] = 0.5
+    fast = predict_instants(model, pi, m.q, m.v, m.a)
+    slow = predict_instants(model, pi, m.q, 1e-3 * m.v)
+    np.testing.assert_array_equal(fast, slow)
+    rest = predict_instants(model, pi, m.q)
+    np.testing.assert_allclose(fast - rest, 0.5 * np.sign(m.v), atol=1e-12)
+
+
+def test_instants_of_another_shape_are_refused(ur5):
+    pi = ur5.standard_parameters()
+    with pytest.raises(DataError, match=r"v has shape \(5,\), wanted \(6,\), as q is \(6,\): a"):
+        predict_instants(ur5, pi, np.zeros(6), np.zeros(5))
+    with pytest.raises(DataError, match=r"q has shape \(1, 5\), wanted \(N, 6\)"):
+        predict_instants(ur5, pi, np.zeros(5), np.zeros(6))
+    with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), wanted \(6,\) or \(N, 6\)"):
+        predict_instants(ur5, pi, np.zeros((1, 2, 6)))

@@ -3,7 +3,7 @@
 Linear inequalities, pseudo-inertias and equalities; Clarabel, and SCS as a second opinion.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -290,7 +290,16 @@ def least_squares(
         x = x + reach * y
     if _SOLVED not in statuses:
         raise _failure(name, statuses[0], cone)
-    return ConeSolution(x, iterations, f"{name}: {', then '.join(statuses)}")
+    return ConeSolution(x, iterations, f"{name}: {_in_words(statuses)}")
+
+
+def _in_words(statuses: Sequence[str]) -> str:
+    """Return how a solution and its refinements ended, the last of which may be less exact."""
+    first = _SOLVED if statuses[0] == _SOLVED else f"first {statuses[0]}"
+    count = len(statuses) - 1
+    refined = f", refined {'once' if count == 1 else f'{count} times'}" if count else ""
+    last = statuses[-1]
+    return first + refined + ("" if last == _SOLVED else f", the last time to {last} only")
 
 
 def nearest(points: Array, cone: Cone, *, max_iterations: int = 200) -> tuple[Array, list[str]]:

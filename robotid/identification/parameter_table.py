@@ -1,0 +1,86 @@
+"""The identified parameters as a table for Python: a row per parameter."""
+
+import math
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from robotid.pages.html import code, number, table, text
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = ["HEADERS", "ParameterRows", "parameter_entries", "parameter_table"]
+
+#: What a row says: link or drive, parameter, the URDF's value, the identified one, its standard
+#: error, what determined it, unit.
+HEADERS = ("part", "parameter", "urdf", "value", "std_error", "source", "unit")
+
+
+class ParameterRows(list[dict[str, Any]]):
+    """The rows without pandas: a list of dictionaries, which a notebook shows as a table."""
+
+    def _repr_html_(self) -> str:
+        cells = [
+            [
+                code(row["part"]),
+                code(row["parameter"]),
+                *(number(row[key]) for key in ("urdf", "value", "std_error")),
+                text(row["source"]),
+                text(row["unit"]),
+            ]
+            for row in self
+        ]
+        return table("Parameters", HEADERS, cells)
+
+
+def parameter_entries(found: "Identification") -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the parameters of the bodies and those of the drives, as result.json has them.
+
+    Args:
+        found: The identification.
+    """
+    layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
+    errors = found.standard_error
+    entries = [
+        {
+            "name": name,
+            "value": float(found.standard[i]),
+            "std_error": float(errors[i]) if math.isfinite(errors[i]) else None,
+            "unit": layout.units[i],
+            "prior": float(found.prior[i]),
+            "source": sources[i],
+            "at_bound": bool(at_bound[i]),
+        }
+        for i, name in enumerate(layout.names)
+    ]
+    return entries[: layout.n_inertial], entries[layout.n_inertial :]
+
+
+def parameter_table(
+    bodies: Iterable[Mapping[str, Any]], drives: Iterable[Mapping[str, Any]]
+) -> Any:  # noqa: ANN401
+    """Return the parameters of a result as a table, links first, then drives.
+
+    Args:
+        bodies: Parameters of the bodies, as of ``parameter_entries``.
+        drives: Those of the drives. What the URDF says of them is not used: it has no value.
+
+    Returns:
+        A pandas DataFrame if pandas is installed, else a list of dictionaries; of ``HEADERS``.
+        What has no value, as the standard error of a parameter at its bound, is None; NaN in a
+        DataFrame.
+    """
+    entries = [*bodies, *({**entry, "prior": None} for entry in drives)]
+    rows = ParameterRows()
+    for entry in entries:
+        part, _, parameter = entry["name"].rpartition(".")
+        values = [entry.get("prior"), entry["value"], entry.get("std_error")]
+        row = (part, parameter, *values, entry.get("source", ""), entry["unit"])
+        rows.append(dict(zip(HEADERS, row, strict=True)))
+    if find_spec("pandas") is None:
+        return rows
+    import pandas
+
+    frame = pandas.DataFrame(rows, columns=list(HEADERS))
+    return frame.astype(dict.fromkeys(("urdf", "value", "std_error"), float))

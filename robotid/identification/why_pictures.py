@@ -1,0 +1,122 @@
+"""Charts of what a joint's torque consists of, of its power, and of what its residual follows."""
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.identification.bands import REACH
+from robotid.identification.dependence import Dependence
+from robotid.identification.torque_split import JointTorque
+from robotid.pages.charts import Chart, Series, broken
+
+__all__ = ["why_charts"]
+
+_POINTS = 600  # of a chart
+_TONES = {
+    "gravity": "tone-1",
+    "inertia": "tone-4",
+    "Coriolis": "tone-7",
+    "friction": "tone-3",
+    "motor inertia": "tone-6",
+    "offset": "tone-8",
+    "spring": "tone-5",
+    "ripple": "urdf",
+    "delay": "quiet",
+}
+
+
+def why_charts(torque: JointTorque, *, points: int = _POINTS) -> dict[str, Chart]:
+    """Return the charts of a joint by what they show.
+
+    They are "split", the parts of the torque stacked over time; one for each quantity that the
+    residual may follow, by its name; and "power", where a speed is known. Those over time show the
+    first recording.
+
+    Args:
+        torque: Torque of the joint, from ``joint_torques``.
+        points: About how many rows each of them shows.
+    """
+    charts = {"split": _split(torque, points)}
+    for dependence in torque.follows:
+        if dependence.name in (*torque.quantities, "time"):
+            charts[dependence.name] = _residual(torque, dependence, points)
+    if torque.power is not None:
+        charts["power"] = _power(torque, torque.power, points)
+    return charts
+
+
+def _split(torque: JointTorque, points: int) -> Chart:
+    k = _first(torque, points)
+    parts = {name: torque.parts[name][k] for name in torque.present}
+    lines = [*parts.values(), torque.residual[k], torque.tau[k]]
+    t, *lines = broken(torque.rows.segment[k], torque.rows.t[k], *lines)
+    *stacked, residual, tau = lines
+    areas = [Series(name, y, _TONES[name], "area") for name, y in zip(parts, stacked, strict=True)]
+    return Chart(
+        title=f"Torque of {torque.joint} over time, the sum of {', '.join(parts)} and residual",
+        x=t,
+        series=(
+            *areas,
+            Series("residual", residual, "residual", "area"),
+            Series("measured", tau, "text"),
+        ),
+        x_label="time [s]",
+        y_label=f"torque [{torque.unit}]",
+        link=torque.rows.recordings[0],
+        spans=_unused(torque, k),
+        height=240,
+    )
+
+
+def _power(torque: JointTorque, power: Array, points: int) -> Chart:
+    k = _first(torque, points)
+    speed = torque.quantities["speed"][1]
+    lost = torque.parts.get("friction", np.zeros_like(speed)) * speed
+    t, whole, heat = broken(torque.rows.segment[k], torque.rows.t[k], power[k], lost[k])
+    return Chart(
+        title=f"Mechanical power of {torque.joint} over time, and that of its friction",
+        x=t,
+        series=(Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")),
+        x_label="time [s]",
+        y_label="power [W]",
+        link=torque.rows.recordings[0],
+        height=120,
+    )
+
+
+def _residual(torque: JointTorque, dependence: Dependence, points: int) -> Chart:
+    name, unit = dependence.name, dependence.unit
+    x = torque.rows.time if name == "time" else torque.quantities[name][1]
+    rows = np.flatnonzero(torque.used)
+    rows = rows[np.argsort(x[rows])]
+    k = rows[_evenly(len(rows), points)]
+    mean, error = dependence.at(x[k])
+    is_one = name == "time" and len(torque.rows.recordings) == 1
+    return Chart(
+        title=f"Residual of {torque.joint} against {name}, with its mean and 95 % interval",
+        x=x[k],
+        series=(
+            Series("residual", torque.residual[k], "residual", "dots", is_faint=True),
+            Series("mean", mean, "text", half=REACH * error),
+        ),
+        x_label=f"{name} [{unit}]",
+        y_label=f"residual [{torque.unit}]",
+        link=torque.rows.recordings[0] if is_one else "",
+        height=120,
+    )
+
+
+def _first(torque: JointTorque, points: int) -> Array:
+    """Return rows spread evenly over the first recording."""
+    own = np.flatnonzero(torque.rows.recording == 0)
+    return own[_evenly(len(own), points)]
+
+
+def _evenly(count: int, most: int) -> Array:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def _unused(torque: JointTorque, k: Array) -> tuple[tuple[float, float], ...]:
+    """Return the stretches of time whose rows are not used."""
+    t, edges = torque.rows.t[k], np.flatnonzero(np.diff(np.r_[0, ~torque.used[k], 0]))
+    last = len(t) - 1
+    return tuple((float(t[start]), float(t[min(end, last)])) for start, end in edges.reshape(-1, 2))

@@ -1,0 +1,450 @@
+"""Charts of the pages: data and a still picture in HTML, which charts.js makes explorable."""
+
+import base64
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+
+__all__ = ["Chart", "Series", "broken", "chart_html", "thin"]
+
+_KINDS = ("line", "dots", "bars", "area")
+_POINTS = 2000  # rows of a chart's data
+_STILL = 200  # points of a line in the still picture
+_WIDTH = 640  # [px] of the still picture
+_LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 20, 34  # [px] around its axes
+_THIN = 0.05  # [px] what covers no more is not drawn
+_LETTER = 6.2  # [px] about the width of one
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One line, cloud or set of bars of a chart.
+
+    Attributes:
+        label: Its name in the legend.
+        y: Values, shape (N,), NaN where the line breaks.
+        tone: Its colour: a variable of tones.css without its dashes, as "predicted" or "tone-1".
+        kind: "line", "dots", "bars", which stand side by side, or "area"; the areas of a chart
+            are stacked, what is positive upwards and what is negative downwards.
+        half: Half width of a band about a line, of error bars about dots and bars, shape (N,).
+        is_faint: Whether it stands back behind the others.
+    """
+
+    label: str
+    y: Array
+    tone: str
+    kind: str = "line"
+    half: Array | None = None
+    is_faint: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A chart: series over a common x.
+
+    Attributes:
+        title: What it shows in words, for those who cannot see it.
+        x: Shape (N,); the log's own time where it is time. Rows are drawn in its order.
+        series: What is drawn, the last on top.
+        x_label: Its name and unit, as "time [s]".
+        y_label: Name and unit of the values, as "torque [N m]".
+        link: Charts of one link share the cursor and the zoom along x.
+        spans: Stretches of x with a shaded ground, as rows that are not used.
+        marks: Where dotted lines stand on x.
+        logarithmic: Which axes are: "", "x", "y" or "xy".
+        height: Of the plot [px].
+        x_names: Names at x = 0, 1, ... in place of numbers, if any.
+
+    Raises:
+        DataError: If a series has not as many values as x, or is of no known kind.
+    """
+
+    title: str
+    x: Array
+    series: tuple[Series, ...]
+    x_label: str
+    y_label: str
+    link: str = ""
+    spans: tuple[tuple[float, float], ...] = ()
+    marks: tuple[float, ...] = ()
+    logarithmic: str = ""
+    height: int = 180
+    x_names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for series in self.series:
+            if series.kind not in _KINDS:
+                raise DataError(
+                    f"series '{series.label}' of the chart '{self.title}' is of kind "
+                    f"'{series.kind}'; kinds: {', '.join(_KINDS)}"
+                )
+            for what, values in (("values", series.y), ("half widths", series.half)):
+                if values is not None and np.shape(values) != np.shape(self.x):
+                    raise DataError(
+                        f"series '{series.label}' of the chart '{self.title}' has "
+                        f"{np.size(values)} {what}, its x has {np.size(self.x)}"
+                    )
+
+
+def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int = _STILL) -> str:
+    """Return a chart as a figure of a page that ``pages.html`` makes.
+
+    It holds a still picture, for print and where no script runs, and the data that charts.js
+    draws: numbers of 16 bits, so they are exact to 1/65,000 of their range.
+
+    Args:
+        chart: The chart.
+        caption: HTML of the caption.
+        points: About how many rows of data go into the page; extremes and breaks are kept.
+        still: About how many of them the still picture shows.
+    """
+    order = np.argsort(chart.x, kind="stable")
+    x = np.asarray(chart.x, dtype=float)[order]
+    series = [(s, _sorted(s.y, order), _sorted(s.half, order)) for s in chart.series]
+    rows = _union([y for _, y, _ in series], points, len(x))
+    is_log = "y" in chart.logarithmic
+    data = {
+        "title": chart.title,
+        "x": _packed(x[rows], is_log="x" in chart.logarithmic, bits=32),
+        "series": [
+            {
+                "label": s.label,
+                "tone": s.tone,
+                "kind": s.kind,
+                "faint": s.is_faint,
+                "y": _packed(y[rows], is_log=is_log),
+                "half": None if half is None else _packed(half[rows]),
+            }
+            for s, y, half in series
+        ],
+        "x_label": chart.x_label,
+        "y_label": chart.y_label,
+        "link": chart.link,
+        "spans": chart.spans,
+        "marks": chart.marks,
+        "logarithmic": chart.logarithmic,
+        "height": chart.height,
+        "x_names": chart.x_names,
+    }
+    # "<" is an escape in JSON, so no text in it can end the script
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    return (
+        f'<figure class="chart"><figcaption>{caption}</figcaption>{_still(chart, x, series, still)}'
+        f'<script type="application/json">{text}</script></figure>\n'
+    )
+
+
+def thin(y: Array, points: int) -> NDArray[np.int_]:
+    """Return the rows of a line that are enough to draw it: its extremes and its breaks.
+
+    Args:
+        y: Values, shape (N,), NaN where the line breaks.
+        points: About how many rows to keep.
+
+    Returns:
+        The rows, in order: all where there are no more than asked for.
+    """
+    count = len(y)
+    if count <= points:
+        return np.arange(count)
+    width = -(-2 * count // points)
+    finite = np.isfinite(y)
+    first = width * np.arange(-(-count // width))
+    below, above = (
+        np.pad(np.where(finite, y, no), (0, -count % width), constant_values=no).reshape(-1, width)
+        for no in (np.inf, -np.inf)
+    )
+    extremes = np.r_[first + below.argmin(axis=1), first + above.argmax(axis=1)]
+    breaks = np.flatnonzero(finite[1:] != finite[:-1])
+    kept = np.r_[
+        0, extremes[finite[np.minimum(extremes, count - 1)]], breaks, breaks + 1, count - 1
+    ]
+    return np.unique(np.minimum(kept, count - 1))
+
+
+def broken(segment: Array, x: Array, *lines: Array) -> tuple[Array, ...]:
+    """Return x and lines with a row of NaN between the stretches of a recording.
+
+    Args:
+        segment: Number of the uninterrupted stretch of each row, shape (N,).
+        x: Times, shape (N,).
+        *lines: Values over it, shape (N,) each.
+    """
+    ends = np.flatnonzero(np.diff(segment)) + 1
+    between = (x[ends - 1] + x[ends]) / 2
+    return np.insert(x, ends, between), *(np.insert(y, ends, np.nan) for y in lines)
+
+
+def _sorted(values: Array | None, order: NDArray[np.int_]) -> Any:  # noqa: ANN401
+    return None if values is None else np.asarray(values, dtype=float)[order]
+
+
+def _union(lines: Sequence[Array], points: int, count: int) -> NDArray[np.int_]:
+    """Return rows that are enough for every line."""
+    if count <= points:
+        return np.arange(count)
+    share = max(points // len(lines), 8)
+    return np.unique(np.concatenate([thin(y, share) for y in lines]))
+
+
+def _packed(values: Array, *, is_log: bool = False, bits: int = 16) -> dict[str, Any]:
+    """Return numbers as base64: steps from low to high, the last code for what is none."""
+    code, last = np.dtype(f"<u{bits // 8}"), 2**bits - 1
+    if is_log:
+        values = np.log10(np.where(values > 0, values, np.nan))
+    finite = np.isfinite(values)
+    low, high = _extent([values[finite]], margin=0.0)
+    steps = np.rint((values[finite] - low) / ((high - low) or 1.0) * (last - 1))
+    codes = np.full(len(values), last, dtype=code)
+    codes[finite] = steps.astype(code)
+    data = base64.b64encode(codes.tobytes()).decode("ascii")
+    return {"data": data, "low": low, "high": high, "log": is_log, "bits": bits}
+
+
+def _extent(arrays: Sequence[Array], margin: float) -> tuple[float, float]:
+    """Return the smallest and the largest number, and a margin [share] around them."""
+    every = np.concatenate([np.ravel(a) for a in arrays]) if arrays else np.empty(0)
+    every = every[np.isfinite(every)]
+    if not len(every):
+        return 0.0, 1.0
+    low, high = float(every.min()), float(every.max())
+    beyond = margin * ((high - low) or 2.0 * abs(low) or 2.0)
+    return low - beyond, high + beyond
+
+
+# ---- the still picture -----------------------------------------------------------------------
+
+_Drawn = tuple[Series, Array, Array | None]  # a series, its sorted values and half widths
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Numbers to pixels."""
+
+    low: float
+    high: float
+    start: float
+    stop: float
+    is_log: bool
+
+    def __call__(self, values: Array | float) -> Array:
+        v = np.asarray(values, dtype=float)
+        if self.is_log:
+            v = np.log10(np.where(v > 0, v, np.nan))
+        share = (v - self.low) / (self.high - self.low)
+        return np.asarray(self.start + share * (self.stop - self.start))
+
+    @property
+    def ticks(self) -> list[float]:
+        if self.is_log:
+            few = self.high - self.low < 1.5
+            decades = range(int(np.floor(self.low)), int(np.ceil(self.high)) + 1)
+            every = [s * 10.0**d for d in decades for s in ((1, 2, 5) if few else (1,))]
+            return [v for v in every if self.low <= np.log10(v) <= self.high]
+        apart = 28.0 if self.stop < self.start else 80.0  # [px] at least
+        raw = (self.high - self.low) * apart / abs(self.stop - self.start)
+        step = 10.0 ** np.floor(np.log10(raw))
+        step *= next(s for s in (1, 2, 5, 10) if s * step >= raw)
+        first, last = np.ceil(self.low / step), np.floor(self.high / step)
+        return [float(k * step) for k in np.arange(first, last + 1)]
+
+
+_Cover = list[tuple[Array, Array]]  # lower and upper edges of what a series covers
+
+
+def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
+    """Return what each series covers; an area covers what is positive and what is negative."""
+    covers: list[_Cover] = []
+    up = down = np.zeros(0)  # where the areas that come next begin
+    for s, y, half in series:
+        if s.kind == "area":
+            up, down = (up, down) if len(up) else (np.zeros(len(y)), np.zeros(len(y)))
+            higher, lower = up + np.fmax(y, 0.0), down + np.fmin(y, 0.0)
+            covers.append([(up, higher), (lower, down)])
+            up, down = higher, lower
+        else:
+            reach = 0.0 if half is None else np.where(np.isfinite(half), half, 0.0)
+            zero = 0.0 if s.kind == "bars" else np.nan
+            covers.append([(np.fmin(y - reach, zero), np.fmax(y + reach, zero))])
+    return covers
+
+
+def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str:
+    """Return the chart as an ``<svg>`` of a few points."""
+    covers = _covers(series)
+    height = _TOP + chart.height + _BOTTOM
+    logs = ["x" in chart.logarithmic, "y" in chart.logarithmic]
+    edges = [edge for cover in covers for pair in cover for edge in pair]
+    values = [x, np.concatenate(edges or [np.empty(0)])]
+    scaled = [np.log10(v[v > 0]) if log else v for v, log in zip(values, logs, strict=True)]
+    wide = any(s.kind == "bars" for s in chart.series) or chart.x_names
+    across = _Axis(
+        *_extent([scaled[0]], 0.5 / max(len(x) - 1, 1) if wide else 0.0),
+        _LEFT, _WIDTH - _RIGHT, logs[0],
+    )  # fmt: skip
+    if across.high == across.low:
+        across = _Axis(across.low - 0.5, across.low + 0.5, _LEFT, _WIDTH - _RIGHT, logs[0])
+    up = _Axis(*_extent([scaled[1]], 0.04), _TOP + chart.height, _TOP, logs[1])
+    drawn = "".join(
+        _drawn(chart, x, item, cover, across, up, points)
+        for item, cover in zip(series, covers, strict=True)
+    )
+    return (
+        f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(chart.title)}" '
+        f'font-size="11" fill="currentColor">{_frame(chart, across, up)}{drawn}'
+        f"{_legend(chart)}</svg>"
+    )
+
+
+def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
+    """Return shaded stretches, grid, ticks, dotted marks and the name of the x axis."""
+    bottom, right = up.start, across.stop
+    parts = []
+    for start, end in chart.spans:
+        left, stop = np.clip(across(np.array([start, end])), _LEFT, right)
+        parts.append(
+            f'<path d="M{left:.1f} {_TOP}H{max(stop, left + 0.5):.1f}V{bottom:.0f}H{left:.1f}z" '
+            'fill-opacity="0.09"/>'
+        )
+    grid = "".join(f"M{_LEFT} {up(v):.1f}H{right}" for v in up.ticks)
+    columns = list(range(len(chart.x_names))) or across.ticks
+    grid += "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in columns)
+    parts.append(f'<path d="{grid}" stroke="currentColor" stroke-opacity="0.15"/>')
+    for v in up.ticks:
+        parts.append(
+            f'<text x="{_LEFT - 6}" y="{up(v) + 4:.1f}" text-anchor="end">{_number(v)}</text>'
+        )
+    for v in columns:
+        name = escape(chart.x_names[int(v)]) if chart.x_names else _number(v)
+        parts.append(
+            f'<text x="{across(v):.1f}" y="{bottom + 14:.0f}" text-anchor="middle">{name}</text>'
+        )
+    dotted = "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in chart.marks)
+    if dotted:
+        parts.append(f'<path d="{dotted}" stroke="currentColor" stroke-dasharray="1 3"/>')
+    middle = (_LEFT + right) / 2
+    parts.append(
+        f'<text x="{middle:.0f}" y="{bottom + 29:.0f}" text-anchor="middle">'
+        f"{escape(chart.x_label)}</text>"
+    )
+    return "".join(parts)
+
+
+def _legend(chart: Chart) -> str:
+    """Return the name of the values, and a patch of colour and the label of each series."""
+    parts = [f'<text x="4" y="12">{escape(chart.y_label)}</text>']
+    place = 4 + _LETTER * (len(chart.y_label) + 3)
+    for series in chart.series:
+        opacity = 0.5 if series.is_faint else 1.0
+        parts.append(
+            f'<path d="M{place:.0f} 8h12" stroke="var(--{series.tone})" stroke-width="4" '
+            f'stroke-opacity="{opacity}"/>'
+            f'<text x="{place + 16:.0f}" y="12">{escape(series.label)}</text>'
+        )
+        place += 16 + _LETTER * (len(series.label) + 3)
+    return "".join(parts)
+
+
+def _drawn(
+    chart: Chart,
+    x: Array,
+    item: _Drawn,
+    cover: _Cover,
+    across: _Axis,
+    up: _Axis,
+    points: int,
+) -> str:
+    """Return one series as paths."""
+    series, y, half = item
+    colour, faint = f"var(--{series.tone})", 0.5 if series.is_faint else 1.0
+    if series.kind == "bars":
+        group = [s for s in chart.series if s.kind == "bars"]
+        slot = 0.8 / len(group) * float(np.min(np.diff(x))) if len(x) > 1 else 0.8 / len(group)
+        x = x + slot * (group.index(series) - (len(group) - 1) / 2)
+        width = 0.9 * float(across(x[0] + slot) - across(x[0])) if len(x) else 0.0
+        zero = float(up(0.0))
+        path = "".join(
+            f"M{a - width / 2:.1f} {zero:.1f}h{width:.1f}V{b:.1f}h{-width:.1f}z"
+            for a, b in _finite(across(x), up(y))
+        )
+        drawn = f'<path d="{path}" fill="{colour}" fill-opacity="{faint}"/>'
+        return drawn + (_whiskers(x, y, half, across, up, "currentColor"))
+    if series.kind == "dots":
+        rows = np.flatnonzero(np.isfinite(y))[:: max(1, int(np.isfinite(y).sum()) // (2 * points))]
+        path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in _finite(across(x[rows]), up(y[rows])))
+        return (
+            f'<path d="{path}" stroke="{colour}" stroke-width="3" stroke-linecap="round" '
+            f'stroke-opacity="{faint}"/>{_whiskers(x, y, half, across, up, colour)}'
+        )
+    if series.kind == "area":
+        style = f'fill="{colour}" fill-opacity="{0.7 * faint}"'
+        return _band(x, y, cover, across, up, style, points)
+    under = ""
+    if half is not None:
+        style = f'fill="{colour}" fill-opacity="0.2"'
+        under = _band(x, y, cover, across, up, style, points)
+    rows = thin(y, points)
+    path = "".join(_path(across(x[rows])[r], up(y[rows])[r]) for r in _runs(y[rows]))
+    return (
+        f'{under}<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.2" '
+        f'stroke-opacity="{faint}"/>'
+    )
+
+
+def _band(
+    x: Array, y: Array, cover: _Cover, across: _Axis, up: _Axis, style: str, points: int
+) -> str:
+    """Return what lies between edges, as a path."""
+    breaks = np.flatnonzero(np.diff(np.isfinite(y)))
+    step = max(1, len(x) // points)
+    rows = np.unique(np.r_[np.arange(0, len(x), step), breaks, breaks + 1, len(x) - 1])
+    at = across(x[rows])
+    path = ""
+    for low, high in cover:
+        lower, upper = up(low[rows]), up(high[rows])
+        is_wide = np.abs(upper - lower) > _THIN
+        is_seen = is_wide | np.r_[is_wide[1:], False] | np.r_[False, is_wide[:-1]]
+        path += "".join(
+            _path(np.r_[at[r], at[r][::-1]], np.r_[upper[r], lower[r][::-1]]) + "z"
+            for r in _runs(np.where(is_seen, lower + upper + y[rows], np.nan))
+        )
+    return f'<path d="{path}" {style}/>'
+
+
+def _whiskers(x: Array, y: Array, half: Array | None, across: _Axis, up: _Axis, colour: str) -> str:
+    if half is None:
+        return ""
+    at, low, high = across(x), up(y - half), up(y + half)
+    known = np.isfinite(at + low + high)
+    path = "".join(
+        f"M{a:.1f} {b:.1f}V{c:.1f}"
+        for a, b, c in zip(at[known], low[known], high[known], strict=True)
+    )
+    return f'<path d="{path}" stroke="{colour}" stroke-width="1.2"/>'
+
+
+def _runs(y: Array) -> list[slice]:
+    """Return the stretches of finite numbers."""
+    edges = np.flatnonzero(np.diff(np.r_[False, np.isfinite(y), False].astype(int)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _path(x: Array, y: Array) -> str:
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+
+
+def _finite(x: Array, y: Array) -> Iterator[tuple[float, float]]:
+    known = np.isfinite(x + y)
+    return zip(x[known].tolist(), y[known].tolist(), strict=True)
+
+
+def _number(value: float) -> str:
+    return f"{value + 0.0:.6g}".replace("-", "−")  # no minus before a zero

@@ -1,0 +1,73 @@
+"""The report's findings, by their cause and by the joint that they are about."""
+
+from collections.abc import Sequence
+from html import escape
+
+from robotid.findings import Cause, grouped
+from robotid.identification.pipeline import Identification
+from robotid.pages.html import code, table, text
+from robotid.report.summary_screen import joint_errors
+
+__all__ = ["findings_line", "findings_section"]
+
+
+def findings_line(found: Identification) -> str:
+    """Return how many findings there are of how many causes, and on which joint it is worst.
+
+    Args:
+        found: The identification.
+    """
+    grave = [finding for finding in found.findings if finding.severity != "note"]
+    notes = len(found.findings) - len(grave)
+    noted = [_count(notes, "note")] if notes else []
+    if not grave:
+        return ", ".join(noted) or "none"
+    causes = grouped(grave, found.model.joints)
+    worst = next(iter(joint_errors(found)), "")
+    said = f"{_count(len(grave), 'finding')}, {_count(len(causes), 'cause')}"
+    return "; ".join([said, *([f"worst: {escape(worst)}"] if worst else []), *noted])
+
+
+def findings_section(found: Identification) -> str:
+    """Return the causes with what was found, the gravest first, and the causes of each joint.
+
+    Args:
+        found: The identification.
+    """
+    causes = grouped(found.findings, found.model.joints)
+    if not causes:
+        return "<p>None.</p>\n"
+    return "".join(_cause(cause) for cause in causes) + _by_joint(found, causes)
+
+
+def _cause(cause: Cause) -> str:
+    """Return one cause: what was found, once, and each finding where there are several."""
+    said = "".join(f"<p>{escape(message)}</p>\n" for message in cause.messages)
+    about = f" {escape(', '.join(cause.joints))}" if cause.joints else ""
+    each = ""
+    if len(cause.findings) > len(cause.messages):
+        items = "".join(f"<li>{escape(finding.message)}</li>" for finding in cause.findings)
+        title = f"each of {len(cause.findings)} findings"
+        each = f"<details><summary>{title}</summary><ul>{items}</ul></details>\n"
+    return (
+        f'<div class="cause {cause.severity}" id="cause-{escape(cause.code)}"><h3>'
+        f"<strong>{cause.severity}</strong> {code(cause.code).html}{about}</h3>\n"
+        f"{said}{each}</div>\n"
+    )
+
+
+def _by_joint(found: Identification, causes: Sequence[Cause]) -> str:
+    rows = []
+    for joint in joint_errors(found):
+        mine = [cause for cause in causes if joint in cause.joints]
+        if mine:
+            grave = ", ".join(cause.code for cause in mine if cause.severity != "note")
+            notes = ", ".join(cause.code for cause in mine if cause.severity == "note")
+            rows.append([code(joint), text(grave or "–"), text(notes or "–")])
+    if not rows:
+        return ""
+    return table("By joint, the worst first", ["joint", "errors and warnings", "notes"], rows)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

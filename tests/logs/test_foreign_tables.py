@@ -1,0 +1,188 @@
+"""Logs that others named: PlotJuggler's exports, DataFrames, and lists of logs of every kind."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers.synthetic import exact_log, truth
+
+import robotid
+from robotid.commands.convert import convert
+from robotid.exceptions import DataError
+from robotid.logs.data import Log
+from robotid.logs.formats import open_table
+from robotid.logs.read import read_log, read_logs, write_log
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Place
+
+JOINTS = ("shoulder", "elbow")
+T = np.arange(60) / 50
+PHASE = T[:, None] * [2.0, 3.0]
+LOG = Log(
+    t=T, q=np.sin(PHASE), v=np.cos(PHASE) * [2.0, 3.0], tau=10 * np.cos(PHASE), joints=JOINTS
+)  # fmt: skip
+WORDS = {"position": LOG.q, "velocity": LOG.v, "effort": LOG.tau}
+
+
+def refused(text):
+    return pytest.raises(DataError, match="^" + re.escape(text) + "$")
+
+
+def assert_same(back, log=LOG):
+    for name in ("t", "q", "v", "tau"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(log, name), name)
+
+
+def juggled(*topics, words=WORDS, scale=1.0):
+    """Return the columns of PlotJuggler's export of joint states, in the order of their names."""
+    columns = {
+        f"{topic}/{joint}/{word}": scale * values[:, j]
+        for topic in topics
+        for word, values in words.items()
+        for j, joint in enumerate(JOINTS)
+    }
+    return {"__time": LOG.t} | dict(sorted(columns.items()))
+
+
+@pytest.fixture(params=["csv", "parquet", "frame"])
+def given(request, tmp_path):
+    """A function that makes a file or a DataFrame of columns."""
+
+    def make(columns):
+        frame = pd.DataFrame(columns)
+        if request.param == "csv":
+            frame.to_csv(tmp_path / "run.csv", index=False)
+        if request.param == "parquet":
+            frame.to_parquet(tmp_path / "run.parquet")
+        return frame if request.param == "frame" else tmp_path / f"run.{request.param}"
+
+    return make
+
+
+def test_plotjugglers_export_is_read(given):
+    extra = {"/imu/linear_acceleration/x": LOG.t}
+    back = read_log(given(juggled("/joint_states") | extra), JOINTS)
+    assert_same(back)
+    assert back.notes == ("columns ignored: /imu/linear_acceleration/x",)
+
+
+def test_of_several_topics_that_with_efforts_is_taken_and_of_two_such_one_must_be_stated(given):
+    ghost = juggled("/ghost", words={"position": LOG.q + 1.0})
+    assert_same(read_log(given(juggled("/joint_states") | ghost), JOINTS))
+    both = given(juggled("/left") | juggled("/right", scale=2.0))
+    with pytest.raises(DataError, match="2 topics of joint states: /left, /right; its columns are"):
+        read_log(both, JOINTS)
+    np.testing.assert_array_equal(
+        read_log(both, JOINTS, source=LogSource(topic="/right")).tau, 2.0 * LOG.tau
+    )
+    with pytest.raises(DataError, match=r"no topic '/rigt'; topics: /left, /right\. Did you mean"):
+        read_log(both, JOINTS, source=LogSource(topic="/rigt"))
+
+
+def test_efforts_may_be_currents_and_columns_may_be_mapped_by_the_names_in_the_file(given):
+    log = read_log(
+        given(juggled("/joint_states")),
+        JOINTS,
+        gains={"elbow": 3.0, "shoulder": 2.0},
+        source=LogSource(effort="current"),
+    )
+    np.testing.assert_allclose(log.tau, LOG.tau * [2.0, 3.0])
+    columns = juggled("/js") | {"M2": 5 * LOG.tau[:, 1]}
+    names = {"tau_elbow": "M2", "q_elbow": "/js/elbow/position"}
+    mapped = read_log(given(columns), JOINTS, columns=names)
+    np.testing.assert_array_equal(mapped.tau[:, 1], 5 * LOG.tau[:, 1])
+
+
+def test_a_table_with_standard_columns_and_another_clock_is_left_as_it_is(given):
+    table = {"time": LOG.t}
+    for kind, values in (("q", LOG.q), ("dq", LOG.v), ("tau", LOG.tau)):
+        table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(JOINTS)}
+    others = juggled("/a") | juggled("/b")
+    del others["__time"]
+    assert_same(read_log(given(table | others), JOINTS))
+
+
+def test_rows_of_a_file_are_read_by_the_same_names(tmp_path):
+    pd.DataFrame(juggled("/joint_states")).to_csv(tmp_path / "run.csv", index=False)
+    rows = open_table(tmp_path / "run.csv", LogSource()).rows
+    assert rows.count() == 60
+    (stamps,) = [values for values, _ in rows.scan("time")]
+    np.testing.assert_array_equal(stamps, LOG.t)
+    part = rows.read(["effort_elbow", "position_shoulder"], 10, 20, Place())
+    np.testing.assert_array_equal(part["effort_elbow"], LOG.tau[10:20, 1])
+    np.testing.assert_array_equal(part["position_shoulder"], LOG.q[10:20, 0])
+    convert(tmp_path / "run.csv", tmp_path / "own.csv")
+    assert_same(read_log(tmp_path / "own.csv", JOINTS))
+
+
+def frame_of(log):
+    columns = {"time": log.t}
+    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
+        columns |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
+    return pd.DataFrame(columns)
+
+
+def test_a_data_frame_may_have_time_as_its_index_or_come_from_another_library():
+    frame = pd.DataFrame(juggled("/joint_states"))
+    assert_same(read_log(frame.set_index("__time"), JOINTS))
+    columns = juggled("/joint_states")
+
+    class Other:
+        def __getitem__(self, name):
+            return columns[name].tolist()
+
+    Other.columns = tuple(columns)
+    assert_same(read_log(Other(), JOINTS))
+
+
+def test_what_is_wrong_with_a_data_frame_is_told():
+    frame = pd.DataFrame(juggled("/joint_states"))
+    with refused(
+        "log has no column 'time'; columns found: position_elbow, velocity_elbow, effort_elbow, "
+        "position_shoulder, velocity_shoulder, effort_shoulder. Rename it, or pass "
+        "columns={'time': ...}"
+    ):
+        order = [f"/joint_states/{j}/{w}" for j in ("elbow", "shoulder") for w in WORDS]
+        read_log(frame[order], JOINTS)
+    position = np.where(T.round(9) == 0.08, np.nan, T)
+    spoilt = frame.assign(**{"/joint_states/elbow/position": position})
+    with pytest.raises(DataError, match=r"log: q_elbow is NaN at row 4 \(t = 0.08 s\); remove"):
+        read_log(spoilt, JOINTS)
+    words = frame.assign(**{"/joint_states/elbow/effort": "much"})
+    with pytest.raises(DataError, match="log: column '/joint_states/elbow/effort' holds str, want"):
+        read_log(words, JOINTS)
+
+
+def test_logs_are_given_one_or_several_of_every_kind(ur5, tmp_path, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    write_log(log, tmp_path / "run.csv")
+    for one in (log, tmp_path / "run.csv", str(tmp_path / "run.csv"), frame_of(log)):
+        for some in (one, [one], (x for x in [one])):
+            (back,) = read_logs(some, ur5.joints)
+            np.testing.assert_array_equal(back.tau, log.tau)
+    assert len(read_logs([log, frame_of(log), tmp_path / "run.csv"], ur5.joints)) == 3
+    assert read_logs((), ur5.joints) == ()
+    cases = ((3, "int"), ([log, None], "NoneType"), ({"q": 1}, "dict"), (log.q, "ndarray"))
+    for wrong, kind in cases:
+        with pytest.raises(DataError, match=f"^a log is a {kind}, wanted a robotid.Log, the path"):
+            read_logs(wrong, ur5.joints)
+
+
+def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tmp_path, rng):
+    first, second = (
+        exact_log(ur5, truth(ur5), rng, samples=700, rate=100.0, noise=0.1) for _ in range(2)
+    )
+    write_log(first, tmp_path / "first.csv")
+    settings = robotid.EstimatorSettings(draws=0)
+    one = robotid.identify(ur5, [first], validation=[second], estimator=settings)
+    other = robotid.identify(
+        ur5.tree.path, tmp_path / "first.csv", validation=frame_of(second), estimator=settings
+    )
+    np.testing.assert_array_equal(one.standard, other.standard)
+    assert one.verdict.to_dict()["status"] == other.verdict.to_dict()["status"]
+    assert [f.code for f in robotid.check_logs(ur5, tmp_path / "first.csv")] == [
+        f.code for f in robotid.check_logs(ur5, [first])
+    ]
+    with pytest.raises(DataError, match="no log was given; at least one is needed"):
+        robotid.identify(ur5, [])

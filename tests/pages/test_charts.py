@@ -1,0 +1,267 @@
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from helpers.browsing import until, visit
+from helpers.pages import charts
+
+from robotid.exceptions import DataError
+from robotid.pages.charts import Chart, Series, broken, chart_html, thin
+from robotid.pages.html import page
+
+T = 1000.0 + np.arange(5000) / 500  # [s], the log's own time
+
+
+@pytest.fixture(scope="module")
+def lines():
+    rng = np.random.default_rng(0)
+    tau = 40 * np.sin(3 * T) + rng.normal(size=len(T))
+    predicted = 40 * np.sin(3 * T)
+    predicted[2000:2500] = np.nan
+    return tau, predicted
+
+
+@pytest.fixture(scope="module")
+def torque(lines):
+    tau, predicted = lines
+    series = (
+        Series("measured", tau, "text", is_faint=True),
+        Series("identified", predicted, "predicted", half=np.full(len(T), 4.0)),
+    )
+    spans = ((float(T[2000]), float(T[2500])),)
+    return Chart("Torque of elbow", T, series, "time [s]", "torque [N m]", "time", spans)
+
+
+@pytest.fixture(scope="module")
+def demo(torque, lines, tmp_path_factory):
+    residual = Series("residual", lines[0] - lines[1], "residual")
+    below = Chart("Residual", T, (residual,), "time [s]", "residual [N m]", "time", height=90)
+    parts = (np.sin(T[::10]), -np.cos(2 * T[::10]), np.sin(3 * T[::10]))
+    areas = tuple(Series(f"part {k}", y, f"tone-{k}", "area") for k, y in enumerate(parts, 1))
+    split = Chart("Split", T[::10], areas, "time [s]", "torque [N m]")
+    f = np.linspace(0.5, 50.0, 100)
+    spectrum = Chart(
+        "Spectrum", f, (Series("S", f**-2.0, "text"),), "f [Hz]", "S", logarithmic="xy"
+    )
+    whiskers = Series("rms", np.array([3.0, -1.0]), "tone-1", "bars", half=np.array([0.5, 0.2]))
+    bars = Chart("Bars", np.arange(2.0), (whiskers,), "joint", "rms", x_names=("one", "two"))
+    first, *others = (chart_html(c, c.title) for c in (torque, below, split, spectrum, bars))
+    folded = f"<details><summary>more</summary>{''.join(others[1:])}</details>"
+    html = page("charts", "<h1>charts</h1>", {"a": ("Torque", first + others[0] + folded)})
+    target = tmp_path_factory.mktemp("charts") / "charts.html"
+    target.write_text(html, encoding="utf-8")
+    return target
+
+
+def test_what_the_page_holds_is_the_data_to_a_65000th_of_their_range(torque, lines):
+    (found,) = charts(chart_html(torque, ""))
+    rows = np.searchsorted(T, found["x"] - 1e-4)
+    np.testing.assert_allclose(found["x"], T[rows], atol=1e-6)
+    for series, y in zip(found["series"], lines, strict=True):
+        np.testing.assert_allclose(series["y"], y[rows], atol=np.nanmax(np.abs(y)) / 30_000)
+        kept = series["y"][np.isfinite(series["y"])]
+        np.testing.assert_allclose(
+            [kept.min(), kept.max()], [np.nanmin(y), np.nanmax(y)], rtol=1e-4
+        )
+    assert 1500 < len(rows) < 3000
+    np.testing.assert_allclose(found["series"][1]["half"], 4.0)
+    assert len(chart_html(torque, "")) < 45_000
+
+
+def test_a_thinned_line_keeps_its_extremes_its_ends_and_both_sides_of_its_breaks(rng):
+    y = rng.normal(size=10_000)
+    y[[1234, 7777]] = [-40.0, 50.0]
+    y[5000:5100] = np.nan
+    rows = thin(y, 200)
+    assert len(rows) < 250
+    assert {0, 1234, 4999, 5000, 5099, 5100, 7777, 9999} <= set(rows.tolist())
+    assert (np.diff(rows) > 0).all()
+    assert thin(y, 10_000).tolist() == list(range(10_000))
+
+
+def test_a_line_breaks_between_the_stretches_of_a_recording():
+    x, y = broken(np.array([0, 0, 1, 1]), np.array([0.0, 1.0, 5.0, 6.0]), np.arange(4.0))
+    np.testing.assert_array_equal(x, [0, 1, 3, 5, 6])
+    np.testing.assert_array_equal(y, [0, 1, np.nan, 2, 3])
+
+
+def test_numbers_on_logarithmic_axes_keep_their_share(rng):
+    y = 10.0 ** rng.uniform(-6, 3, size=500)
+    y[3] = 0.0  # it has no logarithm
+    chart = Chart("S", np.arange(500.0), (Series("S", y, "text"),), "f", "S", logarithmic="y")
+    (found,) = charts(chart_html(chart, ""))
+    np.testing.assert_allclose(np.delete(found["series"][0]["y"], 3), np.delete(y, 3), rtol=3e-4)
+    assert np.isnan(found["series"][0]["y"][3])
+
+
+@pytest.mark.parametrize(
+    ("series", "said"),
+    [
+        (Series("y", np.zeros(4), "text"), "series 'y' of the chart 'c' has 4 values, its x has 5"),
+        (
+            Series("y", np.zeros(5), "text", "pie"),
+            "is of kind 'pie'; kinds: line, dots, bars, area",
+        ),
+        (Series("y", np.zeros(5), "text", half=np.zeros(3)), "has 3 half widths, its x has 5"),
+    ],
+)
+def test_a_chart_that_does_not_fit_together_is_refused(series, said):
+    with pytest.raises(DataError, match=re.escape(said)):
+        Chart("c", np.arange(5.0), (series,), "x", "y")
+
+
+def test_no_name_ends_the_script_or_the_picture():
+    evil = "</script><b>"
+    series = (Series(evil, np.arange(2.0), "text"),)
+    html = chart_html(Chart(evil, np.arange(2.0), series, evil, evil), "")
+    assert html.count("</script>") == 1
+    assert "<b>" not in html
+    assert charts(html)[0]["series"][0]["label"] == evil
+
+
+def test_the_still_picture_shows_the_line_in_the_units_of_its_ticks(torque, lines):
+    svg = re.search(r"<svg.*?</svg>", chart_html(torque, ""), re.DOTALL)[0]
+    root = ET.fromstring(svg)
+    ticks = [
+        (float(t.get("y")) - 4, t.text) for t in root.iter("text") if t.get("text-anchor") == "end"
+    ]
+    places, values = zip(*[(y, float(text.replace("−", "-"))) for y, text in ticks], strict=True)
+    line = next(p for p in root.iter("path") if p.get("stroke") == "var(--text)" and p.get("fill"))
+    points = np.array(re.findall(r"(-?[\d.]+) (-?[\d.]+)", line.get("d")), dtype=float)
+    drawn = np.polyval(np.polyfit(places, values, 1), points[:, 1])
+    assert len(points) < 300
+    np.testing.assert_allclose(
+        [drawn.min(), drawn.max()], [lines[0].min(), lines[0].max()], atol=0.3
+    )
+    assert {"torque [N m]", "time [s]", "measured", "identified"} <= {
+        t.text for t in root.iter("text")
+    }
+
+
+VALUES = "charts.all.map((c) => c.values.map((v) => v.textContent))"
+
+
+def shown(value):
+    """Return a number as a legend writes it, to four digits."""
+    return float(value.replace("−", "-"))
+
+
+def test_values_under_the_cursor_are_the_data_in_all_linked_charts(browser, demo, torque, lines):
+    with visit(browser, demo) as seen:
+        until(seen, "charts.all[1].plot !== null")
+        box = seen.page.locator(".u-over").first.bounding_box()
+        seen.page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 40)
+        until(seen, "charts.all[0].index > 0")
+        at = seen.page.evaluate("charts.all[0].x[charts.all[0].index]")
+        assert at == pytest.approx(1003.0, abs=0.02)
+        row = round((at - 1000) * 500)
+        said = seen.page.evaluate(VALUES)
+        assert [shown(v) for v in said[0]] == pytest.approx(
+            [lines[0][row], lines[1][row]], rel=2e-3, abs=2e-3
+        )
+        # the linked chart has points of its own: the nearest of them
+        near = seen.page.evaluate("charts.all[1].x[charts.all[1].index]")
+        assert near == pytest.approx(at, abs=0.02)
+        other = round((near - 1000) * 500)
+        assert shown(said[1][0]) == pytest.approx(lines[0][other] - lines[1][other], abs=2e-3)
+        assert said[2] == ["", "", ""]  # a chart of no link
+        seen.page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 40)  # rows not used
+        until(seen, "charts.all[0].x[charts.all[0].index] > 1004")
+        assert seen.page.evaluate(VALUES)[0][1] == "–"
+        seen.page.mouse.move(5, 5)
+        until(seen, "charts.all[0].index === -1")
+        assert seen.errors == []
+        assert seen.requests == []
+
+
+def test_dragging_zooms_linked_charts_and_keys_lead_back(browser, demo):
+    with visit(browser, demo) as seen:
+        until(seen, "charts.all[1].plot !== null")
+        box = seen.page.locator(".u-over").first.bounding_box()
+        middle = box["y"] + 40
+        seen.page.mouse.move(box["x"] + 0.2 * box["width"], middle)
+        seen.page.mouse.down()
+        seen.page.mouse.move(box["x"] + 0.4 * box["width"], middle, steps=4)
+        seen.page.mouse.up()
+        window = "charts.all.map((c) => c.plot ? [c.plot.scales.x.min, c.plot.scales.x.max] : null)"
+        until(seen, "charts.all[0].plot.scales.x.max < 1005")
+        first, second, *_ = seen.page.evaluate(window)
+        assert first == second == pytest.approx([1002.0, 1004.0], abs=0.03)
+        assert seen.page.get_by_role("button", name="Show all").count() == 2
+        seen.page.locator(".place").first.focus()
+        seen.page.keyboard.press("Escape")
+        until(seen, "charts.all[1].plot.scales.x.max > 1009")
+        assert seen.page.evaluate(window)[0] == pytest.approx([1000.0, 1009.998], abs=0.001)
+        for key in ("ArrowRight", "ArrowRight", "+"):
+            seen.page.keyboard.press(key)
+        low, high = seen.page.evaluate(window)[1]
+        assert high - low == pytest.approx(5.0, abs=0.01)
+        said = seen.page.locator(".place").first.get_attribute("aria-valuetext")
+        assert re.match(r"1005 s: measured −?[\d.]+, identified", said)
+        seen.page.keyboard.press("1")  # hides the measured torque
+        assert seen.page.evaluate("charts.all[0].plot.series.map((s) => s.show)") == [
+            True,
+            False,
+            True,
+        ]
+        assert seen.errors == []
+
+
+def test_charts_are_drawn_when_they_come_into_sight_and_areas_are_stacked(browser, demo):
+    with visit(browser, demo) as seen:
+        until(seen, "charts.all[0].plot !== null")
+        assert seen.page.evaluate("charts.all.slice(2).every((c) => c.plot === null)")
+        seen.page.locator("summary").click()
+        until(seen, "charts.all[2].plot !== null")
+        low, high = seen.page.evaluate("charts.all[2].extent()")
+        parts = np.array([np.sin(T[::10]), -np.cos(2 * T[::10]), np.sin(3 * T[::10])])
+        top, bottom = np.maximum(parts, 0).sum(axis=0).max(), np.minimum(parts, 0).sum(axis=0).min()
+        room = 0.04 * (top - bottom)
+        assert [low, high] == pytest.approx([bottom - room, top + room], abs=1e-3)
+        seen.page.evaluate("charts.link('time').set(1007)")  # as the clock of a replay does
+        assert seen.page.evaluate("charts.all[1].index") > 0
+        assert seen.errors == []
+
+
+def colours(seen):
+    """Return which colours a chart's first canvas holds."""
+    return seen.page.evaluate("""(() => {
+      const canvas = document.querySelector("canvas");
+      const copy = document.createElement("canvas");
+      [copy.width, copy.height] = [canvas.width, canvas.height];
+      const context = copy.getContext("2d", { willReadFrequently: true });
+      context.drawImage(canvas, 0, 0);
+      const { data } = context.getImageData(0, 0, copy.width, copy.height);
+      let light = 0, dark = 0;
+      for (let k = 0; k < data.length; k += 4) {
+        if (data[k + 3] < 200) continue;
+        const mean = (data[k] + data[k + 1] + data[k + 2]) / 3;
+        if (mean > 222) light += 1; else if (mean < 50) dark += 1;
+      }
+      return [light, dark];
+    })()""")
+
+
+def test_an_open_page_follows_from_dark_to_light_and_prints_light(browser, demo):
+    with visit(browser, demo, color_scheme="dark") as seen:
+        until(seen, "charts.all[0].plot !== null")
+        until(seen, "document.querySelector('canvas').width > 300")
+        light, dark = colours(seen)
+        assert light > 10 * dark
+        seen.page.emulate_media(color_scheme="light")
+        seen.page.wait_for_timeout(200)
+        light, dark = colours(seen)
+        assert dark > 10 * light
+        seen.page.emulate_media(color_scheme="dark", media="print")
+        assert seen.page.locator("figure.chart svg").first.is_visible()
+        assert not seen.page.locator(".explore").first.is_visible()
+        ink = "getComputedStyle(document.documentElement).getPropertyValue('--predicted').trim()"
+        assert seen.page.evaluate(ink) == "#0b63c5"
+        assert seen.errors == []
+
+
+def test_without_scripts_the_still_pictures_stand_in_the_page(browser, demo):
+    with visit(browser, demo, java_script_enabled=False) as seen:
+        assert seen.page.locator("figure.chart svg").first.is_visible()
+        assert seen.page.locator(".explore").count() == 0
