@@ -24,7 +24,7 @@ __all__ = ["Box", "Clearance", "Contact", "Nearness"]
 
 _TRIED = 400  # random poses that say which links may meet at all
 _APART = 0.05  # [m] links that stay so far apart at all of them are looked at in the end alone
-_MADE_TO = 0.95  # share of the poses: links that overlap in so many are made to
+_MADE_TO = 0.95  # share of the poses: links that are too near in so many are made to
 _THINNEST = 1e-3  # [m] a flat shape is as thick
 _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
@@ -111,7 +111,7 @@ class Clearance:
         pairs: Numbers of the two hulls of each pair.
         likely: Which pairs may meet within the limits, shape (pairs,), bool.
         unread: Links of which a shape cannot be read: nothing keeps them from hitting anything.
-        made_to: Names of links that overlap in almost every pose, and are left to it.
+        made_to: Links that are nearer in almost every pose, by two, and are left to it.
 
     Raises:
         DataError: If no link has a shape that can be read.
@@ -146,21 +146,18 @@ class Clearance:
             self._hulls.append(_hull(below.name, -1, _corners(below)))
         self._request = coal.DistanceRequest(True, True)
         self.pairs = self._possible_pairs()
-        self.made_to: list[str] = []
         self.likely = self._likely(np.random.default_rng(seed))
 
     def _possible_pairs(self) -> Array:
-        """Return pairs of hulls on bodies that a joint does not join, one of them moving."""
+        """Return pairs that can move against each other: not links that a joint joins."""
         tree, hulls = self._model.pin_model, self._hulls
         joined = {(int(tree.parents[i]) - 1, i - 1) for i in range(1, tree.njoints)}
-        links = len(self._model.tree.links)
         found = []
         for i, j in combinations(range(len(hulls)), 2):
             a, b = sorted((hulls[i].body, hulls[j].body))
-            is_around = hulls[j].name not in self._model.tree.links
-            if a == b or ((a, b) in joined and not (is_around and a == -1 and b > 0 and links)):
-                continue
-            found.append((i, j))
+            is_link = hulls[j].name in self._model.tree.links
+            if a != b and not (is_link and (a, b) in joined):
+                found.append((i, j))
         return np.array(found, dtype=int).reshape(-1, 2)
 
     def _likely(self, rng: np.random.Generator) -> Array:
@@ -168,11 +165,12 @@ class Clearance:
         low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
         high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
         q = rng.uniform(low, high, (_TRIED, len(low)))
-        distance = self.near(self._poses(q), _APART, np.ones(len(self.pairs), dtype=bool)).distance
-        always = (distance < 0).mean(axis=1) > _MADE_TO
-        for i, j in self.pairs[always].tolist():
-            self.made_to.append(f"{self._hulls[i].name} and {self._hulls[j].name}")
-        likely = (distance.min(axis=1, initial=np.inf) < _APART) & ~always
+        near = self.near(self.poses(q), self.least + _APART, self.everything)
+        distance = near.distance
+        always = (distance < self.least).mean(axis=1) > _MADE_TO
+        names = self.named
+        self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
+        likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
         self.pairs, kept = self.pairs[~always], likely[~always]
         return kept
 
@@ -185,7 +183,22 @@ class Clearance:
             moved[i - 1, [j - 1 for j in list(tree.supports[i])[1:]]] = True
         return moved
 
-    def _poses(self, q: Array) -> Poses:
+    @property
+    def everything(self) -> Array:
+        """All pairs, as ``near`` takes them, shape (pairs,), bool."""
+        return np.ones(len(self.pairs), dtype=bool)
+
+    @property
+    def named(self) -> list[tuple[str, str]]:
+        """The names of each pair."""
+        return [(self._hulls[i].name, self._hulls[j].name) for i, j in self.pairs.tolist()]
+
+    def poses(self, q: Array) -> Poses:
+        """Return where the bodies are.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad or m].
+        """
         G, shift = self._model.velocity_map, self._model.position_offset
         return self._regressor.poses(q @ G.T + shift)
 
@@ -244,7 +257,7 @@ class Clearance:
         References:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
         """
-        everything, seen = np.ones(len(self.pairs), dtype=bool), self.least + _APART
+        seen = self.least + _APART
         lowest: Contact | None = None
         h = duration / max(2, round(duration / _FIRST)) / 2
         middles = np.arange(h, duration, 2 * h)
@@ -254,7 +267,7 @@ class Clearance:
             q, v, _ = motion.evaluate(middles)
             way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
             moved = self._levers @ way.T  # (pairs, N)
-            near = self.near(self._poses(q), seen + moved.max(axis=0), everything)
+            near = self.near(self.poses(q), seen + moved.max(axis=0), self.everything)
             exact = near.distance[near.pairs, near.samples]
             seen = min(seen, exact.min(initial=np.inf))
             bound = near.distance - moved
@@ -263,8 +276,7 @@ class Clearance:
             pair, sample = np.unravel_index(np.argmin(closed), closed.shape)
             found = float(closed[pair, sample])
             if found < (seen if lowest is None else lowest.distance):
-                first, second = (self._hulls[i].name for i in self.pairs[pair].tolist())
-                lowest = Contact(first, second, found, float(middles[sample]))
+                lowest = Contact(*self.named[pair], found, float(middles[sample]))
             h /= 2
             middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
         return lowest

@@ -8,7 +8,8 @@ distances at least the clearance.
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,11 +23,14 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 __all__ = ["Design", "Designer"]
 
 _PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
-_FINER = 10  # times as many at which limits are checked in the end
-_ROUNDS = 10  # of the augmented Lagrangian
+_POLISHED = 3  # times as many that its last rounds look at ...
+_FINER = 10  # ... and at which its limits are checked in the end
+_ROUNDS = 10  # of the augmented Lagrangian ...
+_LAST_ROUNDS = 4  # ... and on the finer grid
 _STEPS = 40  # of L-BFGS in each
 _GROWTH = 2.0  # of the weight of what is violated from one round to the next
 _SETTLED = 1e-3  # change of the criterion below which a design has converged
+_OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
 _HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
 _SPARE = 0.003  # of limits that a design leaves for what lies between its instants
 _SPARE_WAY = 0.002  # [m] the same of distances
@@ -73,29 +77,29 @@ class Designer:
         information: The rows of the base problem, and their gradient.
         limits: What the robot may do.
         basis: Functions that motions are sums of.
-        sigma: Noise of each joint's torque, shape (n,) [N m or N].
+        noise: Density of each joint's noise, variance times the time over which it is correlated,
+            shape (n,) [(N m)^2 s or N^2 s].
         spread: How far base parameters may be from what is known, shape (b,).
         given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
         name: The criterion, as of ``criterion``.
         clearance: What keeps it from collisions; None: they are not looked at.
+        finer: How many times finer than usual the grid of instants is.
     """
 
     information: MotionInformation
     limits: MotionLimits
     basis: Basis
-    sigma: Array
+    noise: Array
     spread: Array
     given: Array | None = None
     name: str = "D"
     clearance: Clearance | None = None
-    _functions: Array = field(init=False, repr=False)
+    finer: int = 1
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_functions", self._on_grid(1))
-
-    def _on_grid(self, finer: int) -> Array:
-        """Return the basis functions and three derivatives, shape (4, N, h)."""
-        count = finer * round(_PER_PERIOD * self.basis.duration / self.basis.shortest)
+    @cached_property
+    def _functions(self) -> Array:
+        """The basis functions and three derivatives on the grid, shape (4, N, h)."""
+        count = self.finer * round(_PER_PERIOD * self.basis.duration / self.basis.shortest)
         return self.basis.derivatives(np.linspace(0.0, self.basis.duration, count + 1), 3)
 
     def design(
@@ -119,68 +123,70 @@ class Designer:
         """
         begun = time.monotonic()
         history: list[tuple[float, float]] = []
-        best: tuple[Array, float] | None = None
-        is_converged, done = False, 0
+        best = _Best()
 
         def is_over() -> bool:
-            return best is not None and time.monotonic() - begun > seconds
+            return best.coefficients is not None and time.monotonic() - begun > seconds
 
-        for start in range(starts):
-            random = [self.random(rng) for _ in range(_STARTED)]
-            C = min(random, key=lambda C: self._looked_at(C)[0])
-            settled = _Settled()
-            for kept, objective in self._search(C, is_over, settled):
-                if best is None or objective < best[1]:
-                    best, is_converged = (kept, objective), False
+        def follow(designer: Designer, C: Array, rounds: int) -> bool:
+            """Follow a start; return whether it settled."""
+            for kept, objective, is_settled in designer._search(C, rounds, is_over):
+                if objective < best.objective:
+                    best.coefficients, best.objective = kept, objective
                     history.append((time.monotonic() - begun, objective))
                 if progress is not None:
-                    progress(start, best[1])
-            is_converged |= best is not None and settled.at == best[1]
+                    progress(done, best.objective)
+            return is_settled
+
+        done = 0
+        while done < starts and not is_over():
+            random = [self.random(rng) for _ in range(_STARTED)]
+            follow(self, min(random, key=lambda C: self._looked_at(C)[0]), _ROUNDS)
             done += 1
-            if is_over():
-                break
-        if best is None:
-            raise NotConvergedError("no motion was found", "max_iterations")
+        chosen, best = best, _Best()
+        fine = replace(self, finer=_POLISHED * self.finer)
+        is_settled = follow(fine, fine._feasible(chosen.of(), 1.0 - _SPARE), _LAST_ROUNDS)
+        found = replace(self, finer=_FINER * self.finer).checked(best.of())
         return replace(
-            self.checked(best[0]),
+            found,
             seconds=time.monotonic() - begun,
             starts=done,
-            is_converged=is_converged,
+            is_converged=is_settled,
             history=tuple(history),
         )
 
     def checked(self, C: Array) -> Design:
-        """Return a motion, scaled down until it keeps all limits between its instants, too.
+        """Return a motion, scaled down until it keeps all limits, and clear between instants, too.
 
         Args:
             C: Coefficients of a motion, shape (h, n).
         """
-        fine = self._on_grid(_FINER)
-        C = self._feasible(C, fine, 1.0)
+        C = self._feasible(C, 1.0)
         contact = None
-        if self.clearance is not None:
-            for _ in range(_HALVINGS):
-                contact = self.clearance.nearest(
-                    DesignedMotion(self.basis, C), self.basis.duration
-                )
-                if contact is None or contact.distance >= self.clearance.least:
-                    break
-                C = _scaled(C, 0.99)
+        for _ in range(0 if self.clearance is None else _HALVINGS):
+            contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
+            if contact is None or contact.distance >= self.clearance.least:
+                break
+            C = _scaled(C, 0.99)
         objective, used, _, rows = self._looked_at(C)
-        _, finely, _, _ = self._looked_at(C, fine)
-        F = self.matrix(rows) - self._known
-        low, *_, high = np.linalg.eigvalsh(F)
+        low, *_, high = np.linalg.eigvalsh(self.matrix(rows) - self._known)
         return Design(
             motion=DesignedMotion(self.basis, C),
             objective=objective,
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
-            used=np.abs(finely).max(axis=1),
+            used=np.abs(used).max(axis=1),
             contact=contact,
         )
 
     @property
     def _known(self) -> Array:
         return np.eye(len(self.spread)) if self.given is None else self.given
+
+    @cached_property
+    def _scale(self) -> Array:
+        """What rows are multiplied by, so that their squares are information, (n, b, 1)."""
+        step = self.basis.duration / (self._functions.shape[1] - 1)
+        return np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
 
     def matrix(self, rows: MotionRows) -> Array:
         """Return the information of a motion and what was known, in units of the spread, (b, b).
@@ -189,16 +195,14 @@ class Designer:
             rows: Its rows.
         """
         n, b, N = rows.W.shape
-        scaled = rows.W * (self.spread[:, None] / self.sigma[:, None, None])
+        scaled = rows.W * self._scale
         flat = scaled.swapaxes(0, 1).reshape(b, n * N)
         F: Array = flat @ flat.T
         return F + self._known
 
-    def _looked_at(
-        self, C: Array, functions: Array | None = None
-    ) -> tuple[float, Array, float, MotionRows]:
+    def _looked_at(self, C: Array) -> tuple[float, Array, float, MotionRows]:
         """Return criterion, shares of limits used (6, N, n), least distance and rows."""
-        q, v, a, jerk = (self._functions if functions is None else functions) @ C
+        q, v, a, jerk = self._functions @ C
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
         distance = np.inf
@@ -231,8 +235,7 @@ class Designer:
             value += cost
             along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
-        scale = self.spread[:, None] / self.sigma[:, None, None]  # (n, b, 1)
-        by_W = 2.0 * scale * np.einsum("bc,rcn->rbn", by_F, scale * rows.W, optimize=True)
+        by_W = 2.0 * self._scale * (by_F @ (self._scale * rows.W))
         by_W += self.information.beta[:, None] * by_torque.T[:, None]
         along_q, along_v, along_a = self.information.pull(rows, by_W)
         by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
@@ -253,7 +256,7 @@ class Designer:
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
         C[0] = self._posture(rng)
-        return self._feasible(C, self._functions, 1.0 - _SPARE)
+        return self._feasible(C, 1.0 - _SPARE)
 
     def _posture(self, rng: np.random.Generator) -> Array:
         """Return a posture that keeps limits and distances at rest, shape (n,)."""
@@ -296,13 +299,13 @@ class Designer:
             "clearance, or move the floor and the boxes"
         )
 
-    def _feasible(self, C: Array, functions: Array, most: float) -> Array:
+    def _feasible(self, C: Array, most: float) -> Array:
         """Return the largest share of a motion about its middle that keeps the limits, (h, n).
 
         Each joint first keeps its own positions and speeds; then all are scaled as one.
         """
         room = most * self.limits.sizes[0] - np.abs(C[0] - self.limits.middle)
-        moving = np.abs(functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
+        moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
         over = np.vstack(
             [moving[:1] / np.maximum(room, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
         )
@@ -311,7 +314,7 @@ class Designer:
         low, high = 0.0, 1.0
         for k in range(_HALVINGS):
             share = 1.0 if k == 0 else (low + high) / 2
-            _, used, distance, _ = self._looked_at(_scaled(C, share), functions)
+            _, used, distance, _ = self._looked_at(_scaled(C, share))
             is_kept = np.abs(used).max() <= most and distance >= least
             low, high = (share, high) if is_kept else (low, share)
             if low == 1.0:
@@ -319,9 +322,9 @@ class Designer:
         return _scaled(C, low)
 
     def _search(
-        self, start: Array, is_over: Callable[[], bool], settled: "_Settled"
-    ) -> Iterator[tuple[Array, float]]:
-        """Yield motions that keep the limits, better and better as a rule, with their criterion."""
+        self, start: Array, rounds: int, is_over: Callable[[], bool]
+    ) -> Iterator[tuple[Array, float, bool]]:
+        """Yield motions that keep the limits, their criterion, and whether the search settled."""
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
@@ -334,8 +337,8 @@ class Designer:
             value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
             return value, (gradient * unit).reshape(-1)
 
-        yield start, self._looked_at(start)[0]
-        for _ in range(_ROUNDS):
+        yield start, self._looked_at(start)[0], False
+        for _ in range(rounds):
             try:
                 found = minimize(
                     scaled,
@@ -352,11 +355,11 @@ class Designer:
             if self.clearance is not None:
                 near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
                 multipliers.raise_by_distances(near.distance, self.clearance.least)
-            kept = self._feasible(C, self._functions, 1.0 - _SPARE)
+            kept = self._feasible(C, 1.0 - _SPARE)
             objective = self._looked_at(kept)[0]
-            yield kept, objective
-            if abs(before - objective) < _SETTLED and np.abs(used).max() < 1.01:
-                settled.at = objective
+            is_settled = abs(before - objective) < _SETTLED and np.abs(used).max() < _OVER
+            yield kept, objective, is_settled
+            if is_settled:
                 return
             before = objective
             multipliers.weight *= _GROWTH
@@ -366,10 +369,17 @@ class _OutOfTime(Exception):
     """The time of a design is over."""
 
 
-class _Settled:
-    """The criterion at which a search settled; None if it did not."""
+class _Best:
+    """The best motion so far."""
 
-    at: float | None = None
+    coefficients: Array | None = None
+    objective: float = np.inf
+
+    def of(self) -> Array:
+        """Return its coefficients."""
+        if self.coefficients is None:
+            raise NotConvergedError("no motion was looked at", "max_iterations")
+        return self.coefficients
 
 
 class _Multipliers:
