@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 
 __all__ = ["LIMITS", "MotionLimits"]
 
@@ -53,24 +56,12 @@ class MotionLimits:
         """
         if not 0 < share <= 1:
             raise SettingsError(f"share is {share}, wanted more than 0 and at most 1")
-        missing = [
-            f"{joint.name} ({', '.join(lacks)})"
-            for joint in model.limits
-            if (
-                lacks := [
-                    what
-                    for what, has in (
-                        ("position", joint.has_limits or joint.turns_freely),
-                        ("velocity", joint.velocity > 0),
-                    )
-                    if not has
-                ]
-            )
-        ]
+        missing = [text for joint in model.limits if (text := _missing(joint))]
         if missing:
             raise SettingsError(
-                f"{model.tree.path} states no limit of {', '.join(missing)}: a motion cannot be "
-                "kept safe without; add <limit lower upper velocity effort> to these joints"
+                f"{Path(model.tree.path).name} states no limit of {listed(missing)}: a motion "
+                "cannot be kept safe without; add <limit lower upper velocity effort> to these "
+                "joints, or lock them"
             )
         middle = [(j.lower + j.upper) / 2 if j.has_limits else 0.0 for j in model.limits]
         half = [(j.upper - j.lower) / 2 if j.has_limits else _FREE for j in model.limits]
@@ -99,13 +90,23 @@ class MotionLimits:
         return values / self.sizes[:, None]
 
 
+def _missing(joint: Joint) -> str:
+    """Return what the URDF does not state of a joint, in words; empty if nothing."""
+    known = {
+        "position": joint.has_limits or joint.type == "continuous",
+        "velocity": 0 < joint.velocity < np.inf,
+    }
+    lacks = [what for what, is_known in known.items() if not is_known]
+    return f"{joint.name} ({' and '.join(lacks)})" if lacks else ""
+
+
 def _each(model: RobotModel, stated: float | Mapping[str, float], what: str) -> Array:
     by_name = stated if isinstance(stated, Mapping) else dict.fromkeys(model.joints, stated)
     for name, value in by_name.items():
         if name not in model.joints:
             raise SettingsError(
                 f"{what} is stated of {name!r}, which is no joint that moves; joints: "
-                f"{', '.join(model.joints)}"
+                f"{listed(model.joints)}"
             )
         if not value > 0:
             raise SettingsError(f"{what} of {name} is {value:g}, wanted a positive number")
