@@ -266,17 +266,20 @@ class Job(Settings):
         """
         return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
 
-    def lay_out(self, entry: LogEntry, model: "RobotModel") -> tuple[LogLayout, Table]:
+    def lay_out(
+        self, entry: LogEntry, model: "RobotModel", *, is_motion: bool = False
+    ) -> tuple[LogLayout, Table]:
         """Return which columns of a log's file are read, before any is, and the opened file.
 
         Args:
             entry: Which log.
             model: The job's robot.
+            is_motion: Whether it is read for its motion alone.
 
         Raises:
             DataError: If the file cannot be used.
         """
-        return lay_out(entry.path, **self._reading(model))
+        return lay_out(entry.path, is_motion=is_motion, **self._reading(model))
 
     def _reading(self, model: "RobotModel") -> dict[str, Any]:
         return {

@@ -7,7 +7,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators import WLS, Estimate
-from robotid.estimators.determination import base_spread, determine
+from robotid.estimators.determination import Determination, base_spread, determine
 from robotid.exceptions import RobotIdError
 from robotid.findings import Finding, log_finding
 from robotid.logs.data import Trajectory
@@ -18,7 +18,12 @@ from robotid.regressor.used_rows import base_problem, independent_share, row_mas
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
-__all__ = ["check_excitation", "check_repeated_motion", "is_poorly_excited"]
+__all__ = [
+    "check_excitation",
+    "check_repeated_motion",
+    "excitation_finding",
+    "is_poorly_excited",
+]
 
 _AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0)  # [s] positions compared: the same now and in a second
 _NEAR = 0.02  # of the range of each joint
@@ -98,14 +103,26 @@ def check_excitation(
     spread = prior_spread(model, squares, sum(len(motion.t) for motion in thinned))
     rows = factors.weighted(found.sigma / np.sqrt(share))[:, :-1]
     known = determine(mapping.base_names, rows, base_spread(mapping.K, spread))
-    evidence = {"rank": known.rank, "base": len(mapping.K), "weakest": known.shrinkage[-1]}
-    if np.isfinite(found.condition):
-        evidence["condition"] = found.condition
+    yield excitation_finding(found, known, name)
+
+
+def excitation_finding(wls: Estimate, known: Determination, name: str) -> Finding:
+    """Return which base parameters a motion determines, in words.
+
+    Args:
+        wls: Weighted least squares on the motion.
+        known: What it determines.
+        name: What its logs are called.
+    """
+    count = len(known.names)
+    evidence = {"rank": known.rank, "base": count, "weakest": known.shrinkage[-1]}
+    if np.isfinite(wls.condition):
+        evidence["condition"] = wls.condition
     message = (
-        f"the motion determines {known.rank} of {len(mapping.K)} base parameters "
-        f"(condition number {found.condition:.3g})"
+        f"the motion determines {known.rank} of {count} base parameters "
+        f"(condition number {wls.condition:.3g})"
     )
-    is_poor = is_poorly_excited(found, len(mapping.K))
+    is_poor = is_poorly_excited(wls, count)
     if known.groups:
         advice = f"record {_RICHER[:-1]}" if is_poor else f"{_LOST}: faster motion would show more"
         message += f": {known.in_words()}; {advice}"
@@ -116,7 +133,7 @@ def check_excitation(
     else:
         message += "; nothing needs doing"
     severity = "warning" if known.groups and is_poor else "note"
-    yield log_finding(name, "excitation", severity, message, **evidence)
+    return log_finding(name, "excitation", severity, message, **evidence)
 
 
 def is_poorly_excited(wls: Estimate, count: int) -> bool:

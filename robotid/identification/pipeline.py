@@ -47,6 +47,7 @@ from robotid.identification.standard_errors import (
     Redraws,
     StandardErrors,
     measured_errors,
+    standard_of,
     with_wls_errors,
 )
 from robotid.identification.summary import (
@@ -595,7 +596,7 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
     ground = _ground(recordings, choice)
     prior, spread = ground.before.pi, ground.before.spread
     estimate, wls, errors = _measured(ground, choice)
-    standard, covariance = _standard(estimate, mapping, prior, spread)
+    standard, covariance = standard_of(estimate, mapping, prior, spread)
     base_variance = np.einsum("bi,ij,bj->b", mapping.K, covariance, mapping.K)
     if model.layout.remembering:  # what is written predicts the torque by its own load
         model = model.with_reference(standard)
@@ -643,7 +644,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
     for step in range(_MOST_LOADS):
         ground = _ground(recordings, choice)
         before = ground.before
-        standard, _ = _standard(ground.rough, mapping, before.pi, before.spread)
+        standard, _ = standard_of(ground.rough, mapping, before.pi, before.spread)
         moved = standard - recordings.model.carried_by
         if step >= _DAMPED:  # friction that takes a large share of the load may overshoot
             standard = standard - 0.5 * moved
@@ -652,7 +653,7 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         if (loads[0] <= _SETTLED * loads[1]).all():
             if make_estimator(choice, model, mapping, before).reads == "factors":
                 estimate, _, _ = _run(choice, ground)
-                standard, _ = _standard(estimate, mapping, before.pi, before.spread)
+                standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
             return recordings.with_model(model.with_reference(standard))
     raise NotConvergedError(
         f"the load of the gears still changes after {_MOST_LOADS} fits; use friction = "
@@ -753,17 +754,3 @@ def _run(
         estimate = with_wls_errors(estimate, ground.rough)
     fit = consistent_fit(choice, model, mapping, before)
     return fit.project(estimate), fit, estimator.weighing
-
-
-def _standard(
-    estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
-) -> tuple[Array, Array]:
-    """Return the standard parameters and their covariance, prior included."""
-    if estimate.names == mapping.names:
-        return estimate.theta, estimate.covariance
-    G, K = mapping.gain(spread), mapping.K
-    before = np.diag(spread**2)
-    # what the data leave open (infinite variance) stays as wide as the prior has it
-    base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
-    covariance = before - G @ K @ before + G @ base @ G.T
-    return mapping.to_standard(estimate.theta, prior, spread), covariance

@@ -16,12 +16,15 @@ from robotid.estimators import Consistent, Estimate
 from robotid.estimators.batch import solve_factor
 from robotid.estimators.stretches import FEWEST_STRETCHES, quantile, scatter
 from robotid.exceptions import NotConvergedError
+from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.factors import Factors
 
 __all__ = [
     "Redraws",
     "StandardErrors",
+    "about_prior",
     "measured_errors",
+    "standard_of",
     "with_wls_errors",
 ]
 
@@ -117,7 +120,7 @@ def measured_errors(
         if redraws is not None:
             return _bounded(estimate, errors, redraws, factors, sigma, share * R.T @ R)
         if pull > 1.0:
-            C = _about_prior(estimate.covariance, K, share * R.T @ R, R, share, pull)
+            C = about_prior(estimate.covariance, K, share * R.T @ R, R, share, pull)
             estimate = replace(estimate, covariance=C)
         return estimate, errors
     is_open = ~np.isfinite(np.diag(estimate.covariance))
@@ -125,7 +128,7 @@ def measured_errors(
     if len(estimate.theta) != b:
         found = scatter(stretches, K @ estimate.theta, sigma, share * K @ C @ K.T)
         R = factors.weighted(sigma)[:b, :b]
-        covariance = _about_prior(C, K, share**2 * found.meat, R, share, pull)
+        covariance = about_prior(C, K, share**2 * found.meat, R, share, pull)
     elif not is_filter:
         bread = solve_factor(factors, sigma, estimate.theta).covariance
         found = scatter(stretches, estimate.theta, sigma, bread)
@@ -165,6 +168,44 @@ def with_wls_errors(estimate: Estimate, wls: Estimate) -> Estimate:
     )
 
 
+def standard_of(
+    estimate: Estimate, mapping: BaseMapping, prior: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Return the standard parameters of an estimate and their covariance, prior included.
+
+    Args:
+        estimate: Base parameters, shape (b,), or standard ones, shape (p,).
+        mapping: Standard to base parameters.
+        prior: What those of the URDF are, shape (p,).
+        spread: How far they may plausibly be wrong, shape (p,).
+    """
+    if estimate.names == mapping.names:
+        return estimate.theta, estimate.covariance
+    G, K = mapping.gain(spread), mapping.K
+    before = np.diag(spread**2)
+    # what the data leave open (infinite variance) stays as wide as the prior has it
+    base = np.where(np.isfinite(estimate.covariance), estimate.covariance, K @ before @ K.T)
+    covariance = before - G @ K @ before + G @ base @ G.T
+    return mapping.to_standard(estimate.theta, prior, spread), covariance
+
+
+def about_prior(C: Array, K: Array, meat: Array, R: Array, share: float, pull: float) -> Array:
+    """Return C (K^T meat K + pull L) C with L = C^-1 - share K^T R^T R K, shape (p, p).
+
+    Args:
+        C: Covariance of the standard parameters if a share of the rows is independent, (p, p).
+        K: Map to the base parameters, shape (b, p).
+        meat: Covariance of the score of these rows, shape (b, b).
+        R: Weighted factor of all rows, base parameters, shape (b, b).
+        share: Share of the rows that the covariance takes to be independent [-].
+        pull: How much heavier the prior weighs than the truth's plausible spread says [-].
+    """
+    KC = K @ C
+    RKC = R @ KC
+    covariance: Array = pull * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
+    return 0.5 * (covariance + covariance.T)
+
+
 def _bounded(
     estimate: Estimate,
     errors: StandardErrors,
@@ -197,11 +238,3 @@ def _bounded(
         replace(estimate, covariance=covariance),
         replace(errors, method=method, freedom=freedom, unbounded=estimate.std_error),
     )
-
-
-def _about_prior(C: Array, K: Array, meat: Array, R: Array, share: float, pull: float) -> Array:
-    """Return C (K^T meat K + pull L) C with L = C^-1 - share K^T R^T R K."""
-    KC = K @ C
-    RKC = R @ KC
-    covariance: Array = pull * (C - share * RKC.T @ RKC) + KC.T @ meat @ KC
-    return 0.5 * (covariance + covariance.T)

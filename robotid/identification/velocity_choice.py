@@ -92,8 +92,8 @@ def _missed(model: RobotModel, motion: Trajectory, sure: Array, every: int) -> A
     for j, support in enumerate(model.support()):
         W, tau, used = Y[:, j, support], motion.tau[rows, j], sure[rows, j]
         fitted, kept = used & (part == 0), used & (part == 1)
-        if min(fitted.sum(), kept.sum()) < _FEW * W.shape[1]:
-            continue
+        if min(fitted.sum(), kept.sum()) < _FEW * W.shape[1] or not tau.any():
+            continue  # a motion without torques tells nothing
         squares = 0.0
         for first, second in ((fitted, kept), (kept, fitted)):
             size = np.linalg.norm(W[first], axis=0)

@@ -152,7 +152,8 @@ class LogLayout:
             for kind, names in self.columns.items()
         }
         slides = np.isin(self.joints, self.prismatic)
-        values["tau"] = values["tau"] * np.array(self.factors)
+        if "tau" in values:
+            values["tau"] = values["tau"] * np.array(self.factors)
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
@@ -171,7 +172,7 @@ class LogLayout:
             q=values["q"],
             v=values.get("dq"),
             a=values.get("ddq"),
-            tau=values["tau"],
+            tau=values.get("tau", np.zeros_like(values["q"])),
             joints=self.joints,
             path=self.path,
             notes=self.notes,
@@ -204,6 +205,7 @@ def lay_out(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    is_motion: bool = False,
 ) -> tuple[LogLayout, Table]:
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
@@ -216,6 +218,8 @@ def lay_out(
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
         transmissions: As of ``read_log``.
+        is_motion: Whether the file is read for its motion alone: its torques, if it has any, are
+            ignored, and those of the log are 0.
 
     Raises:
         DataError: If the file does not hold what is wanted.
@@ -234,14 +238,15 @@ def lay_out(
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     finder = _Finder(
-        where, opened.names, stated, tuple(joints), gains or {}, source, gears, [*opened.notes]
-    )
+        where, opened.names, stated, tuple(joints), gains or {}, source, gears, is_motion,
+        [*opened.notes],
+    )  # fmt: skip
     found = finder.find_all()  # names of columns by kind
     layout = LogLayout(
         path=str(Path(path)) if isinstance(path, str | Path) else "",
         joints=tuple(joints),
         columns=found,
-        factors=finder.factors(found["tau"]),
+        factors=finder.factors(found.get("tau", [])),
         units=units,
         prismatic=tuple(prismatic),
         source=source,
@@ -284,20 +289,25 @@ class _Finder:
     gains: Mapping[str, float]
     source: LogSource
     gears: tuple[Transmission, ...]
+    is_motion: bool = False
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
     def find_all(self) -> dict[str, list[str]]:
-        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete."""
+        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete.
+
+        Of a motion there is no tau.
+        """
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
             "q": [column or self._missing(*at) for at, column in self._each("q")],
-            "tau": [
+        }
+        if not self.is_motion:
+            found["tau"] = [
                 self._find_torque(self.joints[j], is_motor)
                 for j, is_motor in enumerate(self.of_motors("tau"))
-            ],
-        }
+            ]
         found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
         extra = [name for name in self.names if name not in self.seen]
         if extra:
@@ -500,4 +510,4 @@ class _Finder:
             names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
             return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
 
-        return has("q") and (has("tau") or has("current"))
+        return has("q") and (self.is_motion or has("tau") or has("current"))

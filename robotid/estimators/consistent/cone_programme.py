@@ -231,14 +231,18 @@ class Programme:
                 break
         return sigma
 
-    def prior_covariance(self, weight: float) -> Array:
-        """Return the covariance, shape (p, p), of the prior alone, expanded at its centre.
+    def covariance_at_prior(self, weight: float, rows: Array | None = None) -> Array:
+        """Return the covariance, shape (p, p), with the penalty expanded at its centre.
 
         Args:
             weight: Weight of the penalty [-].
+            rows: Information on the base parameters, shape (k, b + 1); that of the prior alone if
+                None.
         """
-        S = np.sqrt(weight) * self._scaled_root(self.penalty.centre) @ self.space.basis
-        return self._covariance(scipy.linalg.qr(S, mode="r")[0][: S.shape[1]])
+        S = np.sqrt(weight) * self._scaled_root(self.penalty.centre)
+        data = [] if rows is None else [rows[:, :-1] @ self.K * self.scale]
+        stacked = np.vstack([*data, S]) @ self.space.basis
+        return self._covariance(scipy.linalg.qr(stacked, mode="r")[0][: stacked.shape[1]])
 
     def _lighten(
         self, rows: Array, heavy: float, weight: float, solution: ConeSolution

@@ -238,7 +238,7 @@ class Consistent(BatchEstimator):
     @property
     def spread_before(self) -> Array:
         """Plausible standard deviation of each parameter by the prior alone, shape (p,)."""
-        covariance = self.programme.prior_covariance(self.prior_weight / self.pull)
+        covariance = self.programme.covariance_at_prior(self.prior_weight / self.pull)
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
