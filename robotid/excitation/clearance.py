@@ -28,7 +28,7 @@ _MADE_TO = 0.95  # share of the poses: links that are too near in so many are ma
 _THINNEST = 1e-3  # [m] a flat shape is as thick
 _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
-_SURE = 1e-3  # [m] by which a lower bound may be too low
+_SURE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
 
 

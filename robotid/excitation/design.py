@@ -7,28 +7,40 @@ distances at least the clearance.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.estimators.determination import base_spread
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.information import MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.identification.previews import (
+    CORRELATION,
+    Run,
+    assumed_noise,
+    assumed_parameters,
+    largest_torques,
+)
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
 
 __all__ = ["Design", "Designer"]
 
 _PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
 _POLISHED = 3  # times as many that its last rounds look at ...
 _FINER = 10  # ... and at which its limits are checked in the end
-_ROUNDS = 10  # of the augmented Lagrangian ...
+_ROUNDS = 14  # of the augmented Lagrangian ...
 _LAST_ROUNDS = 4  # ... and on the finer grid
-_STEPS = 40  # of L-BFGS in each
-_GROWTH = 2.0  # of the weight of what is violated from one round to the next
+_STEPS = 20  # of L-BFGS in each
+_WEIGHT = 0.3  # of what is violated at all instants together, at first
+_GROWTH = 3.0  # of that from one round to the next
 _SETTLED = 1e-3  # change of the criterion below which a design has converged
 _OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
 _HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
@@ -36,6 +48,7 @@ _SPARE = 0.003  # of limits that a design leaves for what lies between its insta
 _SPARE_WAY = 0.002  # [m] the same of distances
 _NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part in the design
 _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
+_USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
 _TRIED = 200  # random postures until one is found that the robot can rest in
 _STARTED = 10  # random motions of which the best is a start
 
@@ -95,6 +108,49 @@ class Designer:
     name: str = "D"
     clearance: Clearance | None = None
     finer: int = 1
+
+    @classmethod
+    def of_model(
+        cls,
+        model: RobotModel,
+        basis: Basis,
+        limits: MotionLimits,
+        *,
+        name: str = "D",
+        clearance: Clearance | None = None,
+        noise: Mapping[str, float] | None = None,
+        correlation: float = CORRELATION,
+        run: Run | None = None,
+    ) -> "Designer":
+        """Return a designer that assumes of friction and noise what a preview does.
+
+        Args:
+            model: The robot; with the friction of a run before, if there is one.
+            basis: Functions that motions are sums of.
+            limits: What the robot may do.
+            name: The criterion.
+            clearance: What keeps it from collisions.
+            noise: Standard deviation of the torque's noise by joint [N m or N].
+            correlation: Time over which it is correlated [s].
+            run: What was recorded before: the motion then tells what it did not.
+
+        Raises:
+            SettingsError: If a setting is unusable.
+        """
+        criterion(name, np.eye(1))
+        mapping = structural_mapping(model)
+        size, speed = largest_torques(model), limits.sizes[1]
+        pi = assumed_parameters(model, size) if run is None else run.standard
+        found = None if run is None else run.noise(mapping.K)
+        density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
+        usual = _USUAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
+        spread = base_spread(mapping.K, prior_spread(model, usual**2, 1))
+        given = None
+        if run is not None:
+            told = run.factors.information(run.step / density)
+            given = np.eye(len(spread)) + spread[:, None] * told * spread
+        information = MotionInformation(model, mapping, mapping.to_base(pi))
+        return cls(information, limits, basis, density, spread, given, name, clearance)
 
     @cached_property
     def _functions(self) -> Array:
@@ -310,7 +366,7 @@ class Designer:
             [moving[:1] / np.maximum(room, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
         )
         C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
-        least = -np.inf if self.clearance is None else self.clearance.least
+        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
         low, high = 0.0, 1.0
         for k in range(_HALVINGS):
             share = 1.0 if k == 0 else (low + high) / 2
@@ -328,7 +384,7 @@ class Designer:
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
-        multipliers = _Multipliers(1.0 / self._functions.shape[1])
+        multipliers = _Multipliers(_WEIGHT / self._functions.shape[1])
         C, before = start, np.inf
 
         def scaled(x: Array) -> tuple[float, Array]:
@@ -396,7 +452,7 @@ class _Multipliers:
 
     def of_distances(self, distance: Array, least: float) -> tuple[float, Array]:
         """Return the cost of distances and its slope by -distance / 5 cm, shape (pairs, N)."""
-        return self._cost((least + _SPARE_WAY - distance) / _SOFT, self._distances)
+        return self._cost((least + 2 * _SPARE_WAY - distance) / _SOFT, self._distances)
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
         pushed = np.maximum(0.0, multipliers + self.weight * over)

@@ -36,7 +36,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, compress, join, merge
-from robotid.regressor.prediction import predict
+from robotid.regressor.prediction import predict, predict_instants
 from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -47,6 +47,8 @@ __all__ = [
     "Run",
     "TorqueNoise",
     "assumed_noise",
+    "assumed_parameters",
+    "largest_torques",
     "preview",
     "preview_logs",
 ]
@@ -55,6 +57,7 @@ __all__ = [
 CORRELATION = 0.1
 _NOISE = 0.01  # the same of its standard deviation, as a share of the largest torque
 _FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
+_POSES = 200  # random ones, of which the largest torque of gravity is taken
 _FAINTEST = 1e-3  # of the largest torque of all joints, that of one that carries nothing
 _EXACT = 1e-9  # share of the largest residual that every joint has at least
 _LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
@@ -289,8 +292,8 @@ def preview_logs(
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
     mapping = structural_mapping(model)
-    size = _largest_torques(model, motions)
-    pi = _assumed_parameters(model, motions, size) if run is None else run.standard
+    size = largest_torques(model)
+    pi = assumed_parameters(model, size) if run is None else run.standard
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
@@ -436,24 +439,32 @@ def _band(log: SurveyedLog) -> float:
     return float(rate * np.sum(low_pass(impulse, rate, log.signals) ** 2))
 
 
-def _largest_torques(model: RobotModel, motions: Sequence[SurveyedLog]) -> Array:
-    """Return the largest torque of each joint, (n,): the URDF's limit, or that of its bodies."""
-    bodies = model.standard_parameters()
-    moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
-    peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
+def largest_torques(model: RobotModel) -> Array:
+    """Return the largest torque of each joint, (n,): the URDF's limit, or what gravity asks for.
+
+    Args:
+        model: The robot.
+    """
+    rng = np.random.default_rng(0)
+    bodies, n = model.standard_parameters(), len(model.joints)
+    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
+    q = rng.uniform(*np.array(reach).T, (_POSES, n))
+    peak = np.abs(predict_instants(model, bodies, q)).max(axis=0)
     peak = np.maximum(peak, _FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
 
 
-def _assumed_parameters(
-    model: RobotModel, motions: Sequence[SurveyedLog], size: Array
-) -> Array:
-    """Return the URDF's bodies with friction of a usual size, shape (p,)."""
+def assumed_parameters(model: RobotModel, size: Array) -> Array:
+    """Return the URDF's bodies with friction of a usual size, shape (p,).
+
+    Args:
+        model: The robot.
+        size: Largest torque of each joint, shape (n,) [N m or N].
+    """
     pi = model.standard_parameters()
-    fastest = np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
     for j, limits in enumerate(model.limits):
-        speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
+        speed = limits.velocity if 0 < limits.velocity < np.inf else 1.0
         for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):
             name = f"{model.joints[j]}.{term}"
             if name in model.layout.names:
