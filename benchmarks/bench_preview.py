@@ -122,9 +122,7 @@ def ratio(key, reported, expected):
     """Return reported over expected standard errors of the parameters that both have."""
     after = dict(zip(reported.mapping.base_names, errors(key, reported), strict=True))
     names = expected.expected.mapping.base_names
-    pairs = [
-        (after[n], e) for n, e in zip(names, expected.base_error, strict=True) if n in after
-    ]
+    pairs = [(after[n], e) for n, e in zip(names, expected.base_error, strict=True) if n in after]
     one, other = np.array(pairs).T
     return (one / other)[np.isfinite(one) & np.isfinite(other)]
 

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from robotid._files import check_file
 from robotid.commands.console import (
     Terminated,
-    print_content,
     print_error,
-    print_files,
     shown_log,
     terminal_progress,
     terminations_raised,
@@ -25,11 +23,16 @@ from robotid.commands.flags import (
     refuse_log_flags,
     source_settings,
     source_words,
+    stated_noise,
 )
+from robotid.commands.printing import print_content, print_files, print_steps, say
 from robotid.exceptions import RobotIdError, SettingsError
 from robotid.versions import __version__
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from robotid._typing import ProgressCallback
     from robotid.commands.job import Job
 
 __all__ = ["main"]
@@ -105,7 +108,10 @@ def _show(
         if options.json:
             print(json.dumps(content, allow_nan=False))
             return
-        print_content(command, content)
+        shown = {"is_verbose": options.verbose} if hasattr(options, "verbose") else {}
+        if hasattr(options, "base"):
+            shown["with_base"] = options.base
+        print_content(command, content, **shown)
         if files:
             print_files(options.out, files)
 
@@ -113,12 +119,13 @@ def _show(
 def _demo(options: argparse.Namespace) -> None:
     from robotid.commands.demo import run_demo
 
-    print("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
-    identification, result, truth = run_demo(options.out)
+    say("simulating a UR5 whose masses, armature and friction its URDF does not know ...")
+    with terminal_progress() as progress:
+        identification, result, truth = run_demo(options.out, progress=progress)
     print_content("identify", result)
     error = identification.base - truth
     within = sum(abs(error) < 3 * identification.base_error)
-    print(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
+    say(f"\n{within} of {len(truth)} base parameters lie within 3 standard errors of the truth")
     print_files(options.out, [*result["outputs"].values(), "result.json", "replay.html"])
 
 
@@ -127,7 +134,7 @@ def _paper(options: argparse.Namespace) -> None:
     from robotid.paper.study import PaperSettings
 
     few = PaperSettings(iterations=5, longest=5, runs=5, patience=5)
-    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+    with _progress(options) as progress:
         result = run_paper(options.out, settings=few if options.quick else None, progress=progress)
     _show(result, options, "paper")
     if not options.json:
@@ -140,22 +147,39 @@ def _inspect(options: argparse.Namespace) -> None:
     from robotid.exceptions import ModelError
 
     content = inspect_urdf(options.urdf, free_flyer=options.free_flyer).to_dict()
+    if not (content["robot"] or options.json):
+        raise ModelError(content["findings"][0]["message"])
     _show(content, options, "inspect")
     if content["structure"] is None:
         raise ModelError(f"no model can be built from {options.urdf}; see the findings")
 
 
-def _identify(options: argparse.Namespace) -> int:
-    from robotid.commands.identify import run_job
-    from robotid.workers.plan import WorkPlan
+def _progress(options: argparse.Namespace) -> "AbstractContextManager[ProgressCallback | None]":
+    """Return the progress that the flags of a command ask for."""
+    return terminal_progress(
+        quiet=options.json,
+        force=getattr(options, "progress", False),
+        is_verbose=getattr(options, "verbose", False),
+    )
 
-    job = job_from_flags(options)
-    workers = job.workers if options.workers is None else options.workers
-    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+
+def _identify(options: argparse.Namespace) -> int:
+    from robotid._typing import report_stage
+
+    with _progress(options) as progress:
+        report_stage(progress, "reading logs")  # before what takes the first second: its modules
+        from robotid.commands.identify import run_job
+        from robotid.identification.advice import Origin, next_steps
+        from robotid.workers.plan import WorkPlan
+
+        job = job_from_flags(options)
+        workers = job.workers if options.workers is None else options.workers
         plan = WorkPlan(workers, options.scheduler, options.resume, progress)
         source = source_words(options.words)
-        _, result = run_job(job, options.out, plan=plan, source=source)
+        found, result = run_job(job, options.out, plan=plan, source=source)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
+    if not options.json:
+        print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["alarms"] else 0
 
 
@@ -216,10 +240,22 @@ def _doctor(options: argparse.Namespace) -> int:
     from robotid.doctor.diagnosis import findings_to_dict
     from robotid.identification.verdict import alarming
 
-    job = job_from_flags(options)
-    findings = examine(job)
-    _show(findings_to_dict(findings), options, "doctor")
+    with _progress(options) as progress:
+        job = job_from_flags(options)
+        model = job.model()
+        findings = examine(job, model, progress=progress)
+    content = findings_to_dict(findings) | {"joints": list(model.joints)}
+    _show(content, options, "doctor")
     return 1 if alarming(findings, job.ignore) else 0
+
+
+def _preview(options: argparse.Namespace) -> None:
+    from robotid.commands.preview import preview_job
+
+    if options.given:
+        refuse_log_flags(options, "a RESULT says how its logs are read")
+    stated = {"noise": stated_noise(options), "correlation": options.correlation}
+    _show(preview_job(job_from_flags(options), options.given, **stated), options, "preview")
 
 
 def _validate(options: argparse.Namespace) -> None:
@@ -241,6 +277,17 @@ def _payload(options: argparse.Namespace) -> None:
         find_gains=options.gains,
     )
     _show(found, options, "payload")
+
+
+def _report(options: argparse.Namespace) -> None:
+    from robotid._typing import report_stage
+
+    with _progress(options) as progress:
+        report_stage(progress, "reading logs")
+        from robotid.commands.report import rewrite_report
+
+        written = rewrite_report(options.result, options.out, progress=progress)
+    _show(written, options, "report")
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -280,10 +327,12 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "inspect": ("joints, parameters and faults of a URDF", _inspect),
     "identify": ("identify a robot: JOB.toml, or URDF LOG [LOG ...]", _identify),
     "track": ("run over a log as if live: history, step changes", _track),
+    "preview": ("what a motion will tell, before it is recorded", _preview),
     "replay": ("play a log in the browser: robot, torques, what was identified", _replay),
     "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor),
     "validate": ("measure a result's prediction on other logs", _validate),
     "payload": ("what hangs on a link: a log with it against one without", _payload),
+    "report": ("write the report of a result again, from its inputs", _report),
     "compare": ("several results side by side", _compare),
     "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
     "convert": (

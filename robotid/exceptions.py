@@ -57,7 +57,7 @@ class RankDeficientError(RobotIdError):
         self.total = total
         super().__init__(
             f"the data excite {rank} of {total} base parameters; undetermined: "
-            f"{list(self.undetermined)}{f' ({words})' if words else ''}. Record a richer "
+            f"{', '.join(self.undetermined)}{f' ({words})' if words else ''}. Record a richer "
             "trajectory, or use the 'consistent' estimator, which keeps the URDF's value where the "
             "data say nothing"
         )

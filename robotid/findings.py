@@ -130,7 +130,7 @@ def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ..
     """Return the messages, one for all that differ in names of joints and logs, and figures."""
     logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
     names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
-    named = "|".join(rf"(?<!\w){re.escape(name)}(?!\w)" for name in names)
+    named = "|".join(rf"'{x}'|(?<!\w){x}(?!\w)" for x in map(re.escape, names))
     slot = re.compile(f"({named}|{_NUMBER})" if named else f"({_NUMBER})")
     alike: dict[tuple[str, ...], list[list[str]]] = {}
     for finding in findings:

@@ -16,9 +16,9 @@ import robotid
 PACKAGE = Path(robotid.__file__).parent
 LINES = [
     "",
-    "exceptions _typing",
+    "exceptions _text _typing",
     "findings versions _files pages",
-    "_settings",
+    "_settings pages",
     "robot logs",
     "regressor",
     "estimators simulation workers",
@@ -46,7 +46,7 @@ INSIDE_FUNCTIONS = {
     "distributed": {"workers"},
     "loky": {"workers"},
     "rich": {"commands"},
-    "matplotlib": {"report", "paper"},
+    "matplotlib": {"paper"},
     "clarabel": {"estimators"},
     "scs": {"estimators"},
 }

@@ -1,5 +1,7 @@
 """The examples under docs/ run, and what they say of their output is so."""
 
+import ast
+import json
 import os
 import re
 import runpy
@@ -7,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 
+import numpy as np
 import pytest
 from helpers.corruptions import CASES
 from helpers.paths import DOCS, ROOT
@@ -62,15 +65,45 @@ def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):
         write_log(log, tmp_path / f"{name}.csv")
     monkeypatch.chdir(tmp_path)
     blocks, namespace = run("own_robot.md")
-    assert len(blocks[0].strip().splitlines()) <= 10
+    assert len(blocks[0].strip().splitlines()) <= 5
     printed = capsys.readouterr().out
     assert "verdict good" in printed.splitlines()[0]
     assert "not fitted" in printed
     best = re.findall(r"^ *(\S+) \+- (\S+)  \S", printed, re.MULTILINE)
     assert len(best) == 5
     assert all(abs(float(value)) > 10 * float(error) for value, error in best)
-    assert {"report.html", "identified.urdf"} <= {p.name for p in tmp_path.iterdir()}
+    written = {path.name for path in (tmp_path / "result").iterdir()}
+    assert {"report.html", "robot.identified.urdf", "result.json"} <= written
     assert set(namespace["found"].sources) <= {"data", "mixed", "prior", "bound"}
+
+
+def test_the_notebook_of_first_steps_runs_and_shows_what_it_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((DOCS / "first_steps.ipynb").read_text())
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+    namespace, shown = {}, []
+    for cell in cells:
+        *steps, last = ast.parse("".join(cell["source"])).body
+        is_value = isinstance(last, ast.Expr)
+        steps = steps if is_value else [*steps, last]
+        exec(compile(ast.Module(steps, []), cell["id"], "exec"), namespace)
+        if is_value:
+            shown.append(eval(compile(ast.Expression(last.value), cell["id"], "eval"), namespace))
+    found, true = namespace["found"], namespace["truth"]
+    assert found.verdict.status == "good"
+    base = found.mapping.to_base(true)
+    assert np.median(np.abs(found.base - base) / found.base_error) < 2.0
+    numbers = re.findall(r"\[(.*?)\]", capsys.readouterr().out)
+    ours, pinocchios, truths = (np.array(line.split(), dtype=float) for line in numbers[:3])
+    np.testing.assert_array_equal(ours, pinocchios)
+    np.testing.assert_allclose(ours, truths, atol=0.1)
+    rich = [thing for thing in shown if hasattr(thing, "_repr_html_")]
+    assert len(rich) == 5  # the identification, its table and three plots
+    assert all("<table" in x._repr_html_() or "<iframe" in x._repr_html_() for x in rich)
+    assert repr(shown[-1]).startswith("<Result of ur5: 58 base parameters")
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {"first.csv", "replay.html", "result"}
 
 
 def test_paper(capsys):

@@ -39,5 +39,10 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
 
 
+def test_quoted_names_are_quoted_one_by_one():
+    findings = [Finding("odd", "note", x, f"link '{x}': {x} weighs 1 kg") for x in ("a b", "c")]
+    assert grouped(findings, ["a b", "c"])[0].messages == ("link 'a b', 'c': a b, c weighs 1 kg",)
+
+
 def test_no_finding_has_no_cause():
     assert grouped([]) == ()

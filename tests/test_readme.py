@@ -8,6 +8,7 @@ import pytest
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
+import robotid
 from robotid.cli import main
 from robotid.commands.job import job_from_settings
 from robotid.logs.read import write_log
@@ -57,13 +58,20 @@ def test_its_links_and_pictures_exist():
 
 def test_the_python_quick_start_runs_and_has_ten_lines(folder, capsys):
     code = block("python quick start")
-    assert len(code.strip().splitlines()) <= 11
-    exec(compile(code, "README.md", "exec"), {})
+    assert len(code.strip().splitlines()) <= 10
+    names = {}
+    exec(compile(code, "README.md", "exec"), names)
     printed = capsys.readouterr().out
-    assert printed.startswith("good")
+    assert "verdict good" in printed
     assert "elbow_joint" in printed
-    assert (folder / "identified.urdf").is_file()
-    assert (folder / "report.html").is_file()
+    assert names["tau"].shape == (6,)
+    loaded = robotid.load_result("result")
+    np.testing.assert_allclose(loaded.parameters, names["found"].standard, rtol=1e-9, atol=1e-12)
+    assert names["robot"].armature.all()
+    assert '<figure class="chart"' in (folder / "torques.html").read_text()
+    assert {"report.html", "robot.identified.urdf"} <= {
+        p.name for p in (folder / "result").iterdir()
+    }
 
 
 def test_the_command_line_quick_start_runs(folder, capsys):

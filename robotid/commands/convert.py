@@ -92,7 +92,9 @@ def _standard_names(
             by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
     if twice := repeated([standard for standard, _ in pairs]):
         both = [name for standard, name in pairs if standard == twice[0]]
-        raise DataError(f"{where} has {both}, several names of {twice[0]!r}; remove all but one")
+        raise DataError(
+            f"{where} has {listed(both)}, several names of {twice[0]!r}; remove all but one"
+        )
     found = dict(pairs)
     if "time" not in found:
         raise DataError(f"{where} has no column 'time'; columns found: {listed(names)}. Rename it")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from robotid._files import check_folder
-from robotid._typing import Array
+from robotid._typing import Array, ProgressCallback
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.replay import replay_identified
@@ -17,6 +17,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.closed_loop import Noise, another_robot, simulate
 from robotid.simulation.motions import random_fourier
+from robotid.workers.plan import WorkPlan
 
 __all__ = ["run_demo"]
 
@@ -26,7 +27,9 @@ _CENTRE = np.array([0.0, -1.2, 1.2, -1.0, 1.0, 0.0])  # [rad] upright, elbow ben
 _NOISE = Noise(q=2e-5, v=2e-4, tau=0.02)  # encoder [rad], its rate [rad/s], 2 % of torque
 
 
-def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]:
+def run_demo(
+    folder: str | Path, *, progress: ProgressCallback | None = None
+) -> tuple[Identification, dict[str, Any], Array]:
     """Simulate, identify, validate, and write everything.
 
     The simulated robot has other masses than its URDF, a tool that the URDF does not know, and
@@ -34,6 +37,7 @@ def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]
 
     Args:
         folder: Where to write; made if it is missing.
+        progress: Called as each stage of the identification begins, as of ``identify``.
 
     Returns:
         The identification, the content of result.json, and the true base parameters, shape (b,).
@@ -59,6 +63,7 @@ def run_demo(folder: str | Path) -> tuple[Identification, dict[str, Any], Array]
         identification=(entries[0],),
         validation=(entries[1],),
     )
-    identification, result = run_job(job, target, beside={"replay": "replay.html"})
+    plan, beside = WorkPlan(progress=progress), {"replay": "replay.html"}
+    identification, result = run_job(job, target, plan=plan, beside=beside)
     replay_identified(identification).write(target / "replay.html")
     return identification, result, identification.mapping.to_base(truth)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from robotid._settings import table_in
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 
 if TYPE_CHECKING:
     from robotid.commands.job import Job
@@ -76,6 +77,14 @@ _ONLINE = tuple(
     or (flag in _LOG and not key.startswith("signals."))
 )
 _SOURCE = ("--topic", "--effort", "--stamp")
+#: Flags that a motion without torques has a use for.
+_MOTION = tuple(
+    flag
+    for flag, (key, _) in _FLAGS.items()
+    if flag in _LOG and not key.startswith(("output.", "torque.", "doctor."))
+    if flag not in ("--effort", "--torque-delay")
+)
+_VERBOSE = "print notes, too; say on stderr the stages, what is chosen, and why"
 
 
 def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
@@ -97,7 +106,9 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
         case "inspect":
             add("urdf", metavar="URDF")
             add("--free-flyer", action="store_true", help="the base floats")
+            add("--base", action="store_true", help="print the base parameters, too")
             _add_json(parser)
+            _add_verbose(parser, "print notes, too")
         case "identify":
             _add_job(parser, "result.json")
             _add_out(parser, "robotid-out")
@@ -105,6 +116,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_progress(parser)
         case "doctor":
             _add_job(parser)
+        case "preview":
+            _add_preview(parser)
         case "track":
             _add_robot_and_log(parser)
             _add_out(parser, "robotid-track")
@@ -127,22 +140,50 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_json(parser)
         case "payload":
             _add_payload(parser)
+        case "report":
+            add("result", metavar="RESULT", help="result.json or its folder")
+            add("--out", metavar="FILE", help="page to write; default: report.html beside it")
+            _add_json(parser)
+            _add_verbose(parser)
+            _add_progress(parser)
         case "compare":
             add("results", nargs="+", metavar="RESULT.json")
             add("--out", metavar="FILE.html", help="page to write")
             _add_json(parser)
-        case "export":
-            add("result", metavar="RESULT", help="result.json or its folder")
-            kinds = ("urdf", "mjcf", "sdf", "ranges")
-            add("--format", required=True, choices=kinds, help="ranges: YAML of 95 %% intervals")
-            add("--out", required=True, metavar="FILE", help="file to write")
-            _add_json(parser)
-        case "convert":
-            add("log", metavar="IN", help="a log of any format, or a bag's folder")
-            add("out", metavar="OUT", help="file to write; its suffix says the format")
-            add("--joints", metavar="A,B,...", help="joints to write; default: all")
-            _add_settings(parser, _SOURCE)
-            _add_json(parser)
+        case "export" | "convert":
+            _add_conversion(parser, command)
+
+
+def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
+    add = parser.add_argument
+    if command == "export":
+        add("result", metavar="RESULT", help="result.json or its folder")
+        kinds = ("urdf", "mjcf", "sdf", "ranges")
+        add("--format", required=True, choices=kinds, help="ranges: YAML of 95 %% intervals")
+        add("--out", required=True, metavar="FILE", help="file to write")
+    else:
+        add("log", metavar="IN", help="a log of any format, or a bag's folder")
+        add("out", metavar="OUT", help="file to write; its suffix says the format")
+        add("--joints", metavar="A,B,...", help="joints to write; default: all")
+        _add_settings(parser, _SOURCE)
+    _add_json(parser)
+
+
+def _add_preview(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="JOB.toml | URDF")
+    add("logs", nargs="*", metavar="MOTION", help="motions or logs; only positions are read")
+    words = "a result.json or its folder: what its logs have said, and their noise"
+    add("--given", metavar="RESULT", help=words)
+    words = "standard deviation of a joint's torque [N m or N]; may be given again; default: that "
+    words += "of RESULT, or 1 %% of the joint's largest torque"
+    add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
+    words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
+    add("--correlation", metavar="S", type=float, help=words)
+    _add_json(parser)
+    flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
+    flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help="as of identify")
+    _add_settings(flags, _MOTION)
 
 
 def _add_payload(parser: argparse.ArgumentParser) -> None:
@@ -170,8 +211,7 @@ def _add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") ->
     parser.add_argument("--json", action="store_true", help=f"print {what}")
 
 
-def _add_verbose(parser: argparse.ArgumentParser) -> None:
-    words = "say on stderr what is chosen, and why"
+def _add_verbose(parser: argparse.ArgumentParser, words: str = _VERBOSE) -> None:
     parser.add_argument("--verbose", action="store_true", help=words)
 
 
@@ -228,6 +268,18 @@ def _add_work(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--resume", action="store_true", help=words)
 
 
+def stated_noise(options: argparse.Namespace) -> dict[str, float]:
+    """Return the noise that was stated, by joint [N m or N].
+
+    Args:
+        options: The flags of the command "preview".
+
+    Raises:
+        SettingsError: If a word is not JOINT=NUMBER.
+    """
+    return _pairs(options.noise, "--noise")
+
+
 def source_settings(options: argparse.Namespace) -> dict[str, Any]:
     """Return the settings of a ``LogSource`` that were given, by name.
 
@@ -253,7 +305,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
         if options.logs or given:
             raise SettingsError(
                 f"{options.source} is a job file, which states its logs and settings itself; "
-                f"leave out {options.logs or given}"
+                f"leave out {listed(options.logs or given)}"
             )
         return read_job(options.source)
     if not options.logs:
@@ -296,19 +348,24 @@ def refuse_log_flags(options: argparse.Namespace, why: str) -> None:
         SettingsError: If one is given.
     """
     if given := _given(options):
-        raise SettingsError(f"{why}; leave out {given}")
+        raise SettingsError(f"{why}; leave out {listed(given)}")
 
 
 def _given(options: argparse.Namespace) -> list[str]:
-    names = ["validate", *(flag[2:].replace("-", "_") for flag in _FLAGS)]
-    return [name for name in names if getattr(options, name, None) is not None]
+    flags = ["--validate", *_FLAGS]
+    return [flag for flag in flags if getattr(options, _name(flag), None) is not None]
+
+
+def _name(flag: str) -> str:
+    """Return what argparse calls a flag."""
+    return flag[2:].replace("-", "_")
 
 
 def _stated(options: argparse.Namespace, flags: Sequence[str]) -> dict[str, Any]:
     """Return what flags state, as a table of a job file."""
     table: dict[str, Any] = {}
     for flag in flags:
-        value = getattr(options, flag[2:].replace("-", "_"), None)
+        value = getattr(options, _name(flag), None)
         if value is None:
             continue
         *tables, key = _FLAGS[flag][0].split(".")

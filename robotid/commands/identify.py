@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
+from robotid._typing import report_stage
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
@@ -27,7 +28,7 @@ from robotid.robot.tree import read_tree
 from robotid.workers.checkpoint import Checkpoint
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["run_job", "save_result"]
+__all__ = ["identify_job", "run_job", "save_result"]
 
 _log = logging.getLogger(__name__)
 
@@ -63,11 +64,12 @@ def run_job(
         SettingsError: If a setting does not fit.
         WorkerError: If a worker ends before its work.
     """
+    chosen = plan or WorkPlan(job.workers or 1)
+    report_stage(chosen.progress, "reading logs")
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])
-    identification, checkpoint = _identify(job, model, target, plan)
-    asked = replace(identification.asked, job=job)
-    found = replace(identification, asked=asked)
+    found, checkpoint = identify_job(job, model, chosen, target)
+    report_stage(chosen.progress, "writing")
     saved = _write(found, job, target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
@@ -189,29 +191,49 @@ def _remove_stale(files: Iterable[Path]) -> None:
             stale.unlink()
 
 
-def _identify(
-    job: Job, model: RobotModel, folder: Path, plan: WorkPlan | None
+def identify_job(
+    job: Job, model: RobotModel, plan: WorkPlan, folder: Path | None = None
 ) -> tuple[Identification, Checkpoint | None]:
-    """Identify from the job's logs; finished pieces of long ones are kept in the folder."""
+    """Identify from a job's logs, and write nothing but finished pieces of long ones.
+
+    Args:
+        job: What to do.
+        model: Its robot.
+        plan: Who works on long logs.
+        folder: Where finished pieces are kept, until the checkpoint is removed; nowhere if None.
+
+    Raises:
+        DataError, ModelError, NotConvergedError, RankDeficientError, SettingsError, WorkerError:
+            As of ``run_job``.
+    """
     check_ignored(job.ignore)
     fitted, kept = survey_logs(job, model, job.identification, job.validation)
     if not fitted:
         raise DataError("no log was given; at least one is needed to identify anything")
+    report_stage(plan.progress, "checking logs")
     stated = model.locked if job.mimic == "coupled" else job.locked
     found = [*locked_findings(model, stated), *examine_logs(job, model, fitted, kept)]
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    chosen, checkpoint = plan or WorkPlan(job.workers or 1), None
+    checkpoint = None
     if not recordings.is_held:
-        checkpoint = Checkpoint.open(
-            folder, checkpoint_inputs(job), recordings.pieces, resume=chosen.resume
-        )
-        recordings = replace(recordings, plan=chosen, checkpoint=checkpoint)
-    elif chosen.is_asked_for:
+        if folder is not None:
+            checkpoint = Checkpoint.open(
+                folder, checkpoint_inputs(job), recordings.pieces, resume=plan.resume
+            )
+        recordings = replace(recordings, plan=plan, checkpoint=checkpoint)
+    elif plan.is_asked_for:
         _log.warning(
             "the logs have no more than %d rows and are read at once: workers, scheduler and "
             "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
             job.rows_in_memory,
         )
-    with chosen:
-        concluded = conclude(recordings, job.estimator, found, job.ignore, friction=job.friction)
-        return concluded, checkpoint
+    with plan:
+        concluded = conclude(
+            recordings,
+            job.estimator,
+            found,
+            job.ignore,
+            friction=job.friction,
+            progress=plan.progress,
+        )
+    return replace(concluded, asked=replace(concluded.asked, job=job)), checkpoint

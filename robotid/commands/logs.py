@@ -1,15 +1,18 @@
 """The logs of a job: each opened once, examined, and told from others by what made them."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from robotid._files import file_sha256
-from robotid.commands.job import Job, LogEntry
+from robotid._typing import STAGES, ProgressCallback, report_stage
+from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import check_locked
 from robotid.exceptions import DataError
+from robotid.export.result import load_result
 from robotid.findings import Finding, by_severity
 from robotid.identification.survey import SurveyedLog, survey_log
 from robotid.identification.verdict import check_ignored
@@ -18,7 +21,7 @@ from robotid.logs.table import Table
 from robotid.robot.model import RobotModel
 from robotid.versions import code_versions
 
-__all__ = ["checkpoint_inputs", "examine", "examine_logs", "survey_logs"]
+__all__ = ["checkpoint_inputs", "examine", "examine_logs", "job_of_result", "survey_logs"]
 
 _PIECES = 8  # pieces that the rows in memory are cut into: smoothing a piece takes some room
 _SHORTEST = 256  # rows of a piece
@@ -72,24 +75,30 @@ def survey_logs(
     return tuple(survey(entries) for entries in groups)
 
 
-def examine(job: Job) -> tuple[Finding, ...]:
+def examine(
+    job: Job, model: RobotModel | None = None, *, progress: ProgressCallback | None = None
+) -> tuple[Finding, ...]:
     """Examine the logs of a job; the findings have errors first.
 
     Args:
         job: The job. A log that cannot be read gives a finding, not an error.
+        model: Its robot; made of its URDF if None.
+        progress: Called as its two stages begin.
 
     Raises:
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit, or a code to ignore is unknown.
     """
     check_ignored(job.ignore)
-    model = job.model()
+    model = model or job.model()
     refused: list[Finding] = []
 
     def refuse(entry: LogEntry, error: DataError) -> None:
         refused.append(Finding(error.code, "error", entry.path.name, str(error)))
 
+    report_stage(progress, "reading logs", STAGES[:2])
     fitted, kept = survey_logs(job, model, job.identification, job.validation, refuse=refuse)
+    report_stage(progress, "checking logs", STAGES[:2])
     return by_severity([*refused, *examine_logs(job, model, fitted, kept)])
 
 
@@ -116,6 +125,32 @@ def examine_logs(
             findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]
     first, second = ([look for log in logs for look in log.looks] for logs in (fitted, kept))
     return (*findings, *diagnose(model, first, second, job.signals))
+
+
+def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[LogEntry]]:
+    """Return a job with the settings of a result, and the logs that this one fitted.
+
+    Args:
+        job: The robot and logs of their own.
+        path: A result.json, or its folder.
+        advice: What to do if a log is gone.
+
+    Raises:
+        DataError: If a log that was fitted is gone or was changed.
+        SettingsError: If the settings in the result are not usable.
+    """
+    result = load_result(path).content
+    settings = {key: value for key, value in result["settings"].items() if value != {}}
+    stated = job_from_settings(settings, Path(path).name, Path())
+    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
+    for entry in stated.identification:
+        if not entry.path.exists() or file_sha256(entry.path) not in hashes:
+            raise DataError(
+                f"{entry.path}, which {path} was fitted to, is not there any more or was changed; "
+                f"{advice}"
+            )
+    wanted = replace(stated, urdf=job.urdf, identification=job.identification)
+    return wanted, list(stated.identification)
 
 
 def checkpoint_inputs(job: Job) -> dict[str, Any]:

@@ -5,11 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robotid._files import file_sha256
-from robotid.commands.job import Job, LogEntry, job_from_settings
-from robotid.commands.logs import survey_logs
-from robotid.exceptions import DataError, SettingsError
-from robotid.export.result import load_result
+from robotid.commands.job import Job, LogEntry
+from robotid.commands.logs import job_of_result, survey_logs
+from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.identification.drive_choice import wanted_families
 from robotid.identification.payload_fit import fit_payloads
@@ -86,7 +84,9 @@ def measure_payload(
     if any(map(is_result, references)):
         if len(references) > 1:
             raise SettingsError(f"one result is a reference by itself; found {listed(references)}")
-        job, entries = _of_result(job, references[0])
+        job, entries = job_of_result(
+            job, references[0], "give a log without the payload instead: --reference LOG"
+        )
     model = job.model()
     unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
     job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
@@ -116,19 +116,3 @@ def _chosen_terms(
     return with_drives(
         reference, choice, wanted_families(job.friction, model.joints)
     ).model.layout.own
-
-
-def _of_result(job: Job, path: str) -> tuple[Job, list[LogEntry]]:
-    """Return the job with the settings of a result, and the logs that this one fitted."""
-    result = load_result(path).content
-    settings = {key: value for key, value in result["settings"].items() if value != {}}
-    stated = job_from_settings(settings, Path(path).name, Path())
-    hashes = {i["sha256"] for i in result["inputs"] if i["role"] == "identification"}
-    for entry in stated.identification:
-        if not entry.path.exists() or file_sha256(entry.path) not in hashes:
-            raise DataError(
-                f"{entry.path}, which {path} was fitted to, is not there any more or was changed; "
-                "give a log without the payload instead: --reference LOG"
-            )
-    wanted = replace(stated, urdf=job.urdf, identification=job.identification)
-    return wanted, list(stated.identification)

@@ -27,6 +27,9 @@ from robotid.viewer.unexplained import find_unexplained
 __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
 
 
+#: Columns that say where a floating base was: position [m] and turn in the world.
+_BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
+
 #: What is read of a track.json.
 _TRACK = {
     "settings": TABLE,
@@ -123,14 +126,21 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     second = None
     if ghost is not None:
         second = (Path(ghost).name, *_ghost(job, model, Path(ghost)))
-    prior = model.standard_parameters()
-    torques = _torques(job, motion, robots)
+    torques = replace(_torques(job, motion, robots), noise=_noise(findings, model))
+    masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
+    shown, q = model, motion.q
+    base = None if second else _base_poses(job, entry, motion)
+    if base is not None:  # the same robot, whose first body is the trunk
+        shown, q = _afloat(job, model), np.hstack([base, q])
+        trunk = shown.standard_parameters()[:10]
+        n = model.layout.n_inertial
+        masses = {label: np.r_[trunk, pi[:n]] for label, pi in masses.items()}
     return replay(
-        model,
+        shown,
         motion.t,
-        motion.q,
+        q,
         torques=torques,
-        masses={"URDF": prior, **bodies} if bodies else None,
+        masses=masses or None,
         ghost=second,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=[*_payloads(findings.track), *_contacts(torques, model)],
@@ -154,10 +164,58 @@ def replay_identified(identification: Identification) -> Replay:
         identification.model,
         motion.t,
         motion.q,
-        torques=Torques(motion.t, motion.tau, {"identified": predicted}),
+        torques=Torques(
+            motion.t, motion.tau, {"identified": predicted}, identification.estimate.sigma
+        ),
         masses={"URDF": identification.prior, "identified": identification.standard},
         notes=[f"Motion: {shown.recording.name}."],
     )
+
+
+def _afloat(job: Job, model: RobotModel) -> RobotModel:
+    """Return a job's robot with a base that moves."""
+    return RobotModel.from_urdf(
+        job.urdf,
+        joints=model.joints,
+        locked=job.locked,
+        free_flyer=True,
+        mimic=job.mimic,
+        snap_angles=job.snap_angles,
+    )
+
+
+def _base_poses(job: Job, entry: LogEntry, log: Log) -> Array | None:
+    """Return where a floating base was, shape (N, 7) as x y z qx qy qz qw; None if unsaid."""
+    table = open_table(entry.path, job.source)
+    time = [name for name in ("time", "t") if name in table.names]
+    if not time or not {*_BASE} <= {*table.names}:
+        return None
+    columns = table.read([time[0], *_BASE])
+    pose = np.column_stack([columns[name] for name in _BASE])
+    known = np.isfinite(pose).all(axis=1)
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    if not known.any() or np.abs(length[known] - 1.0).max() > 0.01:
+        raise DataError(
+            f"{entry.path.name}: {_BASE[3]} to {_BASE[6]} must be the four numbers of a turn, "
+            "whose squares add up to 1; leave these columns out to hold the base fixed"
+        )
+    pose = pose[known]
+    turns = (pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0  # a turn has two quaternions
+    pose[1:, 3:] *= np.where(np.cumsum(turns) % 2, -1.0, 1.0)[:, None]
+    t = columns[time[0]][known]
+    at = np.column_stack([np.interp(log.t, t, column) for column in pose.T])
+    at[:, 3:] /= np.linalg.norm(at[:, 3:], axis=1, keepdims=True)
+    return at
+
+
+def _noise(findings: Findings, model: RobotModel) -> Array | None:
+    """Return the residual's rms of each joint where the first result was identified."""
+    for result in findings.results.values():
+        fitted = result["identification"]["per_joint"]
+        if all(fitted.get(joint, {}).get("rmse") for joint in model.joints):
+            return np.array([fitted[joint]["rmse"] for joint in model.joints])
+        break
+    return None
 
 
 def _ghost(job: Job, model: RobotModel, path: Path) -> tuple[Array, Array]:
@@ -241,5 +299,5 @@ def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:
         size = f"{found.residual:.2g} {units[found.joint]} on average"
         label = f"unexplained torque, most at {found.joint} ({size}, for "
         label += f"{found.end - found.start:.1f} s): contact or load?"
-        marks.append(Mark(found.start, label, "contact"))
+        marks.append(Mark(found.start, label, "contact", found.joint))
     return marks

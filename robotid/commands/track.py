@@ -194,21 +194,21 @@ class _Teller:
             ahead = (t - start) / self._speed - (time.monotonic() - self._began)
             time.sleep(max(ahead, 0.0))
         message = {
-            "t": t - start,
+            "t": t,
             "q": coordinates(self._model, self._log.q[k : k + 1])[0].tolist(),
         }
         if identifier.is_ready:
             reading, (tau, predicted) = identifier.reading, identifier.compared
             message |= {
-                "at": reading.t - start,
+                "at": reading.t,
                 "tau": tau.tolist(),
-                "predicted": predicted.tolist(),
+                "predicted": [x if np.isfinite(x) else None for x in predicted.tolist()],
                 "theta": reading.theta.tolist(),
                 "std_error": reading.std_error.tolist(),
             }
         self._live.send(message)
         for change in identifier.changes[self._marks :]:
-            label = f"step change, flagged at {change.flagged - start:.2f} s"
-            mark = {"t": change.onset - start, "label": label, "kind": "payload"}
+            label = f"step change, flagged at {change.flagged:.2f} s"
+            mark = {"t": change.onset, "label": label, "kind": "payload"}
             self._live.send({"mark": mark})
         self._marks = len(identifier.changes)

@@ -17,7 +17,7 @@ from robotid.export.result import (
     stated_urdf_with_drives,
     stated_witness,
 )
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.evaluation import (
     Evaluation,
     evaluate_logs,
@@ -141,7 +141,7 @@ def _doubts(
     doubts += doubts_of(found, model.joints, names, is_robust=is_robust)
     if missing:
         message = (
-            f"the fitted logs {list(missing)} are not where they were, or were changed: whether "
+            f"the fitted logs {listed(missing)} are not where they were, or were changed: whether "
             "these recordings hold fitted rows was not looked at"
         )
         doubts.append(Doubt("fitted_logs_missing", "", message))

@@ -121,7 +121,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     findings += audit_links(model)
     rounded = list(rounded_angles(model, full))
     findings += rounded
-    if not any(finding.severity == "warning" for finding in rounded):
+    if not any(finding.evidence["felt"] for finding in rounded):
         findings += faint_parameters(model, full)
     structure = Structure(
         standard=model.layout.n_inertial,

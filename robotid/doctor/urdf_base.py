@@ -14,6 +14,7 @@ from robotid.robot.urdf_text import exact_angle
 __all__ = ["faint_parameters", "rounded_angles", "rounded_robot"]
 
 _NOISE = 1e-10  # pivots below this share of the largest are rounding
+_HARMLESS = "the identifiable parameters do not change"
 _ADVICE = "snap_angles = true (--snap-angles) takes the exact angles"
 
 
@@ -25,37 +26,47 @@ def rounded_angles(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]
         mapping: Its base parameters.
 
     Yields:
-        "rounded_rpy" of each joint, with its exact angles. It is a warning where the rounding
-        changes how many parameters are, or look, identifiable; a note elsewhere.
+        "rounded_rpy" of the joints whose angles change how many parameters are, or look,
+        identifiable, and of the others, with the exact angles. It is a warning if more are, which
+        the user can undo; a note elsewhere.
     """
     rounded = _rounded(model.tree)
-    effect = _effect(model, mapping) if rounded else ""
-    carrying = _carrying(model.tree)
-    for name, exact in rounded.items():
-        wanted = ", ".join(f"{value!r} for {word}" for word, value in exact.items())
-        is_felt = bool(effect) and name in carrying
-        more = f"{effect}; {_ADVICE}" if is_felt else "the identifiable parameters do not change"
-        message = f"joint {name!r} has rounded angles in its rpy: write {wanted}; {more}"
-        evidence = {"largest_error": max(abs(float(word) - exact[word]) for word in exact)}
-        severity = "warning" if is_felt else "note"
-        yield Finding("rounded_rpy", severity, f"joint {name}", message, evidence)
+    more, effect = _effect(model, mapping) if rounded else (0, "")
+    felt = _carrying(model.tree) if effect else set()
+    for is_felt, said in ((True, f"{effect}; {_ADVICE}"), (False, _HARMLESS)):
+        joints = {name: exact for name, exact in rounded.items() if (name in felt) == is_felt}
+        if not joints:
+            continue
+        exact = {word: angle for angles in joints.values() for word, angle in angles.items()}
+        wanted = listed(f"{angle!r} for {word}" for word, angle in exact.items())
+        where, subject = f"file {Path(model.tree.path).name}", f"the joints {listed(joints)} have"
+        if len(joints) == 1:
+            where, subject = f"joint {next(iter(joints))}", f"joint {next(iter(joints))!r} has"
+        message = f"{subject} rounded angles in rpy: write {wanted}; {said}"
+        evidence = {
+            "largest_error": max(abs(float(word) - angle) for word, angle in exact.items()),
+            "felt": float(is_felt),
+        }
+        severity = "warning" if is_felt and more else "note"
+        yield Finding("rounded_rpy", severity, where, message, evidence)
 
 
 def rounded_robot(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
-    """Yield one warning if the angles that a URDF rounds change the identifiable parameters.
+    """Yield one finding if the angles that a URDF rounds change the identifiable parameters.
 
     Args:
         model: The robot as its file has it.
         mapping: Its base parameters.
 
     Yields:
-        "rounded_rpy" of the file, with the joints.
+        "rounded_rpy" of the file, with the joints; a note if robotid leaves out what is more.
     """
     joints = [name for name in _rounded(model.tree) if name in _carrying(model.tree)]
-    if joints and (effect := _effect(model, mapping)):
-        where = Path(model.tree.path).name
+    more, effect = _effect(model, mapping) if joints else (0, "")
+    if effect:
+        where, severity = Path(model.tree.path).name, "warning" if more else "note"
         message = f"{where} rounds angles of the joints {listed(joints, 6)}: {effect}; {_ADVICE}"
-        yield Finding("rounded_rpy", "warning", where, message, {"joints": float(len(joints))})
+        yield Finding("rounded_rpy", severity, where, message, {"joints": float(len(joints))})
 
 
 def faint_parameters(model: RobotModel, mapping: BaseMapping) -> Iterator[Finding]:
@@ -95,23 +106,23 @@ def _rounded(tree: Tree) -> dict[str, dict[str, float]]:
     return rounded
 
 
-def _effect(model: RobotModel, mapping: BaseMapping) -> str:
-    """Return what the rounding does to the base parameters, "" if nothing."""
+def _effect(model: RobotModel, mapping: BaseMapping) -> tuple[int, str]:
+    """Return how many base parameters the rounding adds, and what it does, "" if nothing."""
     options = {**model.options, "couplings": model.layout.couplings}
     meant = structural_mapping(RobotModel.from_urdf(model.tree, **options, snap_angles=True))
     more = len(mapping.K) - len(meant.K)
     seeming = _between(mapping) - _between(meant)
     if more:
-        return (
+        return more, (
             f"the file's rounding makes {len(mapping.K)} base parameters of {len(meant.K)}, and "
             "only noise would fix the values of the others"
         )
     if seeming > 0:
-        return (
+        return 0, (
             f"the file's rounding makes {seeming} more parameters look identifiable, though "
             "only noise would fix their values; robotid leaves them out, other tools may not"
         )
-    return ""
+    return 0, ""
 
 
 def _carrying(tree: Tree) -> set[str]:

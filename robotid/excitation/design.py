@@ -28,6 +28,7 @@ from robotid.identification.previews import (
     largest_torques,
 )
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
 
@@ -139,8 +140,8 @@ class Designer:
         """
         criterion(name, np.eye(1))
         mapping = structural_mapping(model)
-        size, speed = largest_torques(model), limits.sizes[1]
-        pi = assumed_parameters(model, size) if run is None else run.standard
+        size, speed = largest_torques(model, _gravity(model)), limits.sizes[1]
+        pi = assumed_parameters(model, size, speed) if run is None else run.standard
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
         usual = _USUAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
@@ -419,6 +420,14 @@ class Designer:
                 return
             before = objective
             multipliers.weight *= _GROWTH
+
+
+def _gravity(model: RobotModel) -> Array:
+    """Return the largest torque that gravity asks of each joint over random poses, shape (n,)."""
+    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
+    q = np.random.default_rng(0).uniform(*np.array(reach).T, (_TRIED, len(reach)))
+    torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
+    return torque
 
 
 class _OutOfTime(Exception):

@@ -24,6 +24,7 @@ from robotid.identification.drive_choice import DriveChoice
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.pipeline import SOURCES, Identification
+from robotid.identification.previews import Preview
 from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
 from robotid.logs.data import suggestion
@@ -38,6 +39,7 @@ from robotid.versions import __version__, versions
 
 __all__ = [
     "Result",
+    "build_preview",
     "build_result",
     "load_result",
     "read_result",
@@ -116,16 +118,7 @@ def build_result(
         "settings": dict(settings),
         "inputs": _inputs(identification),
         "outputs": dict(outputs or {}),
-        "structure": {
-            "standard": size,
-            "base_inertial": len(structural_mapping(model, inertial_only=True).K),
-            "base": len(identification.base),
-            "rank": identification.determination.rank,
-            "condition": _finite(identification.wls.condition),
-            "undetermined": list(identification.determination.undetermined),
-            "poorly_excited": identification.is_poorly_excited,
-            "not_told_apart": identification.determination.to_list(),
-        },
+        "structure": _structure(identification),
         "base_parameters": _base_parameters(identification),
         "uncertainty": {
             "method": identification.errors.method,
@@ -150,7 +143,7 @@ def build_result(
             for e in identification.validation
         ],
         "warnings": [
-            {"code": f.code, "message": f.message, "where": f.where}
+            {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
             for f in identification.findings
         ],
         "wls": {
@@ -164,6 +157,44 @@ def build_result(
     }
 
 
+def build_preview(preview: Preview) -> dict[str, Any]:
+    """Return what a preview tells, plain values only and all of them finite.
+
+    Args:
+        preview: The preview.
+    """
+    found, noise = preview.expected, preview.noise
+    bodies, drives = parameter_entries(found)
+    kept = ("name", "expression", "std_error", "unit")
+    base = [
+        {key: entry[key] for key in kept} | {"plausible": float(spread)}
+        for entry, spread in zip(_base_parameters(found), preview.plausible, strict=True)
+    ]
+    if preview.before is not None and preview.gain is not None:
+        for entry, before, gain in zip(base, preview.before, preview.gain, strict=True):
+            entry |= {"std_error_before": _finite(before), "gain": _finite(gain)}
+    units = dict(zip(found.model.row_names, found.model.row_units, strict=True))
+    return {
+        "robot": found.model.name,
+        "joints": list(found.model.joints),
+        "estimator": found.estimator.name,
+        "motions": [_source(e.recording.log.path) | _extent(e) for e in found.fitted],
+        "noise": {
+            joint: {"std": float(std), "unit": units[joint], "correlation": float(time), "is": of}
+            for joint, std, time, of in zip(
+                found.model.joints, noise.std, noise.correlation, noise.origins, strict=True
+            )
+        },
+        "structure": _structure(found),
+        "undetermined": list(found.determination.undetermined),
+        "words": preview.words,
+        "base_parameters": base,
+        "standard_parameters": [_without_value(entry) for entry in bodies],
+        "drive_parameters": [_without_value(entry) for entry in drives],
+        "torque": _expected_torque(preview),
+    }
+
+
 def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
     """Return the metrics of one recording as result.json has them.
 
@@ -171,7 +202,8 @@ def recording_metrics(evaluation: Evaluation, name: str) -> dict[str, Any]:
         evaluation: The recording.
         name: Which parameters predict.
     """
-    return {"log": evaluation.recording.log.path, **evaluation.metrics[name].to_dict()}
+    recording = evaluation.recording
+    return {"log": recording.log.path, "name": recording.name, **evaluation.metrics[name].to_dict()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,7 +422,9 @@ def stated_parameters(result: Mapping[str, Any], model: RobotModel) -> Array:
     }
     missing = [name for name in model.layout.names if name not in stated]
     if missing:
-        raise ModelError(f"the result has no value of {missing}: the URDF has changed since")
+        raise ModelError(
+            f"the result has no value of {listed(missing, 5)}: the URDF has changed since"
+        )
     return np.array([stated[name] for name in model.layout.names])
 
 
@@ -431,6 +465,44 @@ def _curve(found: Identification, joint: str) -> dict[str, Any]:
     return {"curve": usual_friction(found, joint).to_dict()}
 
 
+def _structure(found: Identification) -> dict[str, Any]:
+    """Return how many parameters there are, and which the data determine."""
+    return {
+        "standard": found.model.layout.n_inertial,
+        "base_inertial": len(structural_mapping(found.model, inertial_only=True).K),
+        "base": len(found.base),
+        "rank": found.determination.rank,
+        "condition": _finite(found.wls.condition),
+        "undetermined": list(found.determination.undetermined),
+        "poorly_excited": found.is_poorly_excited,
+        "not_told_apart": found.determination.to_list(),
+    }
+
+
+def _without_value(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a parameter's entry without what only data tell."""
+    return {key: x for key, x in entry.items() if key not in ("value", "at_bound")}
+
+
+def _expected_torque(preview: Preview) -> dict[str, dict[str, Any]]:
+    """Return size and 95 % band of each joint's torque on the motions, root mean squares."""
+    found, bands = preview.expected, preview.bands
+    torque = np.vstack([e.recording.trajectory.tau for e in found.fitted])
+    of_parameters = REACH * np.sqrt(np.mean(np.vstack([b.parameters for b in bands]) ** 2, axis=0))
+    half = REACH * np.sqrt(np.mean(np.vstack([b.total for b in bands]) ** 2, axis=0))
+    rms = np.sqrt(np.mean(torque**2, axis=0))
+    model = found.model
+    return {
+        row: {
+            "rms": float(rms[j]),
+            "half_width": float(half[j]),
+            "of_parameters": float(of_parameters[j]),
+            "unit": model.row_units[j],
+        }
+        for j, row in enumerate(model.row_names)
+    }
+
+
 def _inputs(identification: Identification) -> list[dict[str, Any]]:
     inputs = [{"role": "urdf", **_source(identification.model.tree.path)}]
     for role, evaluations in (
@@ -439,10 +511,14 @@ def _inputs(identification: Identification) -> list[dict[str, Any]]:
     ):
         for evaluation in evaluations:
             recording = evaluation.recording
-            extent = {key: getattr(recording.extent, key) for key in _EXTENT}
             signals = {"signals": dataclasses.asdict(recording.signals)}
-            inputs.append({"role": role, **_source(recording.log.path), **extent, **signals})
+            source = _source(recording.log.path)
+            inputs.append({"role": role, **source, **_extent(evaluation), **signals})
     return inputs
+
+
+def _extent(evaluation: Evaluation) -> dict[str, Any]:
+    return {key: getattr(evaluation.recording.extent, key) for key in _EXTENT}
 
 
 def _source(path: str) -> dict[str, Any]:

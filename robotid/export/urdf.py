@@ -8,6 +8,7 @@ import difflib
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,8 @@ _SHAPE = {
     "couplings": [{"name": TEXT, "ratios": {...: NUMBER}, "replaces?": FLAG}],
     "lumped": TABLE,
 }
+_HUNK = re.compile(r"@@ -(\d+)")
+_OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over them
 
@@ -116,7 +119,8 @@ def urdf_changes(model: RobotModel, pi: Array, *, dynamics: bool = False) -> lis
         dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``.
 
     Returns:
-        A unified diff without context; empty if the original is gone.
+        A unified diff without context, each stretch with the name of its link or joint; empty if
+        the original is gone.
 
     Raises:
         DataError: If pi does not have p finite entries.
@@ -130,7 +134,13 @@ def urdf_changes(model: RobotModel, pi: Array, *, dynamics: bool = False) -> lis
     texts = original, _content(original, model, pi, written, dynamics=dynamics)
     before, after = (text.decode("utf-8", errors="replace").splitlines() for text in texts)
     names = source.name, f"{source.stem}.identified.urdf"
-    return list(difflib.unified_diff(before, after, *names, n=0, lineterm=""))
+    lines = list(difflib.unified_diff(before, after, *names, n=0, lineterm=""))
+    for k, line in enumerate(lines):
+        if place := _HUNK.match(line):
+            around = "\n".join(before[: int(place[1])])
+            owners = _OWNER.findall(around)
+            lines[k] = f"{line} {owners[-1] if owners else ''}".rstrip()
+    return lines
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any]:

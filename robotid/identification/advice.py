@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from robotid.findings import Cause, grouped, listed
-from robotid.identification.verdict import POOR, is_beaten
+from robotid.identification.verdict import GOOD, is_beaten
 
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
@@ -120,13 +120,15 @@ def _of_verdict(found: Identification) -> list[Cause]:
     causes, kept = [], found.predictions
     measured = [(j, m) for metrics in kept.values() for j, m in metrics.per_joint.items()]
     beaten = {joint for joint, m in measured if is_beaten(m)}
-    missed = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > POOR}
+    missed = {j for j, m in measured if m.relative_error_pct and m.relative_error_pct > GOOD}
     for code, joints in (("beaten", beaten), ("missed", missed)):
         if joints:
             named = tuple(joint for joint in found.model.joints if joint in joints)
             causes.append(Cause(code, "warning", named, (), ()))
     if not kept:
         causes.append(Cause("unseen", "warning", (), (), ()))
+    if not found.is_consistent:
+        causes.append(Cause("impossible", "warning", (), (), ()))
     if not found.witness.agrees:
         severity = "warning" if found.witness.is_against else "note"
         causes.append(Cause("unweighed", severity, (), (), ()))
@@ -168,8 +170,8 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 
 
 def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
-    delays = [f.evidence["delay"] for c in causes for f in c.findings if "delay" in f.evidence]
-    delay = f"{sum(delays) / len(delays):.4f}" if delays else "SECONDS"
+    delays = [finding.evidence["delay"] for cause in causes for finding in cause.findings]
+    delay = f"{sum(delays) / len(delays):.4f}"
     words = (
         f"If the drives filter their torque, state that it is {delay} s late; friction that the "
         "model lacks can look like this, too."
@@ -206,10 +208,19 @@ def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step
     return Step(words, origin.stating("[estimator.constraints]", line))
 
 
+def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = (
+        f"Identify with the consistent estimator: what {found.estimator.name} found is physically "
+        "not possible, so no URDF could be written."
+    )
+    flags = ("--estimator", "consistent")
+    return Step(words, origin.stating("[estimator]", 'name = "consistent"', *flags))
+
+
 def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         f"Look at what the torque of {_named(causes, found.model.joints)} does that the model does "
-        "not explain: a channel that holds something else, a spring, a gear that is not round."
+        "not explain, here under Why and in motion: a channel that holds something else, a spring, a gear that is not round."
     )
     return Step(words, _replay(found, origin))
 
@@ -274,6 +285,7 @@ _STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
     (_delay, ("torque_delay",)),
     (_locks, ("locked_at_zero", "locked_position")),
     (_keep, ("unseen", "repeated_motion", "validation_was_fitted")),
+    (_possible, ("impossible",)),
     (_watch, ("missed", "unexplained_torque", "constraint_costs", "outliers", "spikes")),
     (_pin, ("beaten",)),
     (_richer, ("undetermined", "excitation", "faint_parameters", "no_motion")),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid._settings import Settings
-from robotid._typing import Array
+from robotid._typing import Array, ProgressCallback, report_stage
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
 from robotid.doctor.urdf_inertials import impossible_inertials
@@ -24,7 +24,7 @@ from robotid.exceptions import (
     RankDeficientError,
     SettingsError,
 )
-from robotid.findings import Finding
+from robotid.findings import Finding, listed
 from robotid.identification.bands import (
     FrictionCurve,
     TorqueBand,
@@ -40,6 +40,7 @@ from robotid.identification.metrics import Metrics
 from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
 from robotid.identification.model_error import settled_shapes, with_model_error
 from robotid.identification.parameter_table import parameter_entries, parameter_table
+from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
 from robotid.identification.recordings import Recordings
 from robotid.identification.robust import Outlier, find_outliers, reweigh
 from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
@@ -56,6 +57,7 @@ from robotid.identification.summary import (
     identification_text,
 )
 from robotid.identification.survey import hold_log
+from robotid.identification.torque_split import joint_torques
 from robotid.identification.verdict import (
     Doubt,
     Verdict,
@@ -65,9 +67,12 @@ from robotid.identification.verdict import (
     judge,
     refuted,
 )
+from robotid.identification.why_pictures import why_charts
 from robotid.identification.witness import Witness, call_witness
+from robotid.logs.data import suggestion
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
+from robotid.pages.plots import Plot
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
 from robotid.regressor.prediction import predict_instants
@@ -267,6 +272,80 @@ class Identification:
         """
         return pinocchio_model(self.model, self.standard)
 
+    def plot_torques(self, *joints: str, recording: Evaluation | None = None) -> Plot:
+        """Return charts of measured and identified torque over time, and of the residual.
+
+        Args:
+            joints: The joints; all if none is named.
+            recording: One of ``fitted`` or ``validation``; None: the first that was kept apart,
+                or the first fitted without any.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("torques.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        shown = shown_evaluation(self) if recording is None else recording
+        band, rows = (
+            self.band(shown),
+            [self._row(joint) for joint in joints or self.model.row_names],
+        )
+        charts = []
+        for row in rows:
+            torque, residual = torque_charts(self, shown, row, band=band)
+            name = self.model.row_names[row]
+            charts += [(torque, f"{name}: torque"), (residual, f"{name}: residual")]
+        return Plot(f"Torques of {shown.recording.name}", tuple(charts))
+
+    def plot_friction(self, *joints: str) -> Plot:
+        """Return charts of friction against speed, measured and identified, with its band.
+
+        Args:
+            joints: The joints; all if none is named.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("friction.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint, or none that moved.
+        """
+        names = [self.model.row_names[self._row(joint)] for joint in joints or self.model.joints]
+        charts = [(friction_chart(self, name), f"{name}: friction and offset") for name in names]
+        shown = tuple((chart, caption) for chart, caption in charts if chart is not None)
+        if not shown:
+            raise DataError(f"{listed(names)}: no rows used, so there is no friction to show")
+        return Plot(f"Friction of {listed(names)} against speed", shown)
+
+    def plot_why(self, joint: str) -> Plot:
+        """Return charts of what a joint's torque consists of, and of what its residual follows.
+
+        Args:
+            joint: The joint.
+
+        Returns:
+            Charts that a notebook shows, and that ``.write("why.html")`` keeps.
+
+        Raises:
+            DataError: If there is no such joint.
+        """
+        torque = joint_torques(self)[self._row(joint)]
+        charts = why_charts(torque)
+        about = {name: f"residual against {name}" for name in charts}
+        about |= {"split": torque.sentence, "power": "mechanical power"}
+        shown = tuple((chart, f"{joint}: {about[name]}") for name, chart in charts.items())
+        return Plot(f"Why {joint} is predicted as it is", shown)
+
+    def _row(self, joint: str) -> int:
+        """Return the number of a joint's torque row."""
+        names = self.model.row_names
+        if joint not in names:
+            raise DataError(
+                f"joint {joint!r} is not among those identified: {listed(names)}"
+                f"{suggestion(joint, names)}"
+            )
+        return names.index(joint)
+
     def save(self, folder: str | Path, *, report: bool = True) -> Path:
         """Write what ``robotid identify`` writes: result.json, report, URDF with its sidecar.
 
@@ -438,6 +517,7 @@ def identify(
     friction: str | Mapping[str, str] = AUTO,
     doctor: bool = True,
     ignore: Sequence[str] = (),
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters from motion logs, as the command line does.
 
@@ -453,6 +533,7 @@ def identify(
             ``wanted_families``: "auto" has it chosen.
         doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
         ignore: Codes of errors and doubts that you know better.
+        progress: Called as each of ``STAGES`` begins: its name, stages done, in all, "stages".
 
     Raises:
         DataError: If a log cannot be read, does not fit the model or is too short.
@@ -463,6 +544,7 @@ def identify(
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
+    report_stage(progress, "reading logs")
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic)
@@ -471,9 +553,10 @@ def identify(
     if not first:
         raise DataError("no log was given; at least one is needed to identify anything")
     fitted, kept = ([hold_log(model, log, settings) for log in some] for some in (first, second))
+    report_stage(progress, "checking logs")
     found = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
-    return conclude(recordings, choice, found, ignore, friction=friction)
+    return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
 
 
 def conclude(
@@ -483,6 +566,7 @@ def conclude(
     ignore: Sequence[str] = (),
     *,
     friction: str | Mapping[str, str] = AUTO,
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters from recordings, in memory or not, and judge the result.
 
@@ -492,6 +576,7 @@ def conclude(
         found: What was found of them before, as by the doctor.
         ignore: Codes of findings that the verdict does not count.
         friction: As of ``identify``.
+        progress: As of ``identify``.
 
     Raises:
         DataError: If a row of a log cannot be used.
@@ -504,8 +589,10 @@ def conclude(
             "dynamics is 'static', which has friction 'none' or 'viscous+coulomb' (without the "
             "viscous), but more is stated; leave it out, or set dynamics = 'full'"
         )
+    report_stage(progress, "fitting")
     with _explained(found):
         fit = with_drives(recordings, choice, wanted)
+    report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"

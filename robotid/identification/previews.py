@@ -12,6 +12,7 @@ least squares, and with the prior's information that of a consistent fit.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -31,12 +32,13 @@ from robotid.identification.recordings import Recordings
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
 from robotid.identification.standard_errors import StandardErrors, about_prior, standard_of
 from robotid.identification.survey import SurveyedLog, hold_log
-from robotid.logs.data import Log, suggestion
+from robotid.logs.data import suggestion
+from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, compress, join, merge
-from robotid.regressor.prediction import predict, predict_instants
+from robotid.regressor.prediction import predict
 from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
@@ -57,7 +59,6 @@ __all__ = [
 CORRELATION = 0.1
 _NOISE = 0.01  # the same of its standard deviation, as a share of the largest torque
 _FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
-_POSES = 200  # random ones, of which the largest torque of gravity is taken
 _FAINTEST = 1e-3  # of the largest torque of all joints, that of one that carries nothing
 _EXACT = 1e-9  # share of the largest residual that every joint has at least
 _LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
@@ -212,12 +213,14 @@ class Preview:
         """Factor by which the base parameters' standard errors fall, shape (b,); None of no run."""
         if self.before is None:
             return None
-        plausible = np.sqrt(
-            np.einsum("bi,i,bi->b", self.expected.mapping.K, self.expected.prior_std**2,
-                      self.expected.mapping.K)
-        )  # fmt: skip
-        gain: Array = np.minimum(self.before, plausible) / np.minimum(self.base_error, plausible)
+        before, after = (np.minimum(x, self.plausible) for x in (self.before, self.base_error))
+        gain: Array = before / after
         return gain
+
+    @property
+    def plausible(self) -> Array:
+        """How far the base parameters may plausibly lie from the URDF's, shape (b,)."""
+        return base_spread(self.expected.mapping.K, self.expected.prior_std)
 
     @property
     def bands(self) -> tuple[TorqueBand, ...]:
@@ -228,12 +231,13 @@ class Preview:
     def words(self) -> str:
         """What the motions determine, and what they leave open."""
         found = self.expected
-        return excitation_finding(found.wls, found.determination, "").message
+        names = listed(dict.fromkeys(e.recording.log.name for e in found.fitted))
+        return excitation_finding(found.wls, found.determination, names).message
 
 
 def preview(
-    model: RobotModel,
-    motions: Sequence[Log],
+    model: RobotModel | str | Path,
+    motions: Readable | Sequence[Readable],
     *,
     noise: TorqueNoise | Mapping[str, float] | None = None,
     signals: SignalSettings | None = None,
@@ -243,26 +247,30 @@ def preview(
     """Return the standard errors to be expected of motions, before they are recorded.
 
     Args:
-        model: The robot, from its URDF.
-        motions: The motions; their torques are ignored, and may be zeros.
+        model: The robot; or the path of its URDF, all of whose joints move. With a run before, the
+            robot is that run's.
+        motions: The motions: a ``Log``, whose torques are ignored, the path of a file with
+            positions, a DataFrame, or several of these.
         noise: Standard deviation of the torque's noise by joint [N m or N], of those that it is
             known of, or all about it; as of ``assumed_noise`` for the others, or as a run before
             has it.
-        signals: How logs become trajectories; the defaults if None.
+        signals: How logs become trajectories; those of the run before, or the defaults, if None.
         estimator: Name or settings of the estimator.
         given: A run that was identified before, which adds what it said.
 
     Raises:
-        DataError: If a motion does not fit the model or is too short.
+        DataError: If a motion cannot be read, does not fit the model or is too short.
         SettingsError: If a setting is out of range, or a joint is unknown.
     """
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings, run = signals or SignalSettings(), None
+    model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
     if given is not None:
-        model = given.model
+        model, settings = given.model, signals or given.asked.signals
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
         run = Run.of(Recordings(model, given.mapping, logs), given.standard)
-    held = [hold_log(model, motion, settings) for motion in motions]
+    read = read_logs(motions, model.joints, prismatic=model.layout.prismatic, is_motion=True)
+    held = [hold_log(model, motion, settings) for motion in read]
     return preview_logs(model, held, choice, noise=noise, run=run)
 
 
@@ -272,8 +280,9 @@ def preview_logs(
     choice: EstimatorSettings,
     *,
     noise: TorqueNoise | Mapping[str, float] | None = None,
-    correlation: float = CORRELATION,
+    correlation: float | None = None,
     run: Run | None = None,
+    like: Run | None = None,
 ) -> Preview:
     """Return the standard errors to be expected of motions that were read.
 
@@ -282,8 +291,10 @@ def preview_logs(
         motions: The motions, in memory.
         choice: Which estimator.
         noise: As of ``preview``.
-        correlation: Time over which the noise is correlated where no run before tells it [s].
-        run: What was recorded before, if anything.
+        correlation: Time over which noise that is stated or assumed is correlated [s]; if None, as
+            a run before has it, or 0.1 s.
+        run: What was recorded before, if anything; it adds what it said.
+        like: A run whose noise and parameters these motions have, too, without adding to them.
 
     Raises:
         DataError: As of ``preview``.
@@ -292,21 +303,24 @@ def preview_logs(
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
     mapping = structural_mapping(model)
-    size = largest_torques(model)
-    pi = assumed_parameters(model, size) if run is None else run.standard
+    peak, fastest = _seen(model, motions)
+    size = largest_torques(model, peak)
+    known = run or like
+    pi = assumed_parameters(model, size, fastest) if known is None else known.standard
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
-        noise = assumed_noise(model, size, noise or {}, correlation, run and run.noise(mapping.K))
+        found = None if known is None else known.noise(mapping.K)
+        noise = assumed_noise(model, size, noise or {}, correlation, found)
     said = _Information.of(model, mapping, motions, noise)
     said = said if run is None else said.beside(run)
     prior, spread = model.standard_parameters(), prior_spread(model, said.squares, said.samples)
-    known = Known(prior, spread, said.share, said.sigma)
-    estimate, wls = _errors(model, mapping, said, known, choice)
-    expected = _expected(mapping, motions, pi, said, known, choice, estimate, wls)
+    ground = Known(prior, spread, said.share, said.sigma)
+    estimate, wls = _errors(model, mapping, said, ground, choice)
+    expected = _expected(mapping, motions, pi, said, ground, choice, estimate, wls)
     before = None
     if run is not None:
-        alone, _ = _errors(model, mapping, said.without_motions(), known, choice)
+        alone, _ = _errors(model, mapping, said.without_motions(), ground, choice)
         before = _base_error(alone, mapping, prior, spread)
     return Preview(expected, noise, before)
 
@@ -315,7 +329,7 @@ def assumed_noise(
     model: RobotModel,
     size: Array,
     stated: Mapping[str, float],
-    correlation: float = CORRELATION,
+    correlation: float | None = None,
     found: TorqueNoise | None = None,
 ) -> TorqueNoise:
     """Return the noise of each joint: stated, or that of a run before, or assumed.
@@ -326,7 +340,7 @@ def assumed_noise(
         model: The robot.
         size: Largest torque of each joint, shape (n,) [N m or N].
         stated: Standard deviation by joint [N m or N], of those that it is known of.
-        correlation: Time over which it is correlated [s], unless a run before shows it.
+        correlation: As of ``preview_logs``.
         found: That of a run before, if there is one.
 
     Raises:
@@ -340,12 +354,14 @@ def assumed_noise(
             )
         if not 0 < value < np.inf:
             raise SettingsError(f"noise of {joint!r} is {value:g}, wanted a positive number")
-    if not 0 <= correlation < np.inf:
+    if correlation is not None and not 0 <= correlation < np.inf:
         raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
     is_stated = np.isin(model.joints, list(stated))
     values = np.array([stated.get(joint, np.nan) for joint in model.joints])
     std = _NOISE * size if found is None else found.std
-    time = np.full(len(size), correlation) if found is None else found.correlation
+    time = np.full(len(size), CORRELATION) if found is None else found.correlation
+    if correlation is not None:
+        time = np.where(is_stated | (found is None), correlation, time)
     other = "assumed" if found is None else "found"
     origins = tuple("stated" if known else other for known in is_stated)
     return TorqueNoise(np.where(is_stated, values, std), time, origins)
@@ -439,32 +455,38 @@ def _band(log: SurveyedLog) -> float:
     return float(rate * np.sum(low_pass(impulse, rate, log.signals) ** 2))
 
 
-def largest_torques(model: RobotModel) -> Array:
-    """Return the largest torque of each joint, (n,): the URDF's limit, or what gravity asks for.
+def _seen(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
+    """Return the largest torque and speed of each joint in motions, by the URDF's bodies, (n,)."""
+    bodies = model.standard_parameters()
+    moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
+    peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
+    return peak, np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
+
+
+def largest_torques(model: RobotModel, peak: Array) -> Array:
+    """Return the largest torque of each joint, shape (n,): the URDF's limit, or one that was seen.
 
     Args:
         model: The robot.
+        peak: What stands for the limit where the URDF states none, shape (n,) [N m or N].
     """
-    rng = np.random.default_rng(0)
-    bodies, n = model.standard_parameters(), len(model.joints)
-    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
-    q = rng.uniform(*np.array(reach).T, (_POSES, n))
-    peak = np.abs(predict_instants(model, bodies, q)).max(axis=0)
     peak = np.maximum(peak, _FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
 
 
-def assumed_parameters(model: RobotModel, size: Array) -> Array:
+def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
     """Return the URDF's bodies with friction of a usual size, shape (p,).
 
     Args:
         model: The robot.
         size: Largest torque of each joint, shape (n,) [N m or N].
+        fastest: What stands for the largest speed where the URDF states none, shape (n,)
+            [rad/s or m/s].
     """
     pi = model.standard_parameters()
     for j, limits in enumerate(model.limits):
-        speed = limits.velocity if 0 < limits.velocity < np.inf else 1.0
+        speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
         for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):
             name = f"{model.joints[j]}.{term}"
             if name in model.layout.names:

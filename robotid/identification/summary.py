@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from robotid._text import columns
 from robotid.pages.html import code, number, percent, table, text
 
 if TYPE_CHECKING:
@@ -53,31 +54,34 @@ def identification_text(found: Identification) -> str:
     return "\n".join(lines)
 
 
-def error_lines(metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None) -> list[str]:
+def error_lines(
+    metrics: Mapping[str, Any], wls: Mapping[str, Any] | None = None, width: int | None = None
+) -> list[str]:
     """Return the errors of each joint as lines of text.
 
     Args:
         metrics: Metrics, as in result.json.
         wls: Those of weighted least squares, or none.
+        width: Characters of a line; columns beyond it are left out, and named.
     """
+    heads = ["joint\n", "error\n%", "rmse\n", "\n", "URDF +\ndrives %", "WLS\n%", "URDF\n%"]
     others = {} if wls is None else wls["per_joint"]
-    width = max(len(joint) for joint in metrics["per_joint"])
-    lines = [
-        f"  {'joint':{width}}  error %   rmse        wls %   urdf %  gravity %  urdf + drives %"
-    ]
+    rows, is_worse = [], False
     for joint, m in metrics["per_joint"].items():
-        error, urdf, gravity, driven = (
-            m.get(f"{of}relative_error_pct")
-            for of in ("", "urdf_", "gravity_only_", "urdf_with_drives_")
+        mark = "" if m["better_than_constant"] else " *"
+        is_worse = is_worse or bool(mark)
+        error, driven, urdf, gravity = (
+            cell(m.get(f"{of}relative_error_pct"))
+            for of in ("", "urdf_with_drives_", "urdf_", "gravity_only_")
         )
-        cells = [cell(others.get(joint, {}).get("relative_error_pct")), cell(urdf)]
-        rmse = f"{m['rmse']:.3g} {m['unit']}"
-        flag = "" if m["better_than_constant"] else "  worse than a constant"
-        lines.append(
-            f"  {joint:{width}}  {cell(error)}   {rmse:10}{' '.join(cells)}  {cell(gravity, 9)}"
-            f"  {cell(driven, 15)}{flag}"
-        )
-    return lines
+        least = cell(others.get(joint, {}).get("relative_error_pct"))
+        rmse = f"{m['rmse']:#.3g}".rstrip(".")
+        rows.append([joint + mark, error, rmse, m["unit"], driven, least, urdf, gravity])
+    heads.append("gravity\nonly %")
+    if wls is None:
+        heads, *rows = ([*line[:5], *line[6:]] for line in (heads, *rows))
+    lines = columns(heads, rows, width=width, needed=4, left=(0, 3))
+    return lines + (["  * worse than a constant"] if is_worse else [])
 
 
 def friction_lines(friction: Mapping[str, Any]) -> list[str]:
@@ -99,16 +103,25 @@ def friction_lines(friction: Mapping[str, Any]) -> list[str]:
 
 
 def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
-    """Return a verdict with its reasons as lines of text.
+    """Return a verdict as lines of text: on all, with its reasons; then joint by joint.
+
+    A reason that stands beside a joint is not said twice.
 
     Args:
         verdict: Status, reasons and joints, as in result.json.
     """
-    lines = [f"verdict: {verdict['status']}", *(f"  - {reason}" for reason in verdict["reasons"])]
     by_cell: dict[str, list[str]] = {}
     for name, joint in verdict["per_joint"].items():
         by_cell.setdefault(verdict_cell(name, joint), []).append(name)
-    return lines + [f"  {', '.join(names)}: {said}" for said, names in by_cell.items()]
+    beside = {joint["reasons"][0] for joint in verdict["per_joint"].values() if joint["reasons"]}
+    reasons = [f"  - {reason}" for reason in verdict["reasons"] if reason not in beside]
+    if list(by_cell) == ["good"]:
+        by_cell = {"good": ["every joint"]}
+    return [
+        f"verdict: {verdict['status']}",
+        *reasons,
+        *(f"  {', '.join(names)}: {said}" for said, names in by_cell.items()),
+    ]
 
 
 def verdict_cell(joint: str, verdict: Mapping[str, Any]) -> str:
@@ -134,14 +147,13 @@ def joint_reason(joint: str, reasons: Sequence[str]) -> str:
     return said if joint in about.split(", ") else why
 
 
-def cell(value: float | None, width: int = 7) -> str:
-    """Return a percentage, or a dash, as wide as its column.
+def cell(value: float | None) -> str:
+    """Return a percentage, or a dash.
 
     Args:
         value: The percentage, or None.
-        width: Width of the column.
     """
-    return f"{value:{width}.1f}" if value is not None else "-".rjust(width)
+    return "-" if value is None else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
 
 
 def identification_html(found: Identification) -> str:

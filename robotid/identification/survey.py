@@ -122,9 +122,10 @@ class LogPiece:
         Args:
             rows: The rows.
         """
-        model = self.header.model
+        model, mask = self.header.model, rows.mask
         motion = remember(model, replace(rows.trajectory, memory=None))
-        mask = row_mask(model, motion, self.header.signals.min_velocity)
+        if not model.is_static:  # whose stands were chosen with their speeds
+            mask = row_mask(model, motion, self.header.signals.min_velocity)
         vars(self)["_kept"] = replace(rows, trajectory=motion, mask=mask)
 
     @cached_property

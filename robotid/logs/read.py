@@ -46,6 +46,7 @@ def read_log(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
+    is_motion: bool = False,
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
 
@@ -62,6 +63,7 @@ def read_log(
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
         transmissions: The motors and gears, where the file has columns of motors.
+        is_motion: Whether it is read for its motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -70,7 +72,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions,
+        source=source, transmissions=transmissions, is_motion=is_motion,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -78,7 +80,11 @@ def read_log(
 
 
 def read_logs(
-    given: Readable | Sequence[Readable], joints: Sequence[str], *, prismatic: Collection[str] = ()
+    given: Readable | Sequence[Readable],
+    joints: Sequence[str],
+    *,
+    prismatic: Collection[str] = (),
+    is_motion: bool = False,
 ) -> tuple[Log, ...]:
     """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
 
@@ -86,6 +92,7 @@ def read_logs(
         given: A log, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
         prismatic: Names of joints that slide; the others turn.
+        is_motion: Whether they are read for their motion alone, as of ``lay_out``.
 
     Raises:
         DataError: If it is something else, or does not hold what is wanted.
@@ -98,7 +105,10 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        log if isinstance(log, Log) else read_log(log, joints, prismatic=prismatic) for log in logs
+        log
+        if isinstance(log, Log)
+        else read_log(log, joints, prismatic=prismatic, is_motion=is_motion)
+        for log in logs
     )
 
 
@@ -441,13 +451,34 @@ class _Finder:
         if tau and has_gain:
             self.notes.append(f"the gain of {joint!r} is not used: {tau} is a torque")
         if current and not has_gain:
-            raise DataError(
-                f"{self.where}: joint {joint!r} has the current {current!r} but no gain; give it "
-                f"in N m/A: gains={{{joint!r}: ...}} (job file table [torque], key gains; "
-                f"CLI --gain {joint}=...)",
-                code="missing_gain",
-            )
+            raise self._no_gain(joint, current)
         return tau or current or self._missing(f"tau{m}", joint)
+
+    def _no_gain(self, joint: str, current: str) -> DataError:
+        """Return the error of a current without a gain, with all that the others lack, too."""
+        without = [joint]
+        if joint in self.joints:
+            logged = [other for other in self.joints if self._has("current", other)]
+            without = [x for x in logged if not self._has("tau", x) and x not in self.gains]
+        has = f"joint {joint!r} has the current {current!r}"
+        if len(without) > 1:
+            has = f"joints {listed(without)} have currents"
+        more = ", ..." if len(without) > 1 else ""
+        flags = " ".join(f"--gain {name}=..." for name in without)
+        absent = [x for x in self.joints if not (self._has("tau", x) or self._has("current", x))]
+        also = ""
+        if absent and joint in self.joints:
+            locks = " ".join(f"--lock {name}=0" for name in absent)
+            also = (
+                f". There is no torque of {listed(absent)} either; if they stood still, lock them "
+                f"where they stood, as with {locks}"
+            )
+        return DataError(
+            f"{self.where}: {has} but no gain; give it in N m/A: "
+            f"gains={{{without[0]!r}: ...{more}}} (job file table [torque], key gains; CLI "
+            f"{flags}){also}",
+            code="missing_gain",
+        )
 
     def _find_optional(self, kind: str) -> list[str]:
         """Return the columns of a quantity that every joint has; none if some joint lacks it."""
@@ -505,9 +536,10 @@ class _Finder:
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has a position, and a torque or a current, of a joint."""
+        has_torque = self._has("tau", joint) or self._has("current", joint)
+        return self._has("q", joint) and (self.is_motion or has_torque)
 
-        def has(kind: str) -> bool:
-            names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
-            return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
-
-        return has("q") and (self.is_motion or has("tau") or has("current"))
+    def _has(self, kind: str, joint: str) -> bool:
+        """Return whether the file has a quantity of a joint."""
+        names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
+        return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)

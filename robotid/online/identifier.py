@@ -136,7 +136,10 @@ class OnlineIdentifier:
 
     @property
     def compared(self) -> tuple[Array, Array]:
-        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each."""
+        """Torque at the reading's moment and what the estimate makes of it, shape (n,) each.
+
+        The latter is NaN where a joint stands still: its friction has no sign.
+        """
         self._require_ready()
         return self._compared
 
@@ -239,7 +242,7 @@ class OnlineIdentifier:
         self._remember(t)
         self._state, self._t = state, t
         residual = tau - Y @ state.theta
-        self._compared = tau, tau - residual
+        self._compared = tau, np.where(used, tau - residual, np.nan)
         onset = self._innovations.push(t, tau, e, residual, doubt, used, self._share)
         if onset is not None:
             self._reopen(now, onset)

@@ -102,7 +102,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
 
     Args:
         chart: The chart.
-        caption: HTML of the caption.
+        caption: HTML of the caption; none if empty.
         points: About how many rows of data go into the page; extremes and breaks are kept.
         still: About how many of them the still picture shows.
     """
@@ -136,8 +136,9 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
     }
     # "<" is an escape in JSON, so no text in it can end the script
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    head = f"<figcaption>{caption}</figcaption>" if caption else ""
     return (
-        f'<figure class="chart"><figcaption>{caption}</figcaption>{_still(chart, x, series, still)}'
+        f'<figure class="chart">{head}{_still(chart, x, series, still)}'
         f'<script type="application/json">{text}</script></figure>\n'
     )
 
@@ -249,15 +250,33 @@ class _Axis:
             decades = range(int(np.floor(self.low)), int(np.ceil(self.high)) + 1)
             every = [s * 10.0**d for d in decades for s in ((1, 2, 5) if few else (1,))]
             return [v for v in every if self.low <= np.log10(v) <= self.high]
-        apart = 28.0 if self.stop < self.start else 80.0  # [px] at least
-        raw = (self.high - self.low) * apart / abs(self.stop - self.start)
-        step = 10.0 ** np.floor(np.log10(raw))
-        step *= next(s for s in (1, 2, 5, 10) if s * step >= raw)
-        first, last = np.ceil(self.low / step), np.floor(self.high / step)
-        return [float(k * step) for k in np.arange(first, last + 1)]
+        first, last = np.ceil(self.low / self.step), np.floor(self.high / self.step)
+        return [float(k * self.step) for k in np.arange(first, last + 1)]
+
+    @property
+    def step(self) -> float:
+        """Distance of the ticks: 1, 2 or 5 times a power of ten."""
+        apart = 22.0 if self.stop < self.start else 80.0  # [px] at least
+        least = (self.high - self.low) * apart / abs(self.stop - self.start)
+        power = 10.0 ** np.floor(np.log10(least))
+        return float(power * next(s for s in (1, 2, 5, 10) if s * power >= least))
+
+    @property
+    def words(self) -> list[str]:
+        """The numbers at the ticks, with as many digits as tell them apart."""
+        digits = 0 if self.is_log else max(0, -int(np.floor(np.log10(self.step) + 1e-9)))
+        written = [f"{v:.6g}" if self.is_log else f"{v + 0.0:.{digits}f}" for v in self.ticks]
+        return [word.replace("-", "−") for word in written]
 
 
 _Cover = list[tuple[Array, Array]]  # lower and upper edges of what a series covers
+
+
+def _slant(names: Sequence[str]) -> int:
+    """Return how much room [px] names at ticks need below that stand too close to be upright."""
+    room = (_WIDTH - _LEFT - _RIGHT) / max(len(names), 1)
+    longest = _LETTER * max(map(len, names), default=0)
+    return round(0.5 * longest) if longest > room else 0
 
 
 def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
@@ -280,14 +299,14 @@ def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
 def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str:
     """Return the chart as an ``<svg>`` of a few points."""
     covers = _covers(series)
-    height = _TOP + chart.height + _BOTTOM
+    height = _TOP + chart.height + _BOTTOM + _slant(chart.x_names)
     logs = ["x" in chart.logarithmic, "y" in chart.logarithmic]
     edges = [edge for cover in covers for pair in cover for edge in pair]
     values = [x, np.concatenate(edges or [np.empty(0)])]
     scaled = [np.log10(v[v > 0]) if log else v for v, log in zip(values, logs, strict=True)]
-    wide = any(s.kind == "bars" for s in chart.series) or chart.x_names
+    is_wide = any(s.kind == "bars" for s in chart.series) or bool(chart.x_names)
     across = _Axis(
-        *_extent([scaled[0]], 0.5 / max(len(x) - 1, 1) if wide else 0.0),
+        *_extent([scaled[0]], 0.5 / max(len(x) - 1, 1) if is_wide else 0.0),
         _LEFT, _WIDTH - _RIGHT, logs[0],
     )  # fmt: skip
     if across.high == across.low:
@@ -318,21 +337,22 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
     columns = list(range(len(chart.x_names))) or across.ticks
     grid += "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in columns)
     parts.append(f'<path d="{grid}" stroke="currentColor" stroke-opacity="0.15"/>')
-    for v in up.ticks:
-        parts.append(
-            f'<text x="{_LEFT - 6}" y="{up(v) + 4:.1f}" text-anchor="end">{_number(v)}</text>'
-        )
-    for v in columns:
-        name = escape(chart.x_names[int(v)]) if chart.x_names else _number(v)
-        parts.append(
-            f'<text x="{across(v):.1f}" y="{bottom + 14:.0f}" text-anchor="middle">{name}</text>'
-        )
+    parts += [
+        f'<text x="{_LEFT - 6}" y="{up(v) + 4:.1f}" text-anchor="end">{word}</text>'
+        for v, word in zip(up.ticks, up.words, strict=True)
+    ]
+    slant = _slant(chart.x_names)
+    for v, word in zip(columns, chart.x_names or across.words, strict=True):
+        place = f"{across(v):.1f} {bottom + 14:.0f}"
+        turned = f'transform="translate({place}) rotate(-30)" text-anchor="end"'
+        upright = f'transform="translate({place})" text-anchor="middle"'
+        parts.append(f"<text {turned if slant else upright}>{escape(word)}</text>")
     dotted = "".join(f"M{across(v):.1f} {_TOP}V{bottom}" for v in chart.marks)
     if dotted:
         parts.append(f'<path d="{dotted}" stroke="currentColor" stroke-dasharray="1 3"/>')
     middle = (_LEFT + right) / 2
     parts.append(
-        f'<text x="{middle:.0f}" y="{bottom + 29:.0f}" text-anchor="middle">'
+        f'<text x="{middle:.0f}" y="{bottom + 29 + slant:.0f}" text-anchor="middle">'
         f"{escape(chart.x_label)}</text>"
     )
     return "".join(parts)
@@ -444,7 +464,3 @@ def _path(x: Array, y: Array) -> str:
 def _finite(x: Array, y: Array) -> Iterator[tuple[float, float]]:
     known = np.isfinite(x + y)
     return zip(x[known].tolist(), y[known].tolist(), strict=True)
-
-
-def _number(value: float) -> str:
-    return f"{value + 0.0:.6g}".replace("-", "−")  # no minus before a zero

@@ -17,6 +17,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
+from robotid.findings import listed
 
 __all__ = [
     "PAPER_LINKS",
@@ -211,7 +212,7 @@ def _body(i: int, parent: str, *numbers: float) -> str:
 
 def _check_form(form: str) -> None:
     if form not in PARAMETER_NAMES:
-        raise SettingsError(f"form is {form!r}, wanted one of {list(PARAMETER_NAMES)}")
+        raise SettingsError(f"form is {form!r}, wanted one of {listed(PARAMETER_NAMES)}")
 
 
 def _pair(name: str, values: Array) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.paper.errata import EnergyDrift
 from robotid.paper.study import CASES, DURATION, PROGRAM, ModelStudy, RandomRuns
-from robotid.report.svg import INK, STYLE
+from robotid.paper.svg import INK, STYLE
 
 __all__ = ["paper_figures"]
 

@@ -29,9 +29,9 @@ from robotid.paper.study import (
     random_runs,
     study_model,
 )
+from robotid.paper.svg import STYLE, svg_element
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
-from robotid.report.svg import STYLE, svg_element
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import PAPER_TERMS, to_paper_order
 from robotid.versions import __version__

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 from robotid.paper.equations import LinearDynamics, LinearPlant, PlanarDynamics, torque
 from robotid.paper.planar_2r import PAPER_LINKS, PAPER_PARAMETERS, Form, parameters
 from robotid.paper.procedure import History, Influences, LoopSettings, random_torque, run_procedure
@@ -167,7 +168,7 @@ def paper_arm(name: str) -> tuple[PlanarDynamics, Array]:
         SettingsError: If there is no such model.
     """
     if name not in MODELS:
-        raise SettingsError(f"model is {name!r}, wanted one of {list(MODELS)}")
+        raise SettingsError(f"model is {name!r}, wanted one of {listed(MODELS)}")
     P = parameters(PAPER_LINKS) if name == "physical" else PAPER_PARAMETERS
     return PlanarDynamics(MODELS[name]), P
 

@@ -53,39 +53,6 @@ def predict(
     return _from_rows(source, np.column_stack(list(parameters)))
 
 
-def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
-    """Return gravity, inertia and velocity torques of the bodies, each (N, n_rows) [N m, N].
-
-    They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
-    tau(q, 0, a), so that their sum is the torque of the bodies.
-
-    Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), possible ones or not; those of drives add nothing.
-        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
-        v: Velocities, shape (N, n_rows) [rad/s, m/s].
-        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
-
-    Raises:
-        DataError: If q does not fit the model.
-    """
-    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
-    rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
-    still = np.zeros_like(v)
-    g, g_and_Ma, whole = (rigid(model, bodies, q, *x) for x in ((still, still), (still, a), (v, a)))
-    return [g, g_and_Ma - g, whole - g_and_Ma]
-
-
-def _rows_by_pi(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:
-    """Return Y pi, shape (N, n_rows), without drives that remember, block by block."""
-    torque, memory = np.empty_like(v), np.zeros((len(v), len(model.layout.remembering)))
-    for start in range(0, len(v), BLOCK):
-        k = slice(start, start + BLOCK)
-        Y = joint_torque_regressor(model, q[k], v[k], a[k], memory=memory[k])
-        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
-    return torque
-
-
 def predict_instants(
     model: RobotModel,
     pi: Array,
@@ -129,12 +96,43 @@ def predict_instants(
     direction = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
-    torque = np.empty(v.shape)
+    return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
+
+
+def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
+    """Return gravity, inertia and velocity torques of the bodies, each (N, n_rows) [N m, N].
+
+    They are g(q) = tau(q, 0, 0), M(q) a = tau(q, 0, a) - g(q) and C(q, v) v = tau(q, v, a) -
+    tau(q, 0, a), so that their sum is the torque of the bodies.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), possible ones or not; those of drives add nothing.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+
+    Raises:
+        DataError: If q does not fit the model.
+    """
+    bodies = np.where(np.arange(len(pi)) < model.layout.n_inertial, pi, 0.0)
+    rigid = _newton_euler if _has_centres(model, pi) else _rows_by_pi
+    still = np.zeros_like(v)
+    g, g_and_Ma, whole = (rigid(model, bodies, q, *x) for x in ((still, still), (still, a), (v, a)))
+    return [g, g_and_Ma - g, whole - g_and_Ma]
+
+
+def _rows_by_pi(
+    model: RobotModel, pi: Array, q: Array, v: Array, a: Array, direction: Array | None = None
+) -> Array:
+    """Return Y pi at instants that need not follow each other, shape (N, n_rows), by blocks."""
+    torque = np.empty_like(v)
     for start in range(0, len(v), BLOCK):
-        part = slice(start, start + BLOCK)
-        Y = joint_torque_regressor(model, q[part], v[part], a[part], direction[part])
-        torque[part] = (Y @ pi).reshape(-1, model.n_rows)
-    return torque.reshape(wanted)
+        k = slice(start, start + BLOCK)
+        signs = None if direction is None else direction[k]
+        Y = joint_torque_regressor(model, q[k], v[k], a[k], signs)
+        torque[k] = (Y @ pi).reshape(-1, model.n_rows)
+    return torque
 
 
 def _from_rows(source: TrajectoryRows, stacked: Array) -> list[Array]:

@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, MissingDependencyError
+from robotid.findings import listed
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import RowPlan, plan_rows, trajectory_values
 from robotid.regressor.compiled import (
@@ -163,8 +164,8 @@ def trajectory_rows(
     """
     if trajectory.joints != model.joints:
         raise DataError(
-            f"the trajectory has the joints {list(trajectory.joints)}, the model has "
-            f"{list(model.joints)}; read the log with joints=model.joints"
+            f"the trajectory has the joints {listed(trajectory.joints)}, the model has "
+            f"{listed(model.joints)}; read the log with joints=model.joints"
         )
     shape = (len(trajectory.t), model.n_rows)
     weights = np.broadcast_to(1.0, shape) if weight is None else weight

@@ -5,7 +5,7 @@ from html import escape
 
 from robotid.findings import Cause, grouped
 from robotid.identification.pipeline import Identification
-from robotid.pages.html import code, table, text
+from robotid.pages.html import Cell, code, table
 from robotid.report.summary_screen import joint_errors
 
 __all__ = ["findings_line", "findings_section"]
@@ -37,13 +37,13 @@ def findings_section(found: Identification) -> str:
     causes = grouped(found.findings, found.model.joints)
     if not causes:
         return "<p>None.</p>\n"
-    return "".join(_cause(cause) for cause in causes) + _by_joint(found, causes)
+    return _by_joint(found, causes) + "".join(_cause(cause) for cause in causes)
 
 
 def _cause(cause: Cause) -> str:
     """Return one cause: what was found, once, and each finding where there are several."""
     said = "".join(f"<p>{escape(message)}</p>\n" for message in cause.messages)
-    about = f" {escape(', '.join(cause.joints))}" if cause.joints else ""
+    about = f": {escape(', '.join(cause.joints))}" if cause.joints else ""
     each = ""
     if len(cause.findings) > len(cause.messages):
         items = "".join(f"<li>{escape(finding.message)}</li>" for finding in cause.findings)
@@ -61,9 +61,15 @@ def _by_joint(found: Identification, causes: Sequence[Cause]) -> str:
     for joint in joint_errors(found):
         mine = [cause for cause in causes if joint in cause.joints]
         if mine:
-            grave = ", ".join(cause.code for cause in mine if cause.severity != "note")
-            notes = ", ".join(cause.code for cause in mine if cause.severity == "note")
-            rows.append([code(joint), text(grave or "–"), text(notes or "–")])
+            grave, notes = (
+                ", ".join(
+                    f'<a href="#cause-{escape(cause.code)}">{escape(cause.code)}</a>'
+                    for cause in mine
+                    if (cause.severity == "note") == is_note
+                )
+                for is_note in (False, True)
+            )
+            rows.append([code(joint), Cell(grave or "–"), Cell(notes or "–")])
     if not rows:
         return ""
     return table("By joint, the worst first", ["joint", "errors and warnings", "notes"], rows)

@@ -1,21 +1,24 @@
-"""Several results side by side, from their result.json files only: compared, and shown."""
+"""Several results side by side, from their result.json files only."""
 
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from robotid._files import check_file, write_text
+from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
+from robotid.export.urdf import terms_from_facts
 from robotid.findings import listed
-from robotid.pages.html import Cell, code, number, page, percent, table, text
-from robotid.robot.drives import TERMS
+from robotid.report.comparison_page import comparison_page
+from robotid.robot.drives import TERMS, DriveMotion
 
 __all__ = ["compare_results", "write_comparison"]
 
-_FAR = 3.0  # combined standard errors beyond which a difference is shown as a fault
+_SPEEDS = 40  # of a friction curve, in each direction
 _FILES = ("urdf", "identification", "validation")  # settings that stand among the inputs
 
 
@@ -26,11 +29,12 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         paths: At least two result.json files.
 
     Returns:
-        Plain values: "results" (label, path, robot, estimator, verdict), "validation" and "fitted"
-        (errors by joint, one column per result), "fitted_alike" and "remarks" (what may
-        not be compared, and why), "base_parameters" (values, standard errors, and the difference to
-        the first result over the combined standard error), "settings", "inputs" and "versions"
-        that differ.
+        Plain values: "results" (label, name, path, robot, estimator, verdict; the name is the
+        part of the path that tells it from the others), "validation" and "fitted" (errors by joint,
+        one column per result), "fitted_alike" and "remarks" (what may not be compared, and why),
+        "friction" (curves by joint), "base_parameters" (values, standard errors, and the difference
+        to the first result over the combined standard error), "settings", "inputs" and "versions"
+        that differ. What differs most comes first.
 
     Raises:
         DataError: If there are fewer than two results, one cannot be read, or their base
@@ -41,11 +45,14 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
     results = [load_result(path).content for path in paths]
     for path, result in zip(paths[1:], results[1:], strict=True):
         _require_same_mapping(str(paths[0]), results[0], str(path), result)
-    common, remarks = _common_recordings(results)
+    logs = _told_apart([entry["log"] for result in results for entry in result["validation"]])
+    common, remarks = _common_recordings(results, logs)
+    names = _told_apart(paths)
     return {
         "results": [
             {
                 "label": _label(k),
+                "name": names[str(path)],
                 "path": str(path),
                 "robot": result["robot"],
                 "estimator": result["settings"].get("estimator", {}).get("name", ""),
@@ -56,6 +63,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "validation": [
             {
                 "log": result_log["log"],
+                "name": logs[result_log["log"]],
                 "start": key[1],
                 "end": key[2],
                 "per_joint": _errors([by_key[key] for by_key in map(_by_recording, results)]),
@@ -65,6 +73,7 @@ def compare_results(paths: Sequence[str | Path]) -> dict[str, Any]:
         "fitted": _errors([result["identification"] for result in results]),
         "fitted_alike": len({_recordings(result, "identification") for result in results}) == 1,
         "remarks": remarks,
+        "friction": _friction_curves(results),
         "base_parameters": _base_parameters(results),
         "settings": _differences([_flat(_chosen(result)) for result in results]),
         "inputs": _inputs(results),
@@ -85,13 +94,35 @@ def write_comparison(paths: Sequence[str | Path], target: str | Path) -> dict[st
     """
     check_file(Path(target))
     content = compare_results(paths)
-    write_text(_page(content), target)
+    write_text(comparison_page(content), target)
     return content
 
 
 def _label(k: int) -> str:
     """Return A to Z, then A2 and so on."""
     return chr(ord("A") + k % 26) + (str(k // 26 + 1) if k >= 26 else "")
+
+
+def _told_apart(paths: Sequence[str | Path]) -> dict[str, str]:
+    """Return of each path the fewest of its last parts that no other path ends with.
+
+    Parts that all of them end with are left out, as "result.json" of folders a and b.
+    """
+    parts = {str(path): Path(path).resolve().parts for path in paths}
+    every = set(parts.values())
+    common = 0
+    while len(every) > 1 and len({own[-common - 1 :][:1] for own in every}) == 1:
+        common += 1
+    cut = {own: own[: len(own) - common] for own in every}
+    return {path: _shortest(cut[own], set(cut.values())) for path, own in parts.items()}
+
+
+def _shortest(own: tuple[str, ...], every: set[tuple[str, ...]]) -> str:
+    """Return the shortest end of a path that only it has."""
+    for size in range(1, len(own)):
+        if sum(other[-size:] == own[-size:] for other in every) == 1:
+            return str(Path(*own[-size:]))
+    return str(Path(*own))
 
 
 def _require_same_mapping(
@@ -152,14 +183,14 @@ def _signals(result: Mapping[str, Any], key: tuple[Any, ...]) -> dict[str, Any]:
 
 
 def _common_recordings(
-    results: Sequence[Mapping[str, Any]],
+    results: Sequence[Mapping[str, Any]], names: Mapping[str, str]
 ) -> tuple[dict[tuple[Any, ...], dict[str, Any]], list[str]]:
     """Return the validation recordings that every result has, and what is not comparable."""
     each = [_by_recording(result) for result in results]
     common = {k: v for k, v in each[0].items() if all(k in other for other in each[1:])}
     remarks = []
     for k, by_recording in enumerate(each):
-        left = [Path(v["log"]).name for key, v in by_recording.items() if key not in common]
+        left = [names[v["log"]] for key, v in by_recording.items() if key not in common]
         if left:
             remarks.append(
                 f"{_label(k)} was validated on {', '.join(left)}, which not every result was: "
@@ -174,7 +205,7 @@ def _common_recordings(
         prepared = [_flat(_signals(result, key)) for result in results]
         if other := [f"{d['name']} {' | '.join(d['values'])}" for d in _differences(prepared)]:
             remarks.append(
-                f"{Path(entry['log']).name} was prepared in other ways ({'; '.join(other)}): a "
+                f"{names[entry['log']]} was prepared in other ways ({'; '.join(other)}): a "
                 "smoother torque, and fewer rows, are easier to predict"
             )
     return common, remarks
@@ -189,7 +220,65 @@ def _errors(metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         row = {key: [cell.get(key) for cell in cells] for key in ("relative_error_pct", "rmse")}
         unit = next(cell["unit"] for cell in cells if cell)
         rows.append({"joint": joint, "unit": unit, **row})
-    return rows
+    return sorted(rows, key=lambda row: -_spread(row["relative_error_pct"]))
+
+
+def _spread(values: Sequence[float | None]) -> float:
+    """Return how far values are apart; of fewer than two, -1."""
+    known = [value for value in values if value is not None]
+    return max(known) - min(known) if len(known) > 1 else -1.0
+
+
+def _friction_curves(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the friction of each joint's drive over its speed, of a gear without load at q = 0.
+
+    The speeds are those that the recordings of any result have; a joint of which none is stated,
+    or that has no friction, is left out. What grows with the load is said beside: "load" is
+    the torque lost per torque of load, None without such a term.
+    """
+    found = []
+    for joint in dict.fromkeys(joint for result in results for joint in result["joints"]):
+        stated = [result.get("friction", {}).get(joint, {}).get("seen", {}) for result in results]
+        fastest = max((seen["v"][1] for seen in stated if "v" in seen), default=0.0)
+        v = fastest * np.arange(-_SPEEDS, _SPEEDS + 1) / _SPEEDS
+        curves = [_friction_curve(result, joint, v) for result in results]
+        if not (fastest > 0 and any(torque is not None for torque, _ in curves)):
+            continue
+        known = np.array([torque for torque, _ in curves if torque is not None])
+        found.append(
+            {
+                "joint": joint,
+                "unit": _unit_of_force(results, joint),
+                "speeds": v.tolist(),
+                "torques": [None if x is None else x.tolist() for x, _ in curves],
+                "load": [load for _, load in curves],
+                "difference": float(np.max(np.ptp(known, axis=0)) / (np.abs(known).max() or 1.0)),
+            }
+        )
+    return sorted(found, key=lambda entry: -entry["difference"])
+
+
+def _friction_curve(
+    result: Mapping[str, Any], joint: str, v: Array
+) -> tuple[Array | None, float | None]:
+    """Return the friction of a joint's own drive at some speeds, and what it loses of its load."""
+    value = {entry["name"]: entry["value"] for entry in result["drive_parameters"]}
+    own = terms_from_facts(result.get("own_terms", {})).get(joint, ())
+    terms = (*TERMS.values(), *own)
+    none = np.zeros_like(v)
+    motion = DriveMotion(none, v, none, np.sign(v), none, none)
+    parts = [
+        value[name] * term.column(motion)
+        for term in terms
+        if term.part == "friction" and (name := f"{joint}.{term.name}") in value
+    ]
+    return (np.sum(parts, axis=0) if parts else None), value.get(f"{joint}.load")
+
+
+def _unit_of_force(results: Sequence[Mapping[str, Any]], joint: str) -> str:
+    """Return the unit of a joint's torque."""
+    stated = (result["identification"]["per_joint"].get(joint) for result in results)
+    return next((entry["unit"] for entry in stated if entry), "N m")
 
 
 def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -209,7 +298,11 @@ def _base_parameters(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
                 "differences": [_difference(own[0], entry) for entry in own[1:]],
             }
         )
-    return rows
+    return sorted(rows, key=lambda row: -_farthest(row["differences"]))
+
+
+def _farthest(differences: Sequence[float | None]) -> float:
+    return max((abs(d) for d in differences if d is not None), default=-1.0)
 
 
 def _difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float | None:
@@ -260,135 +353,3 @@ def _inputs(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             what = (row["role"], row["sha256"] or row["path"], row["start"], row["end"])
             found.setdefault(what, row)["in"][k] = True
     return sorted(found.values(), key=lambda row: all(row["in"]))
-
-
-# --- the page ---------------------------------------------------------------------------------
-
-
-def _page(content: Mapping[str, Any]) -> str:
-    sections = {
-        "errors": ("Prediction errors", _errors_section(content)),
-        "base": ("Base parameters", _base_section(content)),
-        "settings": ("Settings that differ", _differing(content, "settings", "setting")),
-        "inputs": ("Inputs", _inputs_section(content)),
-        "versions": ("Versions that differ", _differing(content, "versions", "what")),
-    }
-    robots = ", ".join(dict.fromkeys(result["robot"] for result in content["results"]))
-    title = f"{robots}: {len(content['results'])} results compared"
-    return page(title, f"<h1>{escape(title)}</h1>\n{_verdicts(content)}", sections)
-
-
-def _verdicts(content: Mapping[str, Any]) -> str:
-    return "".join(
-        f'<div class="verdict {escape(result["verdict"]["status"])}"><p>{result["label"]}: '
-        f"<strong>{escape(result['verdict']['status'])}</strong> "
-        f"({escape(result['estimator'])}) {code(result['path']).html}</p>"
-        f"<ul>{''.join(f'<li>{escape(r)}</li>' for r in result['verdict']['reasons'])}</ul></div>\n"
-        for result in content["results"]
-    )
-
-
-def _labels(content: Mapping[str, Any], unit: str = "") -> list[str]:
-    return [result["label"] + unit for result in content["results"]]
-
-
-def _errors_section(content: Mapping[str, Any]) -> str:
-    remarks = "".join(f"<li>{escape(remark)}</li>" for remark in content["remarks"])
-    parts = ["<p>error = 100 |τ − prediction| / |τ| over the rows used; the least in bold.</p>\n"]
-    if remarks:
-        parts.append(f"<ul>{remarks}</ul>\n")
-    parts += [
-        _error_table(
-            f"{Path(entry['log']).name} {entry['start']:.4g}-{entry['end']:.4g} s: not fitted",
-            content,
-            entry["per_joint"],
-            alike=True,
-        )
-        for entry in content["validation"]
-    ]
-    fitted, alike = content["fitted"], content["fitted_alike"]
-    if not alike:
-        parts.append("<p>The results were fitted to other recordings: of the errors below each is "
-                     "that of its own, and they are not comparable.</p>\n")  # fmt: skip
-    parts.append(_error_table("Fitted rows of each result", content, fitted, alike))
-    return "".join(parts)
-
-
-def _error_table(
-    caption: str, content: Mapping[str, Any], per_joint: Sequence[Mapping[str, Any]], alike: bool
-) -> str:
-    headers = ["joint", *_labels(content, " %"), *_labels(content, " RMSE"), "unit"]
-    rows = [
-        [
-            code(entry["joint"]),
-            *_percents(entry["relative_error_pct"], alike),
-            *[number(value, ".3g") for value in entry["rmse"]],
-            text(entry["unit"]),
-        ]
-        for entry in per_joint
-    ]
-    return table(caption, headers, rows)
-
-
-def _percents(errors: Sequence[float | None], alike: bool) -> list[Cell]:
-    """Return the errors, the least in bold where they are comparable; ties by what is shown."""
-    cells = [percent(error) for error in errors]
-    known = [(error, cell.html) for error, cell in zip(errors, cells, strict=True) if error]
-    least = min(known)[1] if known and alike else None
-    return [
-        Cell(f"<strong>{cell.html}</strong>", "number") if cell.html == least else cell
-        for cell in cells
-    ]
-
-
-def _base_section(content: Mapping[str, Any]) -> str:
-    labels = _labels(content)
-    headers = ["parameter", *labels, *[f"± {label}" for label in labels]]
-    headers += [f"({label} − A) / s" for label in labels[1:]] + ["unit", "remark"]
-    rows, apart = [], 0
-    for entry in content["base_parameters"]:
-        differences = entry["differences"]
-        far = any(d is not None and abs(d) > _FAR for d in differences)
-        apart += far
-        rows.append(
-            [
-                code(entry["name"]),
-                *[number(value) for value in entry["values"]],
-                *[number(error, ".2g") for error in entry["std_errors"]],
-                *[number(d, ".1f") for d in differences],
-                text(entry["unit"]),
-                text("apart" if far else "", flag=True),
-            ]
-        )
-    return (
-        f"<p>{apart} of {len(rows)} differ from A by more than {_FAR:g} combined standard errors "
-        "s = √(s² + s_A²). Results of the same recordings share their noise: there the figure only "
-        "sets a scale. Standard errors do not know of faults of the model.</p>\n"
-        + table("Base parameters with standard errors", headers, rows)
-    )
-
-
-def _differing(content: Mapping[str, Any], key: str, head: str) -> str:
-    rows = [
-        [code(row["name"]), *[text(value or "–") for value in row["values"]]]
-        for row in content[key]
-    ]
-    if not rows:
-        return "<p>None.</p>\n"
-    return table(f"{key.capitalize()} that differ", [head, *_labels(content)], rows)
-
-
-def _inputs_section(content: Mapping[str, Any]) -> str:
-    rows = [
-        [
-            text(row["role"]),
-            *[text("yes" if has else "no", flag=not has) for has in row["in"]],
-            code(row["path"]),
-            number(row["start"], ".6g"),
-            number(row["end"], ".6g"),
-            code(row["sha256"] or "not read from a file"),
-        ]
-        for row in content["inputs"]
-    ]
-    headers = ["role", *_labels(content), "file", "from s", "to s", "SHA-256"]
-    return table("Files read, those that differ first", headers, rows)

@@ -8,7 +8,6 @@ from pathlib import Path
 from robotid._files import write_text
 from robotid.findings import listed
 from robotid.identification.advice import Origin
-from robotid.identification.bands import TorqueBand
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.metrics import JointMetrics, Metrics
 from robotid.identification.pipeline import Identification
@@ -17,7 +16,6 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.html import (
     Section,
     code,
-    figure,
     folded,
     number,
     page,
@@ -32,18 +30,13 @@ from robotid.report.diagnosis import (
     information_section,
     residual_section,
 )
-from robotid.report.plots import plot_torque
 from robotid.report.summary_screen import summary_screen
-from robotid.report.svg import svg_element
 from robotid.report.tables import tables
+from robotid.report.torques import torques_section
 from robotid.report.why import why_section
 from robotid.versions import __version__
 
 __all__ = ["write_report"]
-
-_POINTS = 120_000  # points of all lines together: about 2 MB
-_LONGEST = 2000  # points of one line
-_MOST_PLOTS = 84  # twelve recordings of a 7-joint arm
 
 
 def write_report(
@@ -77,7 +70,7 @@ def write_report(
     sections = {
         "errors": Section("Errors", _errors(found), f"{joints} joints, by recording", False),
         "findings": Section("Findings", findings_section(found), findings_line(found), False),
-        "torques": Section("Torques", _torques(found)),
+        "torques": Section("Torques", torques_section(found)),
         "why": Section("Why each joint", why_section(found), "what its torque is made of", False),
         "parameters": Section(
             "Parameters",
@@ -211,63 +204,3 @@ def _remarks(measured: JointMetrics) -> list[str]:
     if error is not None and urdf is not None and error > urdf:
         remarks.append("worse than the URDF")
     return remarks
-
-
-def _torques(found: Identification) -> str:
-    """Return the torques of each joint, those that are not good open."""
-    model, evaluations = found.model, found.validation or found.fitted
-    shown = evaluations[: max(1, _MOST_PLOTS // model.n_rows)]
-    points = min(_LONGEST, max(200, _POINTS // (3 * model.n_rows * len(shown))))
-    parts = [
-        "<p>Measured and predicted torque; below, the residual (measured − predicted) with its "
-        "95 % band, from the uncertainty of the parameters and the noise of the fit. Shaded: "
-        "rows not used, because the joint stands still and the sign of its friction is unknown. "
-        f"Lines end at gaps of the recording. At most about {points} points per line, extremes "
-        "kept.</p>\n"
-    ]
-    if not found.validation:
-        parts.append("<p>No log was kept apart: these are the fitted logs.</p>\n")
-    for evaluation in shown:
-        if evaluation.recording.is_partial:
-            seen, whole = len(evaluation.recording.trajectory.t), evaluation.recording.extent.smooth
-            parts.append(
-                f"<p>Of {escape(evaluation.recording.name)}, a long log, {seen} of its {whole} "
-                "samples are drawn, from its beginning, middle and end; errors are of all.</p>\n"
-            )
-    if left := evaluations[len(shown) :]:
-        parts.append(f"<p>Not drawn, to keep the file small: {escape(_names(left))}.</p>\n")
-    bands = [found.band(evaluation) for evaluation in shown]
-    verdicts = found.verdict.joints
-    for row, (name, unit) in enumerate(zip(model.row_names, model.row_units, strict=True)):
-        figures = "".join(
-            _torque_figure(evaluation, band, row, name, unit, f"tau{k}-{row}", points)
-            for k, (evaluation, band) in enumerate(zip(shown, bands, strict=True))
-        )
-        said = verdict_cell(name, asdict(verdicts[name])) if name in verdicts else ""
-        is_bad = said.startswith(("poor", "usable"))
-        parts.append(
-            folded(
-                f"torque-{row}",
-                f"<strong>{code(name).html}</strong> {escape(said)}",
-                f'<div class="plots">\n{figures}</div>\n',
-                is_open=is_bad,
-            )
-        )
-    return "".join(parts)
-
-
-def _torque_figure(
-    e: Evaluation, band: TorqueBand, row: int, name: str, unit: str, key: str, points: int
-) -> str:
-    measured = e.metrics["estimate"].per_joint.get(name)
-    said = "no rows used"
-    if measured is not None:
-        error = percent(measured.relative_error_pct).html
-        recording = e.recording
-        held = band.held(recording.trajectory.tau, e.torques["estimate"], recording.mask)[row]
-        said = (
-            f"error {error} %, RMSE {measured.rmse:.3g} {unit}; 95 % band holds {100 * held:.0f} %"
-        )
-    title = f"Measured and predicted torque and residual of {name} over time; {said}"
-    svg = svg_element(plot_torque(e, row, band, unit=unit, points=points), title, key)
-    return figure(f"<strong>{escape(name)}</strong>: {said}", svg)

@@ -20,7 +20,7 @@ DETERMINED = {
     "bound": "at its bound",
 }
 _FIRST = 3  # reasons of the verdict that are seen at once
-_ROWS = 12  # joints whose errors are seen at once
+_ROWS = 10  # joints whose errors are seen at once
 _WIDEST = 150.0  # [%] at the end of the scale; what is beyond stands there
 _TICKS = (1.0, 5.0, GOOD, POOR, 100.0, _WIDEST)  # [%] of the scale
 #: Other predictions of the same torque, each with its mark: a path about (0, 9) and its style.
@@ -98,9 +98,9 @@ def _facts(found: Identification, files: Mapping[str, str]) -> str:
     )
     words = ", ".join(f"{count} {DETERMINED[kind]}" for kind, count in counts.items() if count)
     facts = {
-        "Total mass": f"<b>{before:.2f} → {after:.2f} kg</b>{change}",
+        "Total mass": f"<strong>{before:.2f} → {after:.2f} kg</strong>{change}",
         "Base parameters determined": (
-            f"<b>{found.determination.rank} of {len(found.base)}</b>, condition number "
+            f"<strong>{found.determination.rank} of {len(found.base)}</strong>, condition number "
             f"{found.wls.condition:.3g}"
         ),
         f"{total} parameters, determined by": f'<span class="shares">{shares}</span>{words}',
@@ -170,7 +170,7 @@ def _picture(row: int, joint: str, measured: JointMetrics, wls: float | None) ->
     title = f"{joint}: {error} % missed; by comparison {', '.join(figures)}"
     lines = "".join(f'<line x1="{_at(x)}" x2="{_at(x)}" y1="-2" y2="18"/>' for x in (GOOD, POOR))
     marks = "".join(
-        f'<svg x="{_at(value)}" overflow="visible">{_mark(key)}</svg>'
+        f'<svg x="{_at(value)}" overflow="visible" aria-hidden="true">{_mark(key)}</svg>'
         for key, value in shown.items()
         if value is not None
     )

@@ -93,7 +93,7 @@ def _change_section(found: Identification) -> str:
     kinds = {"-": "del", "+": "ins"}
     html = "".join(
         f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n" if line[0] in kinds
-        else f"<b>{escape(line)}</b>\n"
+        else f"<strong>{escape(line.rpartition('@@ ')[2])}</strong>\n"
         for line in lines[2:]
     )  # fmt: skip
     title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])

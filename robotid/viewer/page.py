@@ -12,6 +12,19 @@ from robotid.pages.html import asset, scaffold
 __all__ = ["page"]
 
 _ASSETS = Path(__file__).parent / "assets"
+_SCRIPTS = [
+    "data",
+    "scene",
+    "masses",
+    "arcs",
+    "plots",
+    "clock",
+    "strip",
+    "picking",
+    "controls",
+    "live",
+    "start",
+]
 
 
 def page(data: Mapping[str, Any]) -> str:
@@ -34,7 +47,7 @@ def page(data: Mapping[str, Any]) -> str:
         f"{_BODY}\n"
         f'<script type="application/json" id="data">{text}</script>\n'
         f"<script>{_viewer()}</script>\n<script>{asset('uPlot.iife.min.js')}</script>\n"
-        f"<script>{_asset('replay.js')}</script>\n",
+        f"<script>{_script()}</script>\n",
         policy=policy,
     )
 
@@ -42,6 +55,13 @@ def page(data: Mapping[str, Any]) -> str:
 @cache
 def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
+
+
+@cache
+def _script() -> str:
+    """Return the sections of the page's script as one, whose names are its own."""
+    sections = "".join(_asset(f"{name}.js") for name in _SCRIPTS)
+    return f'"use strict";\n(() => {{\n{sections}}})();\n'
 
 
 @cache
@@ -57,26 +77,36 @@ _OPTIONS = "".join(
     for s in (0.1, 0.25, 0.5, 1, 2, 5, 10)
 )
 _BODY = f"""\
+<footer aria-label="playback">
+<div id="strip" hidden>
+<div id="joints"></div>
+<div id="sheets"><canvas id="sheet" tabindex="0" role="img"
+ aria-label="residual of each joint over time; up and down pick a joint"></canvas></div>
+<p class="quiet">Residual, <span class="ramp"></span> from 0 to <span id="full"></span>;
+<span class="hatched"></span> at rest, not used, or no samples. <output id="told"></output></p>
+</div>
+<div id="bar" role="group" aria-label="playback">
+<div><button type="button" id="play">Pause</button>
+<button type="button" id="live" aria-pressed="false" hidden>Follow</button></div>
+<div id="track"><input type="range" id="time" step="any" aria-label="time"><div id="now"></div></div>
+<div id="pace"><output id="clock"></output>
+<select id="speed" aria-label="speed">{_OPTIONS}</select>
+<label><input type="checkbox" id="loop" checked> loop</label></div>
+</div>
+</footer>
 <main aria-label="3-D view">
 <div id="meshcat-pane" role="img" aria-label="the robot in motion"></div>
-<button type="button" id="view">Reset view</button>
+<div id="names" aria-hidden="true" hidden></div>
+<output id="picked" hidden></output>
+<div id="tools"><button type="button" id="view">Reset view</button>
+<button type="button" id="picture">Picture</button>
+<button type="button" id="film" aria-pressed="false">Film</button></div>
 </main>
 <aside id="side" aria-label="what is shown, and plots" hidden>
+<section id="events" hidden><h2>Events</h2><ul id="marks"></ul></section>
 <div id="switches"></div>
-<p id="residuals" class="quiet">Arcs: measured torque, 270° is a joint's largest; the inner one is
-predicted, unless the joint stands still. Colour: residual, <span class="ramp"></span> from 0 to
-half the torque's rms.</p>
+<p id="residuals" class="quiet">Arcs: measured torque from its tick at zero, 270° is a joint's
+largest; the inner one is predicted, unless the joint stands still. Colour: residual,
+<span class="ramp"></span> from 0 to <span id="most"></span>.</p>
 <div id="plots"></div>
-</aside>
-<footer>
-<div id="bar" role="group" aria-label="playback">
-<button type="button" id="play">Pause</button>
-<button type="button" id="live" aria-pressed="false" hidden>Follow</button>
-<div id="track"><input type="range" id="time" min="0" max="1" step="any" value="0"
- aria-label="time"></div>
-<output id="clock"></output>
-<label>speed <select id="speed">{_OPTIONS}</select></label>
-<label><input type="checkbox" id="loop" checked> loop</label>
-</div>
-<ul id="marks" aria-label="events" hidden></ul>
-</footer>"""
+</aside>"""

@@ -4,6 +4,7 @@ Meshcat's own export asks a server process for the page. Here its viewer is writ
 with what it shows, so that no process, no socket and no port is opened.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,11 +21,13 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
 from robotid.viewer.page import page
 from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
+from robotid.viewer.unexplained import residual_levels
 
 __all__ = ["Bands", "Mark", "Replay", "Torques", "live_page", "replay"]
 
 _KEYS = 500_000  # numbers of a motion: about 3 MB
 _POINTS = 1_000_000  # numbers of all plots: about 6 MB
+_BINS = 480  # columns of the heat strip
 _PLOT_RATE = 50.0  # [Hz] points of a plot per second
 _SEEN = 100  # poses that the camera is aimed by
 _CELLS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # [m] of the grid, 40 by 40
@@ -40,12 +43,15 @@ class Torques:
         t: Times on the clock of the motion, shape (N,) [s].
         measured: Measured torques, shape (N, n) [N m or N].
         predicted: Predicted ones by the name of who predicts, shape (N, n) each, NaN where there
-            is no prediction; arcs are coloured by the residual of the first.
+            is no prediction; arcs, links and the heat strip take the residual of the first.
+        noise: Root mean square of each joint's residual where the first was identified, shape
+            (n,): what a residual is compared to; the torque's own root mean square if None.
     """
 
     t: Array
     measured: Array
     predicted: Mapping[str, Array] = field(default_factory=dict)
+    noise: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +81,13 @@ class Mark:
         t: When, on the clock of the motion [s].
         label: What happened.
         kind: "payload", "contact", "gap" or "note".
+        joint: The joint that it shows at, if any.
     """
 
     t: float
     label: str
     kind: str = "note"
+    joint: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,22 +172,22 @@ def replay(
         second = _moved(model, ghost[1], ghost[2], rate)
     gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     start = float(t[0])
-    lead = [f"0 s is {start:.3f} s of the log."] if abs(start) > 1e-9 else []
     scene = robot_scene(model)
     data = _data(
         model,
         scene,
         [q] if ghost is None else [q, ghost[2]],
+        start=start,
         motion=_packed_motion(*moved),
         ghost=None if second is None else {"label": ghost[0], **_packed_motion(*second)},  # type: ignore[index]
         masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
-        torques=None if torques is None else _torque_data(model, torques, start),
+        torques=None if torques is None else _torque_data(model, torques, t),
         bands=None if bands is None else _band_data(bands, start),
         marks=[
-            {"t": mark.t - start, "label": mark.label, "kind": mark.kind}
+            {"t": mark.t, "label": mark.label, "kind": mark.kind, "joint": mark.joint}
             for mark in sorted((*marks, *gaps), key=lambda mark: mark.t)
         ],
-        notes=[*notes, *lead, *(f"{note}." for note in scene.notes)],
+        notes=[*notes, *_held(model), *(f"{note}." for note in scene.notes)],
     )
     return Replay(data)
 
@@ -198,7 +206,7 @@ def live_page(
 
     Returns:
         The HTML. An event is a JSON list of objects with ``t``, ``q`` as ``coordinates``
-        gives it, ``tau``, ``predicted``, ``theta``, ``std_error``, or with ``mark``.
+        gives it, ``at``, ``tau``, ``predicted`` (null at rest), ``theta``, ``std_error``, or with ``mark``.
     """
     empty = np.zeros((0, 0))
     return page(
@@ -206,6 +214,7 @@ def live_page(
             model,
             robot_scene(model),
             [q],
+            start=0.0,
             motion=_packed_motion(np.zeros(0), empty),
             ghost=None,
             masses=[mass_marks(model, masses, "URDF")],
@@ -279,27 +288,58 @@ def _packed_motion(t: Array, q: Array) -> dict[str, Any]:
     return {"t": packed(t), "q": packed(q)}
 
 
-def _torque_data(model: RobotModel, torques: Torques, start: float) -> dict[str, Any]:
+def _held(model: RobotModel) -> list[str]:
+    """Return what to say of a trunk with several limbs whose motion is not known."""
+    tree = model.pin_model
+    limbs = sum(int(parent) == 0 for parent in list(tree.parents)[1:])
+    is_held = limbs > 1 and not model.free_flyer
+    return ["The base is held fixed; the log does not say where it was."] if is_held else []
+
+
+def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any]:
     series = [torques.measured, *torques.predicted.values()]
-    labels, wanted = ["measured", *torques.predicted], (len(torques.t), model.n_rows)
+    labels, wanted = ["measured", *torques.predicted], (len(torques.t), len(model.joints))
     for label, values in zip(labels, series, strict=True):
         if values.shape != wanted:
             raise DataError(f"torques {label!r} have shape {values.shape}, wanted {wanted}")
-    t, values = _plotted(torques.t - start, np.hstack(series))
-    return {**_torque_rows(model, labels), "t": packed(t), "values": packed(values)}
+    rms = np.sqrt(np.nanmean(torques.measured**2, axis=0))
+    noise = rms if torques.noise is None else np.asarray(torques.noise, dtype=float)
+    if noise.shape != wanted[1:]:
+        raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
+    full, unit = (0.5, "the torque's rms") if torques.noise is None else (6.0, "the noise")
+    scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
+    strip = None
+    if len(series) > 1:
+        edges = np.linspace(t[0], t[-1], min(_BINS, max(len(torques.t) // 4, 1)) + 1)
+        levels = residual_levels(edges, torques.t, series[0] - series[1])
+        strip = packed(_coded(levels, np.array(scale["of"])), "<u2")
+    times, values = _plotted(torques.t - t[0], np.hstack(series))
+    return {
+        **_torque_rows(model, labels),
+        "scale": scale,
+        "strip": strip,
+        "t": packed(times),
+        "values": packed(values),
+    }
+
+
+def _coded(levels: Array, of: Array) -> Array:
+    """Return hundredths of what residuals are compared to; 65,534: not used, 65,535: a gap."""
+    hundredths = np.minimum(np.round(100 * levels / of), 60_000)
+    return np.where(np.isnan(levels), 65_535, np.where(levels < 0, 65_534, hundredths))
 
 
 def _torque_rows(model: RobotModel, labels: Sequence[str]) -> dict[str, Any]:
     """Return who is plotted, without times and values: joints, not the rows of a free base."""
-    if model.n_rows > len(model.joints):
-        raise DataError("the base floats; torques are shown of robots with a fixed base")
-    tree = model.pin_model
+    tree, units = model.pin_model, model.row_units[-len(model.joints) :]
     return {
         "joints": [
             {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
-            for name, unit in zip(model.joints, model.row_units, strict=True)
+            for name, unit in zip(model.joints, units, strict=True)
         ],
         "labels": labels,
+        "scale": None,
+        "strip": None,
         "t": None,
         "values": None,
     }
@@ -322,19 +362,24 @@ def _plotted(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _view(model: RobotModel, corners: Sequence[Array], motions: Sequence[Array]) -> dict[str, Any]:
-    """Return a camera that sees the whole motion, and a grid below it."""
+    """Return the outermost points of a motion, about the base if that floats, and a grid below."""
     data = model.pin_model.createData()
-    points = []
+    points, lowest, first = [], np.inf, int(model.free_flyer)  # without the world's own corner
     for q in motions:
         rows = np.unique(np.linspace(0, len(q) - 1, _SEEN).astype(int))
         for configuration in model.configurations(q[rows]):
             pin.forwardKinematics(model.pin_model, data, configuration)
-            for M, own in zip(list(data.oMi), corners, strict=True):
-                points.append(own @ M.rotation.T + M.translation)
+            base = configuration[:3] if model.free_flyer else np.zeros(3)
+            for M, own in zip(list(data.oMi)[first:], corners[first:], strict=True):
+                places = own @ M.rotation.T + M.translation
+                lowest = min(lowest, float(places[:, 2].min()))
+                points.append(places - base)
     places = np.vstack(points)
-    centre = (places.min(axis=0) + places.max(axis=0)) / 2
-    radius = float(np.linalg.norm(places - centre, axis=1).max())
+    towards = np.array([d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], dtype=float)
+    outermost = places[np.unique((places @ towards.T).argmax(axis=0))]
+    radius = float(np.linalg.norm(np.ptp(places, axis=0)) / 2) or 0.1
     # the camera stands 2.8 radii off; a grid that ends before it has no line behind it
     cell = max((c for c in _CELLS if 20 * c <= 2.5 * radius), default=_CELLS[0])
-    ground = np.r_[cell * np.round(centre[:2] / cell), 0.0]
-    return {"centre": centre.tolist(), "radius": radius, "grid": ground.tolist(), "cell": cell}
+    # the ground is at 0, or under a robot that reaches below it
+    ground = lowest if lowest < -0.1 * radius else 0.0
+    return {"points": outermost.tolist(), "radius": radius, "cell": cell, "ground": ground}

@@ -155,11 +155,11 @@ def ellipsoids(pi: Array) -> tuple[Ellipsoid, ...]:
 
 
 def packed(values: Array, kind: str = "<f4") -> dict[str, Any]:
-    """Return an array for the page: base64 of little-endian numbers, 32 bits each.
+    """Return an array for the page: base64 of little-endian numbers.
 
     Args:
         values: The array.
-        kind: "<f4" or "<u4".
+        kind: "<f4", "<u4" or "<u2".
 
     Returns:
         {"kind", "shape", "data"}.
@@ -191,23 +191,22 @@ class _Library:
         self.meshes: list[dict[str, Any]] = []
         self.parts: list[dict[str, Any]] = []
         self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
-        surfaces: list[Surface] = []
-        ranges: dict[tuple[str, tuple[float, ...]], range] = {}
+        solids: dict[tuple[str, tuple[float, ...]], list[Surface]] = {}  # by file and scale
         visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
         for visual in visuals:
             key = (visual.file, visual.size)
-            if visual.kind == "mesh" and key not in ranges:
-                new = self._read(model, visual)
-                ranges[key] = range(len(surfaces), len(surfaces) + len(new))
-                surfaces += new
-        for surface in thin(surfaces, _TRIANGLES):
-            mesh = {"vertices": packed(surface.vertices), "faces": packed(surface.faces, "<u4")}
-            self.meshes.append(mesh)
-            points = surface.vertices if len(surface.vertices) else np.zeros((1, 3))
-            self.boxes.append(np.array([points.min(axis=0), points.max(axis=0)]))
+            if visual.kind == "mesh" and key not in solids:
+                solids[key] = self._read(model, visual)
+        numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
+        for key, surfaces in zip(solids, thin([*solids.values()], _TRIANGLES), strict=True):
+            shown = [surface for surface in surfaces if len(surface.faces)]
+            numbers[key] = [*enumerate(shown, len(self.meshes))]
+            for surface in shown:
+                self.boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
+                self.meshes.append(_packed_mesh(surface, self.boxes[-1]))
         for visual in visuals:
-            which = ranges.get((visual.file, visual.size), range(0))
-            self.parts += _visual_parts(model, visual, which, surfaces)
+            which = numbers.get((visual.file, visual.size), [])
+            self.parts += _visual_parts(model, visual, which)
 
     def _read(self, model: RobotModel, visual: Shape) -> list[Surface]:
         path = find_mesh(visual.file, model.tree.path)
@@ -220,8 +219,21 @@ class _Library:
         return [replace(s, vertices=s.vertices * np.array(visual.size)) for s in found]
 
 
+def _packed_mesh(surface: Surface, box: Array) -> dict[str, Any]:
+    """Return triangles in half the bytes: corners in steps of a 65,535th of their box (2, 3)."""
+    low, step = box[0], np.maximum(np.ptp(box, axis=0), 1e-9) / 65_535
+    kind = "<u2" if len(surface.vertices) <= 2**16 else "<u4"
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "vertices": packed(np.round((surface.vertices - low) / step), "<u2"),
+        "faces": packed(surface.faces, kind),
+        "closed": surface.is_closed,
+    }
+
+
 def _visual_parts(
-    model: RobotModel, visual: Shape, which: range, surfaces: Sequence[Surface]
+    model: RobotModel, visual: Shape, which: Sequence[tuple[int, Surface]]
 ) -> Iterator[dict[str, Any]]:
     tree = model.pin_model
     frame = tree.frames[tree.getFrameId(visual.link, pin.FrameType.BODY)]
@@ -229,8 +241,8 @@ def _visual_parts(
     if visual.kind == "cylinder":  # of a URDF: along z
         M = M @ _from_y_axis(np.array([0.0, 0.0, 1.0]), np.zeros(3))
     if visual.kind == "mesh":
-        for k in which:
-            colour = _hex(surfaces[k].rgba or visual.rgba)
+        for k, surface in which:
+            colour = _hex(surface.rgba or visual.rgba)
             yield _part(frame.parentJoint, "mesh", [k], colour, M)
     else:
         yield _part(frame.parentJoint, visual.kind, visual.size, _hex(visual.rgba), M)

@@ -7,7 +7,7 @@ import numpy as np
 
 from robotid._typing import Array
 
-__all__ = ["Unexplained", "find_unexplained"]
+__all__ = ["Unexplained", "find_unexplained", "residual_levels"]
 
 _WINDOW = 0.2  # [s] over which a residual is averaged
 _TIMES = 6.0  # a mean residual so many times its median ...
@@ -72,6 +72,30 @@ def find_unexplained(
         k, j = divmod(int(np.argmax(np.where(is_large, share, 0.0)[part])), len(joints))
         found.append(Unexplained(start, end, joints[j], float(level[part[k], j])))
     return tuple(found)
+
+
+def residual_levels(edges: Array, t: Array, residual: Array) -> Array:
+    """Return the root mean square of each joint's residual within each stretch of time.
+
+    Args:
+        edges: Where the stretches begin, and the last one's end, shape (B + 1,) [s].
+        t: Times, shape (N,) [s].
+        residual: Measured less predicted torque, shape (N, n), NaN where none is predicted.
+
+    Returns:
+        Shape (B, n); -1 where there are samples but nothing is predicted, NaN where there is no
+        sample.
+    """
+    bins = len(edges) - 1
+    which = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, bins - 1)
+    samples = np.bincount(which, minlength=bins)
+    levels = np.full((bins, residual.shape[1]), np.nan)
+    for j, known in enumerate(np.isfinite(residual).T):
+        count = np.bincount(which[known], minlength=bins)
+        square = np.bincount(which[known], residual[known, j] ** 2, minlength=bins)
+        levels[:, j] = np.where(samples > 0, -1.0, np.nan)
+        levels[count > 0, j] = np.sqrt(square[count > 0] / count[count > 0])
+    return levels
 
 
 def _running_mean(values: Array, width: int) -> Array:

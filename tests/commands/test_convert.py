@@ -85,7 +85,7 @@ def test_columns_of_no_joint_are_left_out_and_named(tmp_path, log, capsys):
         ({"q_a": [0.0, 1.0]}, "has no column 'time'; columns found: q_a. Rename it"),
         (
             {"t": [0.0, 1.0], "q_a": [0.0, 1.0], "position_a": [0.0, 1.0]},
-            "has ['q_a', 'position_a'], several names of 'q_a'; remove all but one",
+            "has q_a, position_a, several names of 'q_a'; remove all but one",
         ),
     ],
 )

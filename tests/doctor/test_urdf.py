@@ -166,11 +166,12 @@ def test_a_rounded_angle_is_named_with_its_exact_value(tmp_path):
     assert f"write {-math.pi!r} for -3.1416; the identifiable" in finding["message"]
 
 
-def test_a_rounded_angle_that_tilts_an_axis_is_a_warning(tmp_path):
+def test_a_rounded_angle_that_robotid_can_leave_out_is_a_note(tmp_path):
     tilted = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.1416 0 0"/>')
     rounded = inspected(tmp_path, tilted)
     (finding,) = found(rounded, "rounded_rpy")
-    assert (finding["joint"], finding["severity"]) == ("elbow", "warning")
+    assert (finding["joint"], finding["severity"]) == ("elbow", "note")
+    assert found(rounded, "faint_parameters") == []  # they are the same parameters
     exact = inspected(tmp_path, (tilted[0], tilted[1].replace("3.1416", repr(math.pi))))
     assert found(exact, "rounded_rpy") == []
     assert rounded.structure.base == exact.structure.base
@@ -188,7 +189,17 @@ def test_a_rounded_angle_of_a_frame_is_a_note(tmp_path):
     tilted = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.1416 0 0"/>')
     inspection = inspected(tmp_path, ("</robot>", frame), tilted)
     severity = {f["joint"]: f["severity"] for f in found(inspection, "rounded_rpy")}
-    assert severity == {"hold": "note", "elbow": "warning"}
+    assert severity == {"hold": "note", "elbow": "note"}
+
+
+def test_rounded_angles_of_several_joints_are_one_note():
+    inspection = inspect_urdf(example_urdf("xarm7.urdf"))
+    (finding,) = found(inspection, "rounded_rpy")
+    assert finding["severity"] == "note"
+    joints = ", ".join(f"joint{k}" for k in range(2, 8))
+    assert f"the joints {joints} have rounded angles in rpy: write " in finding["message"]
+    quarter = math.pi / 2
+    assert f"write {-quarter!r} for -1.5708, {quarter!r} for 1.5708; the" in finding["message"]
 
 
 COARSE = ('<origin xyz="0.5 0 0"/>', '<origin xyz="0.5 0 0" rpy="3.14 0 0"/>')
@@ -199,6 +210,7 @@ def test_a_coarsely_rounded_angle_changes_the_base_and_snapping_mends_it(tmp_pat
     (finding,) = found(rounded, "rounded_rpy")
     exact = inspected(tmp_path, (COARSE[0], COARSE[1].replace("3.14", repr(math.pi))))
     more = rounded.structure.base, exact.structure.base
+    assert (finding["joint"], finding["severity"]) == ("elbow", "warning")
     assert more[0] > more[1]
     assert f"makes {more[0]} base parameters of {more[1]}, and only noise" in finding["message"]
     assert "snap_angles = true (--snap-angles) takes the exact angles" in finding["message"]
@@ -216,7 +228,8 @@ def test_the_doctor_names_rounded_angles_that_matter_once(tmp_path, rng):
         findings = [f for f in check_logs(model, [log]) if f.code == "rounded_rpy"]
         assert len(findings) == expected, angle
         if findings:
-            assert (findings[0].severity, findings[0].where) == ("warning", "two.urdf")
+            severity = {"3.14": "warning", "3.1416": "note"}[angle]
+            assert (findings[0].severity, findings[0].where) == (severity, "two.urdf")
             assert "rounds angles of the joints elbow: the file" in findings[0].message
         snapped = RobotModel.from_urdf(tmp_path / "two.urdf", snap_angles=True)
         assert not [f for f in check_logs(snapped, [log]) if f.code == "rounded_rpy"]

@@ -223,14 +223,16 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
 
 
 def test_noise_of_any_colour_follows_nothing():
-    rng, alarms, tried = np.random.default_rng(0), 0, 0
+    rng, alarms, tried, shares = np.random.default_rng(0), 0, 0, []
     for trial in range(60):
         v, q, load = motion(rng)
         noise = coloured(rng, (len(v),), (0, 5, 20)[trial % 3])
         found = torque(noise, v, q, load)
         alarms += sum(d.is_sure for d in found.follows)
         tried += len(found.follows)
+        shares.append([d.share for d in found.follows])
     assert alarms <= 1, f"{alarms} of {tried}"
+    assert (np.mean(shares, axis=0) < 0).all(), "what was fitted to noise predicts no other noise"
     assert "nothing explains it: 90 % of its square is as quick as noise" in found.sentence
 
 

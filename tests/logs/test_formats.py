@@ -291,9 +291,9 @@ def test_effort_is_a_current_if_stated(tmp_path):
     back = read_log(path, JOINTS, source=current, gains={"shoulder": 2.0, "elbow": 3.0})
     np.testing.assert_array_equal(back.tau, log.tau * [2.0, 3.0])
     with refused(
-        "run.mcap: joint 'shoulder' has the current 'effort_shoulder' but no gain; give it in "
-        "N m/A: gains={'shoulder': ...} (job file table [torque], key gains; CLI --gain "
-        "shoulder=...)"
+        "run.mcap: joints shoulder, elbow have currents but no gain; give it in N m/A: "
+        "gains={'shoulder': ..., ...} (job file table [torque], key gains; CLI --gain "
+        "shoulder=... --gain elbow=...)"
     ):
         read_log(path, JOINTS, source=current)
 

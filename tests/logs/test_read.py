@@ -270,6 +270,19 @@ def test_current_without_gain_is_refused(run):
         read_log(path, JOINTS)
 
 
+def test_joints_without_gain_and_those_without_torque_are_all_named_at_once(run):
+    one = np.arange(3.0)
+    names = ["q_a", "q_b", "q_finger", "i_a", "i_b", "q_c", "tau_c"]
+    path = run({"time": one, **dict.fromkeys(names, one)})
+    with refused(
+        f"{path.name}: joints a, b have currents but no gain; give it in N m/A: "
+        "gains={'a': ..., ...} (job file table [torque], key gains; CLI --gain a=... --gain "
+        "b=...). There is no torque of finger either; if they stood still, lock them where they "
+        "stood, as with --lock finger=0"
+    ):
+        read_log(path, ("a", "b", "c", "finger"))
+
+
 def test_gain_decides_between_current_and_torque(run):
     path = run(make_table(current_elbow=np.full(300, 2.0)))
     log = read_log(path, JOINTS, gains={"elbow": 10.0})

@@ -406,7 +406,7 @@ def test_wrong_shapes_are_named(message):
     ],
 )
 def test_unknown_form_is_named(call):
-    message = "form is 'right', wanted one of ['printed', 'corrected_five', 'corrected']"
+    message = "form is 'right', wanted one of printed, corrected_five, corrected"
     with pytest.raises(SettingsError, match=f"^{re.escape(message)}$"):
         call("right")
 

@@ -8,16 +8,20 @@ from html import unescape
 
 import numpy as np
 import pytest
-from helpers.pages import number, percent, tables
+from helpers.browsing import until, visit
+from helpers.pages import charts, number, percent, tables
 from helpers.paths import ROOT
 from helpers.synthetic import exact_log, truth
 
 from robotid._files import write_json
 from robotid.cli import main
 from robotid.exceptions import DataError
-from robotid.export.result import read_result
+from robotid.export.result import build_result, read_result
+from robotid.identification.torque_split import split_torque
 from robotid.logs.read import write_log
+from robotid.pages.html import code
 from robotid.report.comparison import compare_results, write_comparison
+from robotid.robot.drives import LoadFriction, Stribeck
 from robotid.robot.model import RobotModel
 
 
@@ -54,12 +58,14 @@ def test_differences_are_in_combined_standard_errors(folder):
     a, b = (read_result(folder / f"{name}.json") for name in "ab")
     found = compare_results([folder / "a.json", folder / "b.json"])
     assert len(found["base_parameters"]) == len(a["base_parameters"])
-    for one, other, entry in zip(
-        a["base_parameters"], b["base_parameters"], found["base_parameters"], strict=True
-    ):
+    shown = {entry["name"]: entry for entry in found["base_parameters"]}
+    for one, other in zip(a["base_parameters"], b["base_parameters"], strict=True):
+        entry = shown[one["name"]]
         s = math.sqrt(one["std_error"] ** 2 + other["std_error"] ** 2)
         assert entry["differences"] == [pytest.approx((other["value"] - one["value"]) / s)]
         assert entry["values"] == [one["value"], other["value"]]
+    sizes = [abs(entry["differences"][0]) for entry in found["base_parameters"]]
+    assert sizes == sorted(sizes, reverse=True)
 
 
 def test_errors_of_the_same_recording_stand_side_by_side(folder):
@@ -141,7 +147,7 @@ def test_the_command_prints_a_table_or_one_json_object_and_writes_the_page(
     assert "settings: estimator.name: consistent | wls" in printed
     html = page.read_text(encoding="utf-8")
     assert "2 results compared" in html
-    assert "://" not in html
+    assert not re.search(r'(src|href)="\w+:', html)
     assert [p.name for p in tmp_path.iterdir()] == ["compare.html"]
     assert main(["compare", *paths, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == compare_results(paths)
@@ -168,20 +174,30 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
             one, other = (part["per_joint"][row[0]] for part in parts)
             errors = [percent(x["relative_error_pct"]) for x in (one, other)]
             rmse = [number(x["rmse"], ".3g") for x in (one, other)]
-            assert row[1:] == [*errors, *rmse, one["unit"]]
-        assert shown[caption].headers == ["joint", "A %", "B %", "A RMSE", "B RMSE", "unit"]
+            assert row[2:] == [*errors, *rmse, one["unit"]]
+        heads = ["joint", "error", "A %", "B %", "A RMSE", "B RMSE", "unit"]
+        assert shown[caption].headers == heads
+        apart = [
+            abs(np.subtract(*(p["per_joint"][row[0]]["relative_error_pct"] for p in parts)))
+            for row in shown[caption].rows
+        ]
+        assert apart == sorted(apart, reverse=True)
     table = shown["Base parameters with standard errors"]
-    assert table.headers[1:6] == ["A", "B", "± A", "± B", "(B − A) / s"]
-    for row, one, other in zip(table.rows, a["base_parameters"], b["base_parameters"], strict=True):
+    assert table.headers == ["parameter", "(B − A) / s", "A", "± A", "B", "± B", "unit"]
+    ours, theirs = ({e["name"]: e for e in r["base_parameters"]} for r in (a, b))
+    assert table.rows[0][0] == last["name"]
+    assert {row[0] for row in table.rows} == set(ours)
+    for row in table.rows:
+        one, other = ours[row[0]], theirs[row[0]]
         difference = other["value"] - one["value"]
         apart = difference / math.hypot(one["std_error"], other["std_error"])
-        assert row == [
-            one["name"],
-            number(one["value"]), number(other["value"]),
-            number(one["std_error"], ".2g"), number(other["std_error"], ".2g"),
-            number(apart, ".1f"), one["unit"], "apart" if abs(apart) > 3 else "",
-        ]  # fmt: skip
-    assert table.rows[-1][-1] == "apart"
+        assert row[1] == number(apart, "z.1f")
+        assert row[6] == one["unit"]
+        for value, error, entry in ((row[2], row[3], one), (row[4], row[5], other)):
+            value, error = (float(x.replace("−", "-")) for x in (value, error))
+            assert error == pytest.approx(entry["std_error"], rel=0.051)
+            assert value == pytest.approx(entry["value"], abs=0.051 * entry["std_error"])
+    assert html.count(f"<strong>{table.rows[0][1]}</strong>") == 1
     settings = dict((row[0], row[1:]) for row in shown["Settings that differ"].rows)
     assert settings["estimator.name"] == ["consistent", "wls"]
     files = shown["Files read, those that differ first"]
@@ -190,7 +206,7 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
         window = [number(entry.get(end), ".6g") for end in ("start", "end")]
         assert row == [entry["role"], "yes", "yes", entry["path"], *window, entry["sha256"]]
     for label, result in (("A", a), ("B", b)):
-        box = html.split(f"<p>{label}: <strong>")[1].split("</div>")[0]
+        box = html.split(f"{label}: <strong>")[1].split("</div>")[0]
         assert box.startswith(f"{result['verdict']['status']}</strong>")
         assert f"({result['settings']['estimator']['name']})" in box
         reasons = [unescape(reason) for reason in re.findall(r"<li>(.*?)</li>", box)]
@@ -232,3 +248,127 @@ def test_names_of_files_cannot_inject_markup(folder, tmp_path):
     html = (tmp_path / "c.html").read_text(encoding="utf-8")
     assert "<b>" not in html
     assert "<i>" not in html
+
+
+def test_no_least_of_equals_is_bold(folder, tmp_path):
+    b = read_result(folder / "a.json")
+    write_json(b, tmp_path / "b.json")
+    write_comparison([folder / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    for caption, shown in tables((tmp_path / "c.html").read_text(encoding="utf-8")).items():
+        if "%" in " ".join(shown.headers):
+            assert all(row[2] == row[3] for row in shown.rows), caption
+    assert '<td class="number"><strong>' not in (tmp_path / "c.html").read_text(encoding="utf-8")
+
+
+def test_results_and_logs_of_one_name_are_told_apart_by_the_shortest_path(folder, tmp_path):
+    result = read_result(folder / "a.json")
+    places = [tmp_path / day / "out" / "result.json" for day in ("monday", "tuesday")]
+    places.append(tmp_path / "wls" / "result.json")
+    for k, place in enumerate(places):
+        place.parent.mkdir(parents=True)
+        own = copy.deepcopy(result)
+        own["validation"][0]["log"] = f"/data/{'ab'[k > 0]}/run.csv"
+        own["inputs"][-1] |= {"path": f"/data/{'ab'[k > 0]}/run.csv", "sha256": str(k > 0)}
+        write_json(own, place)
+    found = compare_results(places)
+    assert [x["name"] for x in found["results"]] == ["monday/out", "tuesday/out", "wls"]
+    assert "A was validated on a, which not every result was" in found["remarks"][0]
+    assert "B was validated on b, which" in found["remarks"][1]
+    write_comparison(places, tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    for label, name in zip("ABC", ("monday/out", "tuesday/out", "wls"), strict=True):
+        assert f"</svg> {label} {name}</span>" in html
+    assert [x["name"] for x in compare_results(places[:2])["results"]] == ["monday", "tuesday"]
+
+
+def test_friction_curves_are_those_of_the_identified_drives(identified, tmp_path):
+    """The curve from result.json alone is the library's own, terms with shapes included."""
+    term = Stribeck(seen=(0.05, 1.5), speed=0.2)
+    joint, other = "elbow_joint", "wrist_1_joint"
+    model = identified.model.with_terms({joint: (term, LoadFriction())})
+    pi, old = (
+        np.zeros(len(model.layout.names)),
+        dict(zip(identified.model.layout.names, identified.standard, strict=True)),
+    )
+    own = {f"{joint}.stribeck": 3.0, f"{joint}.load": 0.08}
+    pi[:] = [old.get(name, own.get(name, 0.0)) for name in model.layout.names]
+    result = build_result(identified, {"estimator": {"name": "consistent"}})
+    seen = {"q": [-1.0, 1.0], "v": [0.05, 1.5]}
+    result["friction"] = {name: {"seen": seen} for name in model.joints}
+    write_json(result, tmp_path / "a.json")
+    b = copy.deepcopy(result)
+    b["own_terms"] = model.options["own_terms"]
+    b["drive_parameters"] += [{"name": n, "value": v, "unit": "N m"} for n, v in own.items()]
+    write_json(b, tmp_path / "b.json")
+    found = compare_results([tmp_path / "a.json", tmp_path / "b.json"])["friction"]
+    first, curves = found[0], {entry["joint"]: entry for entry in found}
+    assert first["joint"] == joint, "what differs most comes first"
+    assert first["load"] == [None, 0.08]
+    v = np.array(first["speeds"])
+    assert (v.min(), v.max(), first["unit"]) == (-1.5, 1.5, "N m")
+    zero = np.zeros((len(v), 6))
+    speeds = zero.copy()
+    speeds[:, 2] = v
+    friction = split_torque(model, pi, zero, speeds, zero, memory=np.zeros((len(v), 1))).parts[
+        "friction"
+    ]
+    np.testing.assert_allclose(first["torques"][1], friction[:, 2], atol=1e-12)
+    plain = old[f"{joint}.viscous"] * v + old[f"{joint}.coulomb"] * np.sign(v)
+    np.testing.assert_allclose(first["torques"][0], plain, atol=1e-12)
+    assert curves[other]["torques"][0] == curves[other]["torques"][1]
+    write_comparison([tmp_path / "a.json", tmp_path / "b.json"], tmp_path / "c.html")
+    drawn = charts((tmp_path / "c.html").read_text(encoding="utf-8"))
+    chart = next(c for c in drawn if joint in c["title"])
+    assert [s["label"] for s in chart["series"]] == ["A", "B"]
+    moving = v != 0
+    np.testing.assert_allclose(
+        np.asarray(chart["series"][1]["y"])[moving], friction[moving, 2],
+        atol=np.ptp(friction[:, 2]) / 60_000,
+    )  # fmt: skip
+    assert np.isnan(np.asarray(chart["series"][1]["y"])[~moving]).all()
+
+
+def test_results_that_state_no_speeds_have_no_curves(folder, tmp_path):
+    for name in "ab":
+        write_json({**read_result(folder / f"{name}.json"), "friction": {}}, tmp_path / name)
+    content = write_comparison([tmp_path / "a", tmp_path / "b"], tmp_path / "c.html")
+    assert content["friction"] == []
+    assert "No result states friction and the speeds" in (tmp_path / "c.html").read_text()
+
+
+def test_bars_are_as_long_as_what_they_show(folder, tmp_path):
+    content = write_comparison([folder / "a.json", folder / "b.json"], tmp_path / "c.html")
+    html = (tmp_path / "c.html").read_text(encoding="utf-8")
+    (entry,) = content["validation"]
+    most = max(max(row["relative_error_pct"]) for row in entry["per_joint"])
+    for row in entry["per_joint"]:
+        cells = html.split(f"{code(row['joint']).html}</th>")[1].split("</td>")[0]
+        widths = [float(x) for x in re.findall(r"h([\d.]+)v", cells)]
+        np.testing.assert_allclose(
+            widths, [160 * x / most for x in row["relative_error_pct"]], atol=0.06
+        )
+    largest = content["base_parameters"][0]
+    cells = html.split(f"{code(largest['name']).html}</th>")[1].split("</td>")[0]
+    (reach,) = re.findall(r'd="M45 3h(-?[\d.]+)l', cells)
+    d = largest["differences"][0]
+    assert abs(d) < 6
+    assert float(reach) == pytest.approx(d * 45 / 6, abs=0.06)
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (360, 800)])
+def test_the_page_in_the_browser(folder, tmp_path, browser, size):
+    write_comparison([folder / "a.json", folder / "b.json"], tmp_path / "c.html")
+    with visit(browser, tmp_path / "c.html", size=size, color_scheme="dark") as seen:
+        seen.page.locator("#friction").scroll_into_view_if_needed()
+        until(seen, "charts.all.some((c) => c.plot)")
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        head = seen.page.get_by_role("button", name="(B − A) / s")
+        head.click()
+        head.click()
+        column = 'tr => parseFloat(tr.cells[1].textContent.replace("−", "-"))'
+        shown = seen.page.evaluate(
+            f'[...document.querySelectorAll("table.data tbody tr")].map({column})'
+        )
+        assert shown == sorted(shown, reverse=shown[0] > shown[-1])
+        assert not seen.errors
+        assert not seen.requests

@@ -13,7 +13,7 @@ from robotid.exceptions import DataError
 from robotid.export.result import read_result
 from robotid.logs.read import write_log
 from robotid.pages.html import page
-from robotid.report import comparison
+from robotid.report import comparison_page
 from robotid.robot.model import RobotModel
 
 MARKUP = "<script>alert(1)<!--'\""
@@ -62,5 +62,5 @@ def test_a_status_of_another_program_is_refused_and_escaped(folder, tmp_path):
     with pytest.raises(DataError, match=r"result.json.verdict.status is .*, wanted good, usable"):
         read_result(path)
     shown = [{"label": "A", "path": "", "estimator": "", "verdict": result["verdict"]}]
-    text = page("", comparison._verdicts({"results": shown}), {})
+    text = page("", comparison_page._verdicts({"results": shown}), {})
     assert "<script>alert" not in text

@@ -1,15 +1,18 @@
-"""The report's plots, read back in the units of their axes, against the series they claim."""
+"""The report's charts: the data in the page against the series they claim."""
 
+import pickle
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
 from helpers.figures import torques
-from helpers.pages import assert_drawn, plot
+from helpers.pages import chart
 
 from robotid.identification.information import information
-from robotid.report.residuals import autocorrelation, spectrum
+from robotid.identification.residuals import autocorrelation, spectrum
 from robotid.robot.parameters import INERTIAL_TERMS
 
 JOINTS = range(6)
@@ -25,151 +28,148 @@ def predicted(identified, kept):
     return torques(identified, kept.recording.trajectory)["estimate"]
 
 
-def stretches_of(used, segment):
-    """Return how many uninterrupted runs of rows there are."""
-    starts = used & ~np.r_[False, used[:-1] & (np.diff(segment) == 0)]
-    return int(starts.sum())
+def close(drawn, wanted):
+    """Assert that a series is the data, to what 16 bits tell apart."""
+    assert np.isnan(drawn).tolist() == np.isnan(wanted).tolist()
+    np.testing.assert_allclose(drawn, wanted, atol=2e-5 * (np.nanmax(wanted) - np.nanmin(wanted)))
 
 
 @pytest.mark.parametrize("j", JOINTS)
-def test_torque_is_drawn_as_measured_predicted_and_residual(report, kept, predicted, j):
-    trajectory, used = kept.recording.trajectory, kept.recording.mask[:, j].astype(bool)
-    t, tau, model = trajectory.t, trajectory.tau[:, j], predicted[:, j]
-    upper, lower = plot(report, f"tau0-{j}", 1, x_of=2), plot(report, f"tau0-{j}", 2)
-    runs = stretches_of(used, trajectory.segment)
-    assert_drawn(upper.line("currentColor", 0.6), t, tau, parts=2)
-    assert_drawn(upper.line("var(--predicted)"), t[used], model[used], parts=runs)
-    assert_drawn(lower.line("var(--residual)"), t[used], (tau - model)[used], parts=runs)
+def test_torque_is_drawn_as_measured_identified_urdf_and_residual(
+    report, identified, kept, predicted, j
+):
+    name, motion = identified.model.joints[j], kept.recording.trajectory
+    used, tau = kept.recording.mask[:, j].astype(bool), motion.tau[:, j]
+    upper = chart(report, f"Torque of {name} over time:")
+    lower = chart(report, f"Residual of {name} over time, m")
+    # the rows that the page has, between them one that breaks the line at the gap
+    t = np.insert(motion.t, np.flatnonzero(np.diff(motion.segment)) + 1, np.nan)
+    assert motion.t[0] == pytest.approx(upper["x"][0], abs=1e-6)  # the log's own time
+    np.testing.assert_allclose(upper["x"][np.isfinite(t)], motion.t, atol=1e-6)
+    blank = np.where(used, 0.0, np.nan)
+    urdf, measured, ours = (series["y"][np.isfinite(t)] for series in upper["series"])
+    close(measured, tau)
+    close(ours, predicted[:, j] + blank)
+    close(urdf, kept.torques["urdf"][:, j] + blank)
+    close(lower["series"][1]["y"][np.isfinite(t)], tau - predicted[:, j] + blank)
+    assert np.isnan(upper["series"][1]["y"]).sum() == np.isnan(t).sum() == 1
+    assert upper["link"] == lower["link"] != ""
 
 
 @pytest.mark.parametrize("j", JOINTS)
 def test_the_band_is_that_of_the_joint(report, identified, kept, j):
-    trajectory, band = kept.recording.trajectory, identified.band(kept)
-    drawn = np.vstack(plot(report, f"tau0-{j}", 2).patches("FillBetweenPolyCollection"))
-    half = 1.96 * band.total[:, j]
-    times = trajectory.t[band.samples]
-    wanted = np.interp(drawn[:, 0], times, half)
-    np.testing.assert_allclose(np.abs(drawn[:, 1]), wanted, atol=0.03 * half.max())
-    assert (drawn[:, 1] > 0).sum() == pytest.approx((drawn[:, 1] < 0).sum(), abs=4)
+    name, band = identified.model.joints[j], identified.band(kept)
+    t = kept.recording.trajectory.t
+    for title in ("Torque of {} over time:", "Residual of {} over time, m"):
+        what = chart(report, title.format(name))
+        (series,) = [series for series in what["series"] if series["half"] is not None]
+        known = np.isfinite(series["half"])
+        half = np.interp(what["x"][known], t[band.samples], 1.96 * band.total[:, j])
+        np.testing.assert_allclose(series["half"][known], half, rtol=0.02)
 
 
-def rows_of_friction(kept, j):
-    return np.flatnonzero(kept.recording.mask[:, j])
+@pytest.mark.parametrize("j", JOINTS)
+def test_the_ground_is_shaded_where_rows_are_not_used(report, identified, kept, j):
+    motion, used = kept.recording.trajectory, kept.recording.mask[:, j].astype(bool)
+    spans = chart(report, f"Torque of {identified.model.joints[j]} over time:")["spans"]
+    t = motion.t
+    assert all(any(a <= t[k] <= b for a, b in spans) for k in np.flatnonzero(~used))
+    assert not any(a < t[k] < b for a, b in spans for k in np.flatnonzero(used))
+    after = np.flatnonzero(np.diff(motion.segment))[0] + 1
+    assert any(a <= motion.t[after - 1] and motion.t[after] <= b for a, b in spans)  # the gap
 
 
 @pytest.mark.parametrize("j", JOINTS)
 def test_friction_is_drawn_against_speed(report, identified, kept, predicted, j):
-    trajectory, rows = kept.recording.trajectory, rows_of_friction(kept, j)
+    motion, rows = kept.recording.trajectory, np.flatnonzero(kept.recording.mask[:, j])
     value = dict(zip(identified.model.layout.names, identified.standard, strict=True))
-    joint, v = identified.model.joints[j], trajectory.v[rows, j]
-    sign = np.sign(v) if trajectory.direction is None else trajectory.direction[rows, j]
-    friction = value[f"{joint}.viscous"] * v + value[f"{joint}.coulomb"] * sign
-    friction += value[f"{joint}.offset"]
-    left = trajectory.tau[rows, j] - predicted[rows, j] + friction
-    axes = plot(report, f"friction{j}")
-    for colour, opacity, series in (
-        ("currentColor", 0.4, left),
-        ("var(--predicted)", 1.0, friction),
-    ):
-        dots = np.array([part[0] for part in axes.line(colour, opacity).parts])
-        assert len(dots) == len(rows)
-        np.testing.assert_allclose(dots[:, 0], v, atol=2e-3 * np.ptp(v))
-        np.testing.assert_allclose(dots[:, 1], series, atol=3e-3 * np.ptp(left))
+    joint, v = identified.model.joints[j], motion.v[rows, j]
+    sign = np.sign(v) if motion.direction is None else motion.direction[rows, j]
+    own = [value[f"{joint}.{term}"] for term in ("viscous", "coulomb", "offset")]
+    friction = own[0] * v + own[1] * sign + own[2]
+    left = motion.tau[rows, j] - predicted[rows, j] + friction
+    what = chart(report, f"Friction of {joint} against speed")
+    known = np.isfinite(what["series"][0]["y"])
+    order = np.argsort(v, kind="stable")
+    np.testing.assert_allclose(what["x"][known], v[order], atol=1e-6)
+    dots, ours, steady = (series["y"][known] for series in what["series"])
+    close(dots, left[order])
+    close(ours, friction[order])
+    close(steady, own[0] * v[order] + own[1] * np.sign(v[order]) + own[2])
+    assert known.sum() == len(known) - 1  # dry friction jumps: the line breaks where it turns
 
 
 @pytest.mark.parametrize("j", JOINTS)
-def test_the_spectrum_is_that_of_torque_and_residual(report, kept, predicted, j):
+def test_the_spectrum_is_that_of_torque_and_residual(report, identified, kept, predicted, j):
     recording = kept.recording
-    trajectory, used = recording.trajectory, recording.mask[:, j].astype(bool)
-    axes = plot(report, f"residual{j}", 1, log_y=True)
-    tau, residual = trajectory.tau[:, j], (trajectory.tau - predicted)[:, j]
-    for colour, opacity, x in (("currentColor", 0.6, tau), ("var(--residual)", 1.0, residual)):
-        f, density = spectrum(x, used, trajectory.segment, 0.02)
+    motion, used = recording.trajectory, recording.mask[:, j].astype(bool)
+    what = chart(report, f"Spectrum of torque and residual of {identified.model.joints[j]}")
+    residual = motion.tau - predicted
+    for series, x in zip(what["series"], (motion.tau[:, j], residual[:, j]), strict=True):
+        f, density = spectrum(x, used, motion.segment, 0.02)
         shown = (f > 0) & (f <= 24.0)  # twice the cut-off
-        decades = np.log10(np.sqrt(density[shown]))
-        points = np.vstack(axes.line(colour, opacity).parts)
-        wanted = np.interp(points[:, 0], f[shown], decades)
-        np.testing.assert_allclose(np.log10(points[:, 1]), wanted, atol=0.06)
-        assert points[-1, 0] == pytest.approx(f[shown][-1], abs=0.05)
+        np.testing.assert_allclose(what["x"], f[shown], atol=1e-6)
+        np.testing.assert_allclose(series["y"], np.sqrt(density[shown]), rtol=1e-3)
+    assert what["marks"] == [12.0]
+    assert what["logarithmic"] == "y"
 
 
 @pytest.mark.parametrize("j", JOINTS)
-def test_the_autocorrelation_is_that_of_the_residual(report, kept, predicted, j):
+def test_the_autocorrelation_is_that_of_the_residual(report, identified, kept, predicted, j):
     recording = kept.recording
-    trajectory, used = recording.trajectory, recording.mask[:, j].astype(bool)
-    residual = (trajectory.tau - predicted)[:, j]
-    r = autocorrelation(residual, used, trajectory.segment, 99)  # 2 s at 50 Hz
-    assert_drawn(plot(report, f"residual{j}", 2).line("var(--residual)"), 0.02 * np.arange(100), r)
-
-
-def bars(axes):
-    """Return the ends of the error bars, lowest row first."""
-    return np.array(sorted(axes.patches("LineCollection"), key=lambda ends: ends[0, 1]))
+    motion, used = recording.trajectory, recording.mask[:, j].astype(bool)
+    r = autocorrelation((motion.tau - predicted)[:, j], used, motion.segment, 99)  # 2 s at 50 Hz
+    what = chart(report, f"Autocorrelation of the residual of {identified.model.joints[j]}")
+    np.testing.assert_allclose(what["x"], 0.02 * np.arange(100), atol=1e-6)
+    close(what["series"][0]["y"], r)
 
 
 @pytest.mark.parametrize("term", ["armature", "viscous", "coulomb", "offset"])
-def test_drives_show_prior_spread_value_and_two_standard_errors(report, identified, term):
+def test_drives_show_their_values_with_two_standard_errors(report, identified, term):
     joints, names = identified.model.joints, list(identified.model.layout.names)
     part = [names.index(f"{joint}.{term}") for joint in joints]
-    axes = plot(report, f"{term}0")
-    assert list(axes.y.names) == list(joints)
-    heights = list(axes.y.names.values())
-    prior, value = (x[part] for x in (identified.prior, identified.standard))
-    error, spread = identified.standard_error[part], identified.prior_std[part]
+    what = chart(report, f"{term} of each drive")
+    assert what["x_names"] == list(joints)
+    (ours,) = what["series"]  # the URDF has no friction to stand beside it
+    error = identified.standard_error[part]
     assert np.isinf(error).tolist() == [j == "elbow_joint" and term == "viscous" for j in joints]
-    error = np.where(np.isinf(error), 0.0, error)  # at its bound: no bar
-    reach = np.ptp([*(value - 2 * error), *(value + 2 * error), *prior])
-    close = 5e-3 * reach
-    lines = [line for line in axes.lines() if len(line.marks) == len(part)]
-    before = lines[0]
-    after = [line for line in lines if line.colour == "var(--predicted)"][-1]  # above its caps
-    np.testing.assert_allclose(before.marks[:, 1], heights, atol=0.02)
-    np.testing.assert_allclose(before.marks[:, 0], prior, atol=close)
-    np.testing.assert_allclose(after.marks[:, 0], value, atol=close)
-    np.testing.assert_allclose(after.marks[:, 1], heights, atol=0.02)
-    drawn = bars(axes)
-    np.testing.assert_allclose(drawn[:, 0, 1], heights, atol=0.02)
-    np.testing.assert_allclose(drawn[:, 0, 0], value - 2 * error, atol=close)
-    np.testing.assert_allclose(drawn[:, 1, 0], value + 2 * error, atol=close)
-    widths = [np.ptp(corners[:, 0]) for corners in axes.patches() if len(corners) >= 4]
-    np.testing.assert_allclose(widths[: len(part)], 2 * spread, rtol=1e-2, atol=close)
+    close(ours["y"], identified.standard[part])
+    close(ours["half"], np.where(np.isinf(error), np.nan, 2 * error))  # at its bound: no bar
 
 
-@pytest.mark.parametrize("i", JOINTS)
-def test_bodies_show_the_urdf_beside_what_was_identified(report, identified, i):
-    part = slice(10 * i, 10 * i + 10)
-    prior, value, error, spread = (
-        x[part]
-        for x in (
-            identified.prior,
-            identified.standard,
-            identified.standard_error,
-            identified.prior_std,
-        )
-    )
-    axes = plot(report, f"body{i}")
-    assert list(axes.y.names) == list(INERTIAL_TERMS)
-    heights = np.array(list(axes.y.names.values()))
-    lines = [line for line in axes.lines() if len(line.marks) == 10]
-    urdf = next(line for line in lines if line.colour == "currentColor")
-    ours = [line for line in lines if line.colour == "var(--predicted)"][-1]  # above its caps
-    close = 6e-3 * np.ptp([*urdf.marks[:, 0], *bars(axes)[:, :, 0].ravel()])
-    np.testing.assert_allclose(urdf.marks[:, 0], prior / spread, atol=close)
-    np.testing.assert_allclose(ours.marks[:, 0], value / spread, atol=close)
-    assert (urdf.marks[:, 1] < heights).all()
-    assert (ours.marks[:, 1] > heights).all()
-    drawn = bars(axes)
-    np.testing.assert_allclose(drawn[:, 0, 0], (value - 2 * error) / spread, atol=close)
-    np.testing.assert_allclose(drawn[:, 1, 0], (value + 2 * error) / spread, atol=close)
+@pytest.mark.parametrize("k", range(10))
+def test_bodies_show_the_urdf_beside_what_was_identified(report, identified, k):
+    term, part = INERTIAL_TERMS[k], slice(k, 60, 10)
+    what = chart(report, f"{term} of each body")
+    assert what["x_names"] == list(identified.model.layout.bodies)
+    *before, ours = what["series"]
+    close(ours["y"], identified.standard[part])
+    close(ours["half"], 2 * identified.standard_error[part])
+    assert bool(before) == bool(identified.prior[part].any())
+    for series in before:
+        close(series["y"], identified.prior[part])
 
 
 def test_singular_values_are_those_of_the_regressor(report, identified):
-    axes = plot(report, "singular", log_y=True)
-    values, rank = information(identified).singular_values, identified.wls.rank
-    determined = next(line for line in axes.lines() if line.colour == "var(--predicted)")
-    np.testing.assert_allclose(determined.marks[:, 0], np.arange(1, rank + 1), atol=0.05)
-    drawn = np.log10(determined.marks[:, 1])
-    np.testing.assert_allclose(drawn, np.log10(values[:rank]), atol=0.02)
+    values = information(identified).singular_values
+    what = chart(report, "Singular values")
+    np.testing.assert_allclose(what["x"], np.arange(1, len(values) + 1), atol=1e-6)
+    np.testing.assert_allclose(what["series"][0]["y"], values, rtol=1e-3)
+    assert identified.wls.rank == len(values)
+
+
+def test_a_report_needs_no_matplotlib(identified, tmp_path):
+    (tmp_path / "found.pickle").write_bytes(pickle.dumps(identified))
+    code = (
+        "import pickle, sys\nfrom pathlib import Path\nsys.modules['matplotlib'] = None\n"
+        "from robotid.report.document import write_report\n"
+        "found = pickle.loads(Path('found.pickle').read_bytes())\n"
+        "write_report(found, 'report.html')"
+    )
+    words = [sys.executable, "-c", code]
+    run = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert '<figure class="chart"' in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_correlations_are_drawn_in_their_cell_with_their_sign_and_strength(report, identified):

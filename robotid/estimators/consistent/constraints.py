@@ -8,6 +8,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators.consistent.cones import Cone, svec
 from robotid.exceptions import SettingsError
+from robotid.findings import listed
 from robotid.robot.parameters import ParameterLayout, pseudo_inertia, pseudo_inertia_basis
 
 __all__ = ["SIGN_MARGIN", "Constraints", "slabs"]
@@ -67,7 +68,7 @@ class Constraints:
         if unknown:
             raise SettingsError(
                 f"constraints name {unknown}, which are no bodies of the model; links joined by "
-                f"fixed joints count to the one that a joint moves: {list(layout.bodies)}"
+                f"fixed joints count to the one that a joint moves: {listed(layout.bodies)}"
             )
         values = prior[: layout.n_inertial].reshape(-1, 10)
         parts = held.reshape(-1, 10)

@@ -22,6 +22,7 @@ from robotid.estimators.consistent.penalties import (
 from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.estimator import BatchEstimator, Estimate
 from robotid.exceptions import DataError, NotConvergedError
+from robotid.findings import listed
 from robotid.regressor.factors import Factors
 from robotid.robot.parameters import ParameterLayout
 
@@ -102,8 +103,8 @@ class Consistent(BatchEstimator):
             )
         if self.metric not in METRICS or self.solver not in SOLVERS:
             raise DataError(
-                f"metric is {self.metric!r}, wanted one of {list(METRICS)}; solver is "
-                f"{self.solver!r}, wanted one of {list(SOLVERS)}"
+                f"metric is {self.metric!r}, wanted one of {listed(METRICS)}; solver is "
+                f"{self.solver!r}, wanted one of {listed(SOLVERS)}"
             )
         self.constraints.check(self.layout, self.prior, self.known_share)
 

@@ -5,6 +5,7 @@ window.charts = (() => {
 const BAND = 0.2, AREA = 0.7, FAINT = 0.5, GROUND = 0.09; // opacities
 const CLOSER = 0.5; // what a key leaves of what is shown
 const HINT = "Arrow keys move the cursor, plus and minus zoom, Escape shows all, digits hide lines.";
+const STEPS = Array.from({ length: 24 }, (_, k) => [1, 2, 5].map((x) => x * 10 ** (k - 12))).flat();
 const all = [];
 
 function element(tag, attributes = {}, ...children) {
@@ -41,6 +42,17 @@ function powers(low, high) { // ticks of a logarithmic axis
   const every = Array.from({ length: last - first + 1 }, (_, k) => first + k);
   const ticks = every.flatMap((power) => steps.map((step) => step * 10 ** power));
   return ticks.filter((tick) => tick >= low && tick <= high);
+}
+
+function steady(x, span) { // a number of an axis, with the digits that its span needs
+  const digits = Math.min(Math.max(Math.ceil(4 - Math.log10(span || 1)), 0), 9);
+  return x.toFixed(digits).replaceAll("-", "−");
+}
+
+function tickWords(_, ticks) { // with as many digits as tell them apart
+  const step = ticks.length > 1 ? ticks[1] - ticks[0] : 1;
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  return ticks.map((tick) => (tick + 0).toFixed(digits).replaceAll("-", "−"));
 }
 
 function unpack({ data, low, high, log, bits }) { // numbers from steps between low and high
@@ -102,6 +114,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.what = what;
     this.link = link(what.link);
     this.hidden = new Set();
+    this.below = (what.x_label ? 56 : 36) + this.slant(); // [px] that the x axis takes
     this.plot = null;
     this.index = -1; // row under the cursor
     this.keys = element("div", { class: "keys" }, element("span", {}, what.y_label));
@@ -113,7 +126,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.whole.onclick = () => { this.link.zoom(null); this.place.focus(); };
     this.keys.append(this.whole);
     this.place = element("div", { class: "place", tabindex: 0, role: "slider",
-      "aria-label": what.title, "aria-description": HINT, style: `height: ${what.height + 52}px` });
+      "aria-label": what.title, "aria-description": HINT });
+    this.place.style.height = `${what.height + this.below}px`;
     this.place.onkeydown = (event) => this.press(event);
     this.live = element("div", { class: "explore" }, this.keys, this.place);
     parent.append(this.live);
@@ -124,6 +138,12 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.resized.observe(this.place);
   }
 
+  slant() { // room [px] that names at ticks need below because they are too long to be upright
+    const { x_names: names } = this.what;
+    const longest = Math.max(0, ...(names || []).map((name) => 6.2 * name.length));
+    return names && longest * names.length > 420 ? Math.round(longest / 2) : 0;
+  }
+
   key(series, i) { // the legend's button of a series; it hides and shows it
     const swatch = element("i", { style: `--key: var(--${series.tone})` });
     const value = element("b");
@@ -131,6 +151,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       { type: "button", tabindex: -1, "aria-pressed": true }, swatch, series.label, value);
     button.onclick = () => this.toggle(i);
     this.keys.append(button);
+    if (series.half) value.className = "wide";
     return value;
   }
 
@@ -248,23 +269,26 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     const { series, logarithmic, height, x_label: name, x_names: names } = this.what;
     const distribution = (axis) => (logarithmic.includes(axis) ? 3 : 1);
     const axis = (extra) => ({ stroke: () => tone("text"), font: "11px system-ui, sans-serif",
-      grid: { stroke: () => tone("line"), width: 1 }, ticks: { stroke: () => tone("line"), width: 1 },
-      values: (_, splits) => splits.map((v) => words(v, 6)), ...extra });
+      grid: { stroke: () => tone("line"), width: 1 }, values: tickWords, incrs: STEPS,
+      ticks: { stroke: () => tone("line"), width: 1, size: 6 }, ...extra });
     const decades = (is) => (logarithmic.includes(is) ? { filter: (_, splits) => splits,
-      splits: (u, i, low, high) => powers(low, high) } : {});
-    const named = names && names.length
-      ? { splits: () => names.map((_, k) => k), values: () => names } : {};
+      splits: (u, i, low, high) => powers(low, high),
+      values: (_, splits) => splits.map((v) => words(v)) } : {});
+    const slant = this.slant();
+    const named = names && names.length ? { splits: () => names.map((_, k) => k),
+      values: () => names, filter: (_, splits) => splits, grid: { show: false },
+      ...(slant ? { rotate: 30, size: 28 + slant } : {}) } : {};
     this.plot = new uPlot({
-      width: Math.max(this.place.clientWidth, 120), height: height + 52, padding: [8, 10, 0, 0],
+      width: Math.max(this.place.clientWidth, 120), height: height + this.below, padding: [8, 10, 0, 0],
       legend: { show: false },
       cursor: { x: false, y: false, points: { show: false },
         drag: { x: true, y: false, setScale: false, dist: 4 },
         bind: { dblclick: () => () => this.link.zoom(null) } },
       scales: { x: { time: false, distr: distribution("x"), range: () => this.window() },
         y: { distr: distribution("y"), range: () => this.extent() } },
-      axes: [axis({ size: 24, label: name, labelSize: 20, labelGap: 2, space: 60,
+      axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2, space: 70,
         labelFont: "11px system-ui, sans-serif", ...decades("x"), ...named }),
-      axis({ size: 54, space: 28, ...decades("y") })],
+      axis({ size: 54, space: 22, ...decades("y") })],
       series: [{}, ...series.map(({ tone: colour, kind, faint }) => ({
         stroke: () => tone(colour), width: 1.3, alpha: faint ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
@@ -378,9 +402,9 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   move() { // the cursor to where the link shows it
     const x = this.link.shown, shown = Number.isFinite(x) && this.x.length > 0;
     this.index = shown ? this.near(x) : -1;
-    this.at.textContent = shown ? `${words(this.x[this.index], 6)} ${this.unit}` : "";
+    this.at.textContent = shown ? this.where(this.x[this.index]) : "";
     this.values.forEach((value, i) => {
-      value.textContent = shown ? words(this.ys[i][this.index]) : "";
+      value.textContent = shown ? this.value(i) : "";
     });
     const said = this.what.series.map((s, i) => `${s.label} ${this.values[i].textContent}`);
     this.place.setAttribute("aria-valuenow", shown ? this.x[this.index] : 0);
@@ -392,6 +416,18 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     if (!this.cursor.hidden) {
       this.cursor.style.transform = `translateX(${this.plot.valToPos(x, "x")}px)`;
     }
+  }
+
+  value(i) { // of a series under the cursor, with half the width of its band
+    const y = this.ys[i][this.index], half = this.halves[i] && this.halves[i][this.index];
+    return `${words(y)}${Number.isFinite(y) && Number.isFinite(half) ? ` ± ${words(half, 2)}` : ""}`;
+  }
+
+  where(x) { // an x in words
+    const { x_names: names, logarithmic } = this.what;
+    if (names && names.length) return names[Math.round(x)];
+    const [from, to] = this.window();
+    return `${logarithmic.includes("x") ? words(x) : steady(x, to - from)} ${this.unit}`;
   }
 
   under(event) { // x of the row nearest to the pointer

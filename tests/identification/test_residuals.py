@@ -5,21 +5,22 @@ import pytest
 from helpers.synthetic import exact_log, truth
 
 from robotid.identification.evaluation import evaluate_logs
+from robotid.identification.residuals import autocorrelation, friction_split, spectrum
 from robotid.identification.survey import hold_log
 from robotid.logs.settings import SignalSettings
-from robotid.report.residuals import autocorrelation, friction_split, spectrum
 
 
 def brute_force(x, used, segment, lags):
-    means = []
+    found = []
     for k in range(lags + 1):
         pairs = [
-            x[i] * x[i + k]
+            (x[i], x[i + k])
             for i in range(len(x) - k)
             if used[i] and used[i + k] and segment[i] == segment[i + k]
         ]
-        means.append(np.mean(pairs) if pairs else np.nan)
-    return np.array(means) / means[0]
+        one, other = np.array(pairs).T if pairs else np.full((2, 1), np.nan)
+        found.append(one @ other / np.sqrt(one @ one * (other @ other)))
+    return np.array(found)
 
 
 def test_autocorrelation_is_the_mean_of_products_of_used_pairs(rng):
@@ -29,6 +30,14 @@ def test_autocorrelation_is_the_mean_of_products_of_used_pairs(rng):
     r = autocorrelation(x, used, segment, 60)
     np.testing.assert_allclose(r, brute_force(x, used, segment, 60), atol=1e-10)
     assert np.isnan(r[55:]).all()  # longer than every stretch
+
+
+def test_no_correlation_exceeds_1_where_few_pairs_are_far_apart():
+    # the largest values are one lag apart, and there is no other pair of that lag
+    x = np.r_[5.0, np.full(60, 0.1), 5.0, np.full(20, 0.1)]
+    r = autocorrelation(x, np.ones(82, dtype=bool), np.zeros(82), 81)
+    assert np.nanmax(np.abs(r)) <= 1.0
+    assert r[61] > 0.9
 
 
 def test_a_sine_correlates_as_a_cosine_across_rows_left_out(rng):

@@ -57,7 +57,8 @@ def spectrum(
 def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int) -> Array:
     """Return the autocorrelation of a signal that has gaps and rows left out.
 
-    r(k) is the mean of x(i) x(i + k) over the pairs of used rows in one stretch, over r(0).
+    r(k) = sum x(i) x(i + k) / sqrt(sum x(i)^2 sum x(i + k)^2), all over the pairs of used rows in
+    one stretch: by Cauchy and Schwarz it never exceeds 1, however few pairs are so far apart.
 
     Args:
         x: The signal, shape (N,); its mean is not taken out.
@@ -71,15 +72,19 @@ def autocorrelation(x: Array, used: NDArray[np.bool_], segment: Array, lags: int
     References:
         Parzen (1963), On spectral analysis with missing observations.
     """
-    products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
+    products, earlier, later, pairs = np.zeros((4, lags + 1))
     bounds = np.flatnonzero(np.r_[True, np.diff(segment) != 0, True])
     for start, end in itertools.pairwise(bounds):
         mask = used[start:end].astype(float)
-        products += _lagged(mask * x[start:end], lags)
-        pairs += _lagged(mask, lags)
-    pairs = np.round(pairs)
-    means = np.divide(products, pairs, out=np.full(lags + 1, np.nan), where=pairs > 0)
-    return means / means[0] if means[0] > 0 else np.full(lags + 1, np.nan)
+        seen = mask * x[start:end]
+        products += _lagged(seen, seen, lags)
+        earlier += _lagged(seen**2, mask, lags)
+        later += _lagged(mask, seen**2, lags)
+        pairs += _lagged(mask, mask, lags)
+    size = np.sqrt(np.maximum(earlier * later, 0.0))
+    known = (np.round(pairs) > 0) & (size > 1e-12 * size[0])  # the FFT rounds
+    r = np.divide(products, size, out=np.full(lags + 1, np.nan), where=known)
+    return np.asarray(np.clip(r, -1.0, 1.0))
 
 
 def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tuple[Array, Array]:
@@ -104,9 +109,9 @@ def friction_split(model: RobotModel, evaluation: Evaluation, pi: Array) -> tupl
     return trajectory.tau - moved, whole - moved
 
 
-def _lagged(x: Array, lags: int) -> Array:
-    """Return sum_i x(i) x(i + k) for k = 0 to lags, by FFT; zero beyond the signal's length."""
+def _lagged(x: Array, y: Array, lags: int) -> Array:
+    """Return sum_i x(i) y(i + k) for k = 0 to lags, by FFT; zero beyond the signals' length."""
     size = len(x) + lags
-    transformed = np.fft.rfft(x, n=size)
-    products: Array = np.fft.irfft(np.abs(transformed) ** 2, n=size)[: lags + 1]
+    transformed = np.fft.rfft(x, n=size).conj() * np.fft.rfft(y, n=size)
+    products: Array = np.fft.irfft(transformed, n=size)[: lags + 1]
     return products

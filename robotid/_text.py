@@ -1,0 +1,121 @@
+"""Text for people: lines that fit the terminal, columns in line, digits that mean something."""
+
+import math
+import os
+import re
+import shutil
+import textwrap
+from collections.abc import Sequence
+from typing import TextIO
+
+__all__ = ["columns", "in_digits_of", "terminal_width", "tinted", "wrapped"]
+
+_PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
+_PLAIN = (-3, 6)  # powers of ten that are written without an exponent
+_GAP = 2  # blanks between columns
+_NARROWEST = 40
+_TONES = {"good": 32, "usable": 33, "poor": 31, "error": 31, "warning": 33}  # of ANSI terminals
+
+
+def terminal_width() -> int:
+    """Return how many characters a line of the terminal has, 80 where that is not known."""
+    return max(shutil.get_terminal_size((80, 24)).columns, _NARROWEST)
+
+
+def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
+    """Return text with its first occurrence of a word in colour, if a stream is to show some.
+
+    It is if it is a terminal with colours and the environment variable NO_COLOR is not set.
+
+    Args:
+        text: The text.
+        word: The word.
+        tone: What it means: "good", "usable", "poor", "error" or "warning"; others have no colour.
+        stream: Where the text goes.
+    """
+    has_codes = "WT_SESSION" in os.environ if os.name == "nt" else os.getenv("TERM") != "dumb"
+    if tone not in _TONES or os.environ.get("NO_COLOR") or not (has_codes and stream.isatty()):
+        return text
+    return text.replace(word, f"\x1b[{_TONES[tone]}m{word}\x1b[0m", 1)
+
+
+def wrapped(text: str, width: int | None, hang: str = "") -> str:
+    """Return text in lines no longer than a width; neither words nor paths are broken.
+
+    Args:
+        text: The text; its own lines stay, with their indentation.
+        width: Characters of a line; None for as many as it has.
+        hang: What a line that goes on begins with, behind the indentation of its first.
+    """
+    if width is None:
+        return text
+    lines = []
+    for line in _PATH.sub(lambda found: found.group().replace(" ", "\0"), text).split("\n"):
+        indent = line[: len(line) - len(line.lstrip())] + hang
+        lines += textwrap.wrap(
+            line,
+            max(width, 2 * len(indent), 20),
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ) or [""]
+    return "\n".join(lines).replace("\0", " ")
+
+
+def columns(
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    width: int | None = None,
+    needed: int | None = None,
+    left: Sequence[int] = (0,),
+) -> list[str]:
+    """Return the lines of a table, indented by two.
+
+    Args:
+        heads: Heads of the columns, each of as many lines.
+        rows: Cells.
+        width: Characters of a line; None for as many as it takes.
+        needed: How many columns are shown in any case; all if None. A last line names those that
+            are left out since the lines would be longer than ``width``.
+        left: Which columns are aligned to the left.
+    """
+    table = [*zip(*(head.split("\n") for head in heads), strict=True), *rows]
+    sizes = [max(map(len, column)) for column in zip(*table, strict=True)]
+    count = len(heads)
+    while count > (len(heads) if needed is None else needed) and width is not None:
+        if sum(sizes[:count]) + _GAP * count <= width:
+            break
+        count -= 1
+    lines = []
+    for row in table:
+        cells = [
+            cell.ljust(size) if k in left else cell.rjust(size)
+            for k, (cell, size) in enumerate(zip(row[:count], sizes[:count], strict=True))
+        ]
+        lines.append((" " * _GAP + (" " * _GAP).join(cells)).rstrip())
+    if count < len(heads):
+        names = ", ".join(" ".join(head.split()) for head in heads[count:])
+        lines.append(f"  in wider terminals: {names}")
+    return lines
+
+
+def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
+    """Return a value to the second digit of its error, and the error.
+
+    Args:
+        value: The value.
+        error: Its standard error; the value has four digits where there is none.
+
+    Returns:
+        Both, with the same power of ten, as "8.562" and "0.023"; a dash for no error.
+    """
+    if error is None or not (math.isfinite(error) and error > 0):
+        return f"{value:.4g}", "-"
+    error = float(f"{error:.1e}")  # 0.0996 is 0.10, whose second digit is another
+    last = math.floor(math.log10(error)) - 1
+    value = round(value, -last) + 0.0  # no "-0.0"
+    top = max(math.floor(math.log10(abs(value))) if value else last, last + 1)
+    if _PLAIN[0] <= top < _PLAIN[1]:
+        return f"{value:.{max(-last, 0)}f}", f"{error:.{max(-last, 0)}f}"
+    return tuple(f"{x / 10**top:.{top - last}f}e{top:+03d}" for x in (value, error))  # type: ignore[return-value]

@@ -1,0 +1,391 @@
+"""What the commands found as text: lines that fit the terminal, columns, a little colour."""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from robotid._text import columns, in_digits_of, terminal_width, tinted, wrapped
+from robotid.findings import Finding, grouped, listed
+
+if TYPE_CHECKING:
+    from robotid.identification.advice import Step
+
+__all__ = ["print_content", "print_files", "print_steps", "say"]
+
+
+def say(text: str, hang: str = "", tone: str = "") -> None:
+    """Print text in lines that the terminal holds.
+
+    Args:
+        text: The text.
+        hang: What a line that goes on begins with.
+        tone: A word of it that is shown in its colour, as "error" is, on a terminal that has some;
+            the environment variable NO_COLOR ends it.
+    """
+    print(tinted(wrapped(text, terminal_width(), hang), tone, tone, sys.stdout))
+
+
+def print_content(
+    command: str, content: dict[str, Any], *, is_verbose: bool = False, with_base: bool = False
+) -> None:
+    """Print what a command found.
+
+    Args:
+        command: Its name.
+        content: What it prints with ``--json``.
+        is_verbose: Whether to print notes, too.
+        with_base: Whether "inspect" prints the base parameters.
+    """
+    prints: Mapping[str, Callable[[dict[str, Any]], None]] = {
+        "paper": _print_paper,
+        "inspect": partial(_print_inspection, is_verbose=is_verbose, with_base=with_base),
+        "identify": partial(_print_result, is_verbose=is_verbose),
+        "track": _print_track,
+        "doctor": partial(_print_examination, is_verbose=is_verbose),
+        "validate": _print_validation,
+        "payload": _print_payload,
+        "report": lambda done: print(f"written: {done['report']}"),
+        "compare": _print_comparison,
+        "export": _print_export,
+        "convert": _print_conversion,
+    }
+    prints[command](content)
+
+
+def print_files(folder: str, names: Sequence[str]) -> None:
+    """Print which files were written, each on a line of its own.
+
+    Args:
+        folder: Where.
+        names: Their names.
+    """
+    print("\nwritten:")
+    for name in names:
+        print(f"  {Path(folder) / name}")
+
+
+def print_steps(steps: "Sequence[Step]") -> None:
+    """Print what to do next, each step with what to type, on lines to copy.
+
+    Args:
+        steps: The steps.
+    """
+    print("\ndo next:")
+    for number, step in enumerate(steps, start=1):
+        say(f"  {number}. {step.words}", "   ")
+        for block in step.blocks:
+            print("\n".join(f"       {line}" for line in block.split("\n")))
+
+
+def _print_block(*lines: str) -> None:
+    print("\n" + "\n".join(lines))
+
+
+def _print_causes(
+    findings: Sequence[Mapping[str, Any]],
+    joints: Sequence[str],
+    *,
+    is_verbose: bool,
+    worst: str = "",
+    said: Sequence[str] = (),
+) -> None:
+    """Print findings by their cause, then how many there are; notes only where they are wanted.
+
+    Args:
+        findings: As a command has them, with code, severity, message and where.
+        joints: Names, of joints or links, that findings may be about.
+        is_verbose: Whether notes are printed.
+        worst: What is worst off.
+        said: Messages that are printed elsewhere.
+    """
+    shown = [f for f in findings if is_verbose or f["severity"] != "note"]
+    causes = grouped([Finding(**_finding(f)) for f in shown], joints)
+    for cause in causes:
+        for message in cause.messages:
+            if message not in said:
+                say(f"{cause.severity}: {cause.code}: {message}", "  ", cause.severity)
+    hidden = len(findings) - len(shown)
+    notes = f"{_some(hidden, 'note')} hidden (--verbose)" if hidden else ""
+    if shown:
+        count = f"{_some(len(shown), 'finding')}, {_some(len(causes), 'cause')}"
+        notes = count + (f"; worst: {worst}" if worst else "") + (f"; {notes}" if notes else "")
+    say(notes or "nothing was found")
+
+
+def _finding(found: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: found[key] for key in ("code", "severity", "where", "message")}
+
+
+def _some(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
+    from robotid.identification.summary import error_lines, friction_lines
+
+    structure, wls, width = result["structure"], result["wls"], terminal_width()
+    before, after, _ = result["witness"]["masses"]
+    say(
+        f"\n{result['robot']}: {len(result['joints'])} joints, {structure['base']} base parameters "
+        f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
+        f"total mass {before:.2f} -> {after:.2f} kg"
+    )
+    fitted = [_recording(entry) for entry in result["inputs"] if entry["role"] == "identification"]
+    say(f"\nfitted: {', '.join(fitted)}", "  ")
+    print("\n".join(error_lines(result["identification"], wls["identification"], width)))
+    kept = [_recording(entry) for entry in result["inputs"] if entry["role"] == "validation"]
+    for name, ours, theirs in zip(kept, result["validation"], wls["validation"], strict=True):
+        say(f"\nnot fitted: {name}", "  ")
+        print("\n".join(error_lines(ours, theirs, width)))
+    if lines := friction_lines(result["friction"]):
+        _print_block(*(wrapped(line, width, "  ") for line in lines))
+    print()
+    verdict = result["verdict"]
+    _print_causes(
+        result["warnings"],
+        result["joints"],
+        is_verbose=is_verbose,
+        worst="" if verdict["status"] == "good" else _worst(result),
+        said=verdict["reasons"],
+    )
+    _print_verdict(verdict)
+
+
+def _recording(entry: Mapping[str, Any]) -> str:
+    """Return the name of a recording's file and the stretch of it."""
+    return f"{Path(entry['path']).name or 'log'} {entry['start']:.4g}-{entry['end']:.4g} s"
+
+
+def _worst(result: Mapping[str, Any]) -> str:
+    """Return the joint whose torque is explained least, and how much of it is missed."""
+    errors = [
+        (m["relative_error_pct"], joint)
+        for metrics in result["validation"] or [result["identification"]]
+        for joint, m in metrics["per_joint"].items()
+        if m["relative_error_pct"] is not None
+    ]
+    return "{1}, {0:.1f} % of its torque is missed".format(*max(errors)) if errors else ""
+
+
+def _print_verdict(verdict: Mapping[str, Any]) -> None:
+    from robotid.identification.summary import verdict_lines
+
+    first, *others = verdict_lines(verdict)
+    say(f"\n{first}", tone=verdict["status"])
+    for line in others:
+        status = line.partition(": ")[2].partition(":")[0]
+        say(line, "  ", "" if line.startswith("  - ") else status)
+
+
+def _print_validation(found: dict[str, Any]) -> None:
+    from robotid.identification.summary import error_lines
+
+    say(f"predicted with {found['predicted_with']}")
+    for recording in found["validation"]:
+        say(f"\n{recording['name']}", "  ")
+        print("\n".join(error_lines(recording, width=terminal_width())))
+    _print_verdict(found["verdict"])
+
+
+def _print_inspection(content: dict[str, Any], *, is_verbose: bool, with_base: bool) -> None:
+    structure, joints = content["structure"], content["joints"]
+    findings = [
+        {**finding, "where": finding.get("link") or finding.get("joint") or ""}
+        for finding in content["findings"]
+    ]
+    if content["robot"]:
+        say(f"{content['robot']}: {len(joints)} joints: {listed(joints)}", "  ")
+    if structure:
+        say(
+            f"{structure['standard']} standard inertial parameters, {structure['base_inertial']} "
+            f"base; with drives {structure['base']}"
+        )
+    names = list(dict.fromkeys([*joints, *(finding["where"] for finding in findings)]))
+    _print_causes(findings, [name for name in names if name], is_verbose=is_verbose)
+    if with_base:
+        print("\nbase parameters, inertial")
+        for group in content["base_groups"]:
+            say(f"  {group}", "    ")
+    elif structure:
+        say("the base parameters: --base")
+
+
+def _print_examination(content: dict[str, Any], *, is_verbose: bool) -> None:
+    findings, joints = content["findings"], content["joints"]
+    _print_causes(findings, joints, is_verbose=is_verbose, worst=_worst_of(findings, joints))
+
+
+def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> str:
+    """Return the joint that most errors are about, then warnings, then the gravest by figure."""
+    ranks = dict.fromkeys(joints, (0, 0, 0.0))
+    for finding in findings:
+        (cause,) = grouped([Finding(**_finding(finding))], joints)
+        for joint in cause.joints:
+            errors, warnings, share = ranks[joint]
+            ranks[joint] = (
+                errors + (cause.severity == "error"),
+                warnings + (cause.severity == "warning"),
+                max(share, finding["evidence"].get("share", 0.0)),
+            )
+    worst = max(ranks, key=lambda joint: ranks[joint], default="")
+    return worst if any(ranks.get(worst, ())[:2]) else ""
+
+
+def _print_comparison(content: dict[str, Any]) -> None:
+    from robotid.identification.summary import cell
+
+    results = content["results"]
+    labels = [result["label"] for result in results]
+    for result in results:
+        verdict = result["verdict"]["status"]
+        said = f"{result['label']}  {verdict:7} {result['estimator']:10} "
+        print(tinted(f"{said}{result['path']}", verdict, verdict, sys.stdout))
+    for remark in content["remarks"]:
+        say(f"- {remark}", "  ")
+    alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
+    tables = {f"not fitted: {_recording(e | {'path': e['log']})}, error %": e["per_joint"]
+              for e in content["validation"]}  # fmt: skip
+    for title, per_joint in (
+        *tables.items(),
+        (f"fitted recordings of each, error %{alike}", content["fitted"]),
+    ):
+        rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
+        say(f"\n{title}", "  ")
+        print("\n".join(columns(["joint", *labels], rows)))
+    _print_base_parameters(content, labels)
+    for key in ("settings", "versions"):
+        for row in content[key]:
+            say(f"{key}: {row['name']}: {' | '.join(v or '-' for v in row['values'])}", "  ")
+    for row in content["inputs"]:
+        if not all(row["in"]):
+            read = listed(label for label, has in zip(labels, row["in"], strict=True) if has)
+            window = f" {row['start']:.4g}-{row['end']:.4g} s" if row["start"] is not None else ""
+            say(f"only {read} read '{row['path']}'{window} ({row['role']})", "  ")
+
+
+def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
+    say(
+        "\nbase parameters to the second digit of their standard errors; last columns: difference "
+        f"to {labels[0]} over the combined standard error"
+    )
+    rows = []
+    for entry in content["base_parameters"]:
+        pairs = zip(entry["values"], entry["std_errors"], strict=True)
+        values = ["-" if x is None else in_digits_of(x, error)[0] for x, error in pairs]
+        differences = [
+            "-" if x is None else f"{round(x, 1) + 0.0:.1f}" for x in entry["differences"]
+        ]
+        rows.append([entry["name"], *values, entry["unit"], *differences])
+    heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
+    print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))
+
+
+def _print_track(found: dict[str, Any]) -> None:
+    converged = found["converged_at"]
+    when = "not converged" if converged is None else f"converged at {converged:.2f} s"
+    say(
+        f"{found['robot']}: {found['samples']} samples, estimate {1e3 * found['delay']:.0f} ms "
+        f"behind, {when}, excitation {found['excitation']:.2f}"
+    )
+    for change in found["changes"]:
+        load = change["payload"]
+        mass, error = in_digits_of(load["mass"], load["std_error"])
+        say(
+            f"step change at {change['onset']:.2f} s, flagged at {change['flagged']:.2f} s; as a "
+            f"load on {load['body']}: {mass} +- {error} kg",
+            "  ",
+        )
+    rows = []
+    for entry in found["base_parameters"]:
+        value, error = in_digits_of(entry["value"], entry["std_error"])
+        rows.append([entry["name"], value, f"+- {error}", entry["unit"]])
+    print("\n".join(columns(["", "", "", ""], rows, left=(0, 2, 3))[1:]))
+
+
+def _print_payload(content: dict[str, Any]) -> None:
+    from robotid.identification.summary import cell
+
+    for found in content["payloads"]:
+        _print_one_payload(found)
+    errors = [f"{joint} {cell(x)} %" for joint, x in content["relative_error_pct"].items()]
+    say(f"torque left unexplained: {listed(errors)}", "  ")
+    if "gains" in content:
+        print("\n[torque.gains]")
+        for joint, gain in content["gains"].items():
+            low, high = gain["interval"]
+            value, _ = in_digits_of(gain["gain"], gain["std_error"])
+            print(f"{joint} = {value}  # 95 % interval {low:.4g} to {high:.4g}")
+
+
+def _print_one_payload(found: Mapping[str, Any]) -> None:
+    link, (low, high) = found["link"], found["mass_interval"]
+    mass, error = in_digits_of(found["mass"], found["mass_std_error"])
+    print(f"payload on {link}")
+    if error == "-":
+        print(f"  mass {found['mass']:g} kg, stated")
+    else:
+        low, high = (in_digits_of(end, found["mass_std_error"])[0] for end in (low, high))
+        print(f"  mass {mass} kg (95 % interval {low} to {high})")
+    if found["com"] is not None:
+        print(f"  centre of mass in the frame of {link} [m]")
+        rows = [
+            [axis, *_with_error(x, error)]
+            for axis, x, error in zip("xyz", found["com"], found["com_std_error"], strict=True)
+        ]
+        _print_values(rows)
+    if found["inertia"] is not None:
+        for where, key in (
+            ("its centre of mass", "inertia"),
+            (f"the origin of {link}", "inertia_at_link"),
+        ):
+            say(f"  inertia about {where}, axes of {link} [kg m^2]", "  ")
+            errors = found["inertia_std_error"] if key == "inertia" else None
+            rows = [
+                [f"I{'xyz'[i]}{'xyz'[j]}", *_with_error(found[key][i][j], errors and errors[i][j])]
+                for i in range(3)
+                for j in range(i, 3)
+            ]
+            _print_values(rows)
+    for name, reason in found["reasons"].items():
+        what = "centre of mass" if name == "com" else name
+        say(f"  {what}: not determined; {reason}", "  ")
+
+
+def _with_error(value: float, error: float | None) -> list[str]:
+    """Return a value in the digits of its error, and that error, as cells."""
+    shown, half = in_digits_of(value, error)
+    return [shown, "" if half == "-" else f"+- {half}"]
+
+
+def _print_values(rows: Sequence[Sequence[str]]) -> None:
+    for line in columns([""] * len(rows[0]), rows, left=(0, 2))[1:]:
+        print(f"  {line}")
+
+
+def _print_export(done: dict[str, Any]) -> None:
+    print(f"written: {', '.join(done['files'])}")
+    for note in done["not_stated"]:
+        say(f"  {note}", "  ")
+
+
+def _print_conversion(done: dict[str, Any]) -> None:
+    print(f"{done['path']}: {done['samples']} samples of {len(done['joints'])} joints")
+    say(f"  columns {', '.join(done['columns'])}", "  ")
+    if done["ignored"]:
+        say(f"  not of a joint, left out: {', '.join(done['ignored'])}", "  ")
+
+
+def _print_paper(result: dict[str, Any]) -> None:
+    cases = {"disturbed": "disturbed", "noisy": "noisy", "on_program": "on program"}
+    print("relative error of the parameters; the last three cases at the end")
+    print("  model       start   after 1   at end   " + "  ".join(cases.values()) + "   NA")
+    for name, model in result["models"].items():
+        errors = model["relative_error"]
+        ends = [result[case][name]["relative_error"][-1] for case in cases]
+        cells = [errors[0], errors[1], errors[-1], *ends]
+        print(f"  {name:10}" + "".join(f"{cell:9.2g}" for cell in cells) + f"   {model['NA']}")
+    print("\nrandom motions that converged to 1e-3")
+    for name, found in result["trajectories"].items():
+        print(f"  {name:10} {found['converged']} of {found['runs']}")

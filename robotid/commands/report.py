@@ -1,0 +1,129 @@
+"""The report of a written result, made anew from its inputs; nothing else is written."""
+
+from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from robotid._files import check_file, file_sha256
+from robotid._typing import ProgressCallback, report_stage
+from robotid.commands.identify import identify_job
+from robotid.commands.job import Job, job_from_settings
+from robotid.exceptions import DataError, SettingsError
+from robotid.export.result import load_result
+from robotid.findings import listed
+from robotid.identification.advice import Origin
+from robotid.identification.pipeline import Identification
+from robotid.report.document import write_report
+from robotid.versions import versions
+from robotid.workers.plan import WorkPlan
+
+__all__ = ["rewrite_report"]
+
+_SHARE = 1e-6  # of a base parameter ...
+_PART = 0.01  # ... or of its standard error, which is rounding: solvers stop somewhere
+
+
+def rewrite_report(
+    path: str | Path, target: str | Path | None = None, *, progress: ProgressCallback | None = None
+) -> dict[str, Any]:
+    """Write the report of a result again, as this version of robotid shows it.
+
+    The fit is made again, from the inputs and with the settings that the result names.
+
+    Args:
+        path: A result.json, or its folder.
+        target: The page to write; report.html beside the result if None. A page that is there is
+            replaced, another file is not.
+        progress: Called as each stage begins, as of ``identify``.
+
+    Returns:
+        {"result", "report"}: the files that were read and written.
+
+    Raises:
+        DataError: If the result or an input cannot be used, an input is missing or was changed
+            since, or the fit gives other base parameters than the result has.
+        SettingsError: If the settings cannot be used, or the target is another kind of file.
+    """
+    loaded = load_result(path)
+    content, folder = loaded.content, loaded.path.parent
+    goal = folder / "report.html" if target is None else Path(target)
+    _check_target(goal)
+    report_stage(progress, "reading logs")
+    settings = {key: value for key, value in content["settings"].items() if value != {}}
+    job = job_from_settings(settings, loaded.path.name, Path())
+    _check_inputs(job, content, loaded.path.name)
+    found, _ = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
+    _require_same(found, content, loaded.path.name)
+    report_stage(progress, "writing")
+    beside = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}
+    files = {
+        what: name
+        for what, name in beside.items()
+        if what != "report" and goal.resolve().with_name(name) == (folder / name).resolve()
+        if (folder / name).is_file()
+    }
+    write_report(found, goal, files=files, origin=Origin((), str(folder)))
+    return {"result": str(loaded.path), "report": str(goal)}
+
+
+def _check_target(goal: Path) -> None:
+    """Refuse to write where something else than a page is."""
+    check_file(goal)
+    if goal.exists() and not goal.read_bytes()[:15].lower().startswith(b"<!doctype html"):
+        raise SettingsError(
+            f"{str(goal)!r} is there and is no page; it would be lost: name another --out"
+        )
+
+
+def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
+    """Refuse to go on without the very files that were read."""
+    inputs = {
+        role: [entry for entry in content["inputs"] if entry["role"] == role]
+        for role in ("urdf", "identification", "validation")
+    }
+    if not all(entry["path"] for entries in inputs.values() for entry in entries):
+        raise DataError(
+            f"{name} was made from a log in memory, which is gone; write its report in Python, "
+            "robotid.write_report(found, ...)"
+        )
+    logs = [entry.path for entry in (*job.identification, *job.validation)]
+    for path, entry in zip([job.urdf, *logs], chain(*inputs.values()), strict=True):
+        what, wanted = "URDF" if entry["role"] == "urdf" else "log", entry["sha256"]
+        if not path.exists():
+            raise DataError(
+                f"the {what} {str(path)!r}, which {name} was made from, is not there; put it back, "
+                "or identify again"
+            )
+        if (found := file_sha256(path)) != wanted:
+            raise DataError(
+                f"the {what} {str(path)!r} was changed since {name} was made from it: its SHA-256 "
+                f"begins with {found[:12]}, wanted {wanted[:12]}; put the old file back, or "
+                "identify again"
+            )
+
+
+def _require_same(found: Identification, content: Mapping[str, Any], name: str) -> None:
+    """Refuse a fit that is not the one that the result states."""
+    stated = {entry["name"]: entry for entry in content["base_parameters"]}
+    fitted = dict(zip(found.mapping.base_names, found.base.tolist(), strict=True))
+    if lacking := sorted(stated.keys() ^ fitted.keys()):
+        said = f"the parameters {listed(lacking, 5)} are in one of them only"
+    else:
+        pairs = [(stated[key], value) for key, value in fitted.items()]
+        other = [
+            f"{entry['name']} is {value:.6g}, {entry['value']:.6g} before"
+            for entry, value in pairs
+            if abs(value - entry["value"])
+            > max(_SHARE * abs(entry["value"]), _PART * (entry["std_error"] or 0.0))
+        ]
+        if not other:
+            return
+        said = f"{len(other)} of {len(pairs)} base parameters differ: {listed(other, 3)}"
+    now = {"robotid": content["robotid"], **content.get("versions", {})}
+    changed = [f"{k} {now[k]} -> {v}" for k, v in versions().items() if now.get(k, v) != v]
+    why = f"; versions since: {listed(changed)}" if changed else ""
+    raise DataError(
+        f"the fit made again is not that of {name}: {said}{why}. No report was written; identify "
+        "again to have result and report of one fit"
+    )

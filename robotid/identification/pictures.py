@@ -1,0 +1,275 @@
+"""Charts of an identification: torques, residuals, friction, parameters, excitation."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotid._typing import Array
+from robotid.identification.bands import REACH, TorqueBand, friction_curve
+from robotid.identification.evaluation import Evaluation
+from robotid.identification.residuals import autocorrelation, friction_split, spectrum
+from robotid.pages.charts import Chart, Series, broken
+from robotid.regressor.memory import drive_motion_along
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = [
+    "friction_chart",
+    "parameter_charts",
+    "residual_charts",
+    "shown_evaluation",
+    "singular_chart",
+    "torque_charts",
+    "unused_spans",
+]
+
+_DOTS = 1200  # of one friction chart
+_LAGS = 400  # points of one autocorrelation
+_LONGEST_LAG = 2.0  # [s]
+_PIXELS = 500  # spans closer than one of so many are one
+
+
+def shown_evaluation(found: "Identification") -> Evaluation:
+    """Return the recording that is looked into: the first one that was not fitted.
+
+    Args:
+        found: The identification.
+    """
+    return (found.validation or found.fitted)[0]
+
+
+def torque_charts(
+    found: "Identification",
+    evaluation: Evaluation,
+    row: int,
+    *,
+    band: TorqueBand | None = None,
+    link: str = "time",
+) -> tuple[Chart, Chart]:
+    """Return measured and predicted torque over the log's own time, and the residual.
+
+    Where rows were not used, the ground is shaded and only the measured torque is drawn: the sign
+    of friction is not known there. No line is drawn across a gap of the recording.
+
+    Args:
+        found: The identification.
+        evaluation: One of its recordings.
+        row: Number of the torque row.
+        band: How far the predictions can be trusted; computed if None.
+        link: The charts' link.
+    """
+    motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
+    name, unit = found.model.row_names[row], found.model.row_units[row]
+    band = found.band(evaluation) if band is None else band
+    half = REACH * np.interp(np.arange(len(motion.t)), band.samples, band.total[:, row])
+    model, urdf = (
+        np.where(used, evaluation.torques[key][:, row], np.nan) for key in ("estimate", "urdf")
+    )
+    t, tau, model, urdf, half = broken(
+        motion.segment, motion.t, motion.tau[:, row], model, urdf, half
+    )
+    spans = unused_spans(t, np.isfinite(model))
+    kind = "force" if unit == "N" else "torque"
+    torque = Chart(
+        f"{kind.capitalize()} of {name} over time: measured, identified, the URDF's",
+        t,
+        (
+            Series("URDF", urdf, "urdf", is_faint=True),
+            Series("measured", tau, "text", is_faint=True),
+            Series("identified, 95 % band", model, "predicted", half=half),
+        ),
+        "time [s]",
+        f"{kind} [{unit}]",
+        link,
+        spans,
+    )
+    zero = np.where(np.isfinite(model), 0.0, np.nan)
+    residual = Chart(
+        f"Residual of {name} over time, measured less identified",
+        t,
+        (
+            Series("95 % band", zero, "residual", half=half, is_faint=True),
+            Series("residual", tau - model, "residual"),
+        ),
+        "time [s]",
+        f"residual [{unit}]",
+        link,
+        spans,
+        height=90,
+    )
+    return torque, residual
+
+
+def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """Return the stretches of time that lie between used rows; those closer than a pixel as one.
+
+    Args:
+        t: Times, shape (N,) [s].
+        used: Rows used, shape (N,), bool.
+    """
+    edges = np.flatnonzero(np.diff(np.r_[True, used, True].astype(int))).reshape(-1, 2)
+    pixel = float(t[-1] - t[0]) / _PIXELS if len(t) else 0.0
+    spans: list[tuple[float, float]] = []
+    for first, after in edges.tolist():
+        start, end = float(t[max(first - 1, 0)]), float(t[min(after, len(t) - 1)])
+        if spans and start - spans[-1][1] < pixel:
+            spans[-1] = (spans[-1][0], end)
+        else:
+            spans.append((start, end))
+    return tuple(spans)
+
+
+def residual_charts(
+    found: "Identification", evaluation: Evaluation, row: int
+) -> tuple[Chart, Chart] | None:
+    """Return spectrum and autocorrelation of a joint's residual; None if no row was used.
+
+    Args:
+        found: The identification.
+        evaluation: One of its recordings.
+        row: Number of the torque row.
+    """
+    motion, used = evaluation.recording.trajectory, evaluation.recording.mask[:, row].astype(bool)
+    name, unit = found.model.row_names[row], found.model.row_units[row]
+    residual = motion.tau[:, row] - evaluation.torques["estimate"][:, row]
+    dt = float(np.median(np.diff(motion.t)[np.diff(motion.segment) == 0]))
+    f, density = spectrum(residual, used, motion.segment, dt)
+    if not len(f):
+        return None
+    torque = spectrum(motion.tau[:, row], used, motion.segment, dt)[1]
+    cutoff = evaluation.recording.signals.cutoff
+    shown = (f > 0) & (f <= (np.inf if cutoff is None else 2.0 * cutoff))
+    lags = max(1, min(int(_LONGEST_LAG / dt), len(residual) // 2))
+    step = max(1, lags // _LAGS)
+    r = autocorrelation(residual, used, motion.segment, lags)[::step]
+    return (
+        Chart(
+            f"Spectrum of torque and residual of {name}",
+            f[shown],
+            (
+                Series("torque", np.sqrt(torque[shown]), "text", is_faint=True),
+                Series("residual", np.sqrt(density[shown]), "residual"),
+            ),
+            "frequency [Hz]",
+            f"density [{unit}/√Hz]",
+            marks=() if cutoff is None else (cutoff,),
+            logarithmic="y",
+        ),
+        Chart(
+            f"Autocorrelation of the residual of {name}",
+            step * dt * np.arange(len(r)),
+            (Series("residual", r, "residual"),),
+            "lag [s]",
+            "autocorrelation [-]",
+            marks=() if cutoff is None else (1.0 / (2.0 * cutoff),),
+        ),
+    )
+
+
+def friction_chart(
+    found: "Identification", joint: str, *, split: tuple[Array, Array] | None = None
+) -> Chart | None:
+    """Return friction against speed: measured, identified, and that of steady motion.
+
+    Args:
+        found: The identification.
+        joint: The joint.
+        split: Torque left and friction identified, as ``friction_split`` returns them for
+            ``shown_evaluation``; computed if None.
+
+    Returns:
+        The chart; None if no row of the joint was used.
+    """
+    evaluation, model = shown_evaluation(found), found.model
+    motion, row = evaluation.recording.trajectory, model.row_names.index(joint)
+    left, friction = split or friction_split(model, evaluation, found.standard)
+    rows = np.flatnonzero(evaluation.recording.mask[:, row])
+    rows = rows[:: max(1, -(-len(rows) // _DOTS))]
+    if not len(rows):
+        return None
+    rows = rows[np.argsort(motion.v[rows, row], kind="stable")]
+    load = 0.0
+    if any(x.name == "load" for x in model.layout.own.get(joint, ())):
+        loads = drive_motion_along(model, motion).load
+        load = float(np.sqrt(np.mean(loads[row, rows] ** 2)))
+    v, unit = motion.v[rows, row], model.row_units[row]
+    curve = friction_curve(found, joint, v, q=float(np.median(motion.q[rows, row])), load=load)
+    # dry friction jumps where the motion turns: no line leads across
+    v, left, friction, steady, std = broken(
+        np.sign(v), v, left[rows, row], friction[rows, row], curve.torque, curve.std
+    )
+    under = f" at {load:.3g} {unit} of load" if load else ""
+    return Chart(
+        f"Friction of {joint} against speed, measured and identified",
+        v,
+        (
+            Series("measured", left, "text", "dots", is_faint=True),
+            Series("identified", friction, "predicted", "dots"),
+            Series(f"steady{under}, 95 % band", steady, "residual", half=REACH * std),
+        ),
+        "speed [m/s]" if unit == "N" else "speed [rad/s]",
+        f"friction [{unit}]",
+    )
+
+
+def parameter_charts(found: "Identification", terms: Sequence[str]) -> tuple[Chart, ...]:
+    """Return each term of all bodies or drives beside the value before the fit.
+
+    Args:
+        found: The identification.
+        terms: Terms, as "m" or "viscous"; parameters of another unit have a chart of their own.
+    """
+    layout = found.model.layout
+    owners, ends = zip(*(name.rsplit(".", 1) for name in layout.names), strict=True)
+    error = np.where(np.isfinite(found.standard_error), 2 * found.standard_error, np.nan)
+    charts = []
+    for term in terms:
+        chosen = [i for i, end in enumerate(ends) if end == term]
+        for unit in dict.fromkeys(layout.units[i] for i in chosen):
+            part = np.array([i for i in chosen if layout.units[i] == unit])
+            before = "URDF" if part[0] < layout.n_inertial else "before the fit"
+            series = [
+                Series(
+                    "identified ± 2 s.e.", found.standard[part], "predicted", "bars", error[part]
+                )
+            ]
+            if found.prior[part].any():
+                series.insert(0, Series(before, found.prior[part], "urdf", "bars", is_faint=True))
+            charts.append(
+                Chart(
+                    f"{term} of each {'body' if before == 'URDF' else 'drive'}, {before} and "
+                    "identified with two standard errors",
+                    np.arange(len(part), dtype=float),
+                    tuple(series),
+                    "",
+                    f"{term} [{unit}]",
+                    height=140,
+                    x_names=tuple(owners[i] for i in part),
+                )
+            )
+    return tuple(charts)
+
+
+def singular_chart(values: Array, rank: int) -> Chart:
+    """Return the singular values of a regressor, largest first.
+
+    Args:
+        values: Singular values, shape (b,) [-].
+        rank: How many of them the data determine.
+    """
+    number = np.arange(1, len(values) + 1)
+    values = np.maximum(values, float(values.max()) * 1e-17)
+    seen = [Series("determined", np.where(number <= rank, values, np.nan), "predicted", "dots")]
+    if rank < len(values):
+        seen.append(Series("open", np.where(number > rank, values, np.nan), "residual", "dots"))
+    return Chart(
+        "Singular values of the regressor, columns scaled to unit norm",
+        number.astype(float),
+        tuple(seen),
+        "number of the direction",
+        "singular value [-]",
+        logarithmic="y",
+    )

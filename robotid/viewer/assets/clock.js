@@ -1,0 +1,144 @@
+
+// ---- the clock: the log's own time -----------------------------------------------------------
+
+const SLOW = 0.045; // [s] a frame
+const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
+const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
+  speed: 1, loop: true, follow: Boolean(data.live), start: data.start, end: 0, frames: 0, at: 0 };
+clock.end = Math.max(motion.end, ghostMotion ? ghostMotion.end : data.start);
+const slider = byId("time"), clockText = byId("clock"), playButton = byId("play");
+let shown = null, told = null, spoken = -Infinity;
+const digits = (time) => time.toFixed(2);
+
+function show() { // the robot in every frame, the page about it ten times a second
+  if (shown !== clock.time) showRobot(clock.time);
+  shown = clock.time;
+  const now = performance.now();
+  if (told && (told.time === clock.time || (clock.playing && now - told.at < 100))) return;
+  told = { time: clock.time, at: now };
+  showReadings(clock.time);
+}
+
+function showRobot(time) {
+  if (!viewer || !motion.rows.length) return;
+  const row = motion.at(time);
+  robot.pose(row);
+  follow(row);
+  if (ghost) ghost.pose(ghostMotion.at(time));
+  if (arcs.length && torqueTable.rows.length) showArcs(torqueTable.at(time));
+  viewer.set_dirty();
+}
+
+function showReadings(time) {
+  const from = clock.end - clock.start || 1;
+  if (torqueTable && torqueTable.rows.length) {
+    const row = torqueTable.rows[torqueTable.before(time)];
+    torquePlots.forEach((plot, j) => plot.say(torques.labels.map((_, k) => row[k * count + j])));
+  }
+  if (bandTable && bandTable.rows.length) {
+    const row = bandTable.rows[bandTable.before(time)];
+    bandPlots.forEach((plot) => plot.say([row[plot.index]]));
+  }
+  plots.forEach((plot) => plot.move(time));
+  byId("now").style.left = `${(100 * (time - clock.start)) / from}%`;
+  slider.value = time;
+  clockText.textContent = `${digits(time)} of ${digits(clock.end)} s`;
+  if (Math.abs(time - spoken) > 1 || !clock.playing) { // a screen reader hears it once a second
+    spoken = time;
+    slider.setAttribute("aria-valuetext", `${time.toFixed(1)} of ${clock.end.toFixed(1)} seconds`);
+    keep();
+  }
+}
+
+function seek(time) {
+  clock.follow = false;
+  clock.time = Math.min(Math.max(time, clock.start), clock.end);
+  told = null;
+  buttons();
+  show();
+}
+function play() {
+  if (clock.time >= clock.end) clock.time = clock.start;
+  clock.playing = true;
+  buttons();
+}
+function pause() {
+  clock.playing = clock.follow = false;
+  told = null;
+  sharpen();
+  buttons();
+}
+function toggle() { if (clock.playing) pause(); else play(); }
+function buttons() {
+  playButton.textContent = clock.playing ? "Pause" : "Play";
+  byId("live").setAttribute("aria-pressed", clock.follow);
+}
+
+const pace = { mean: 0, frames: 0, pixels: 1 }; // of the last frames [s]; share of the pixels' width
+function spare(passed) { // a slow processor draws fewer pixels rather than fewer frames
+  pace.mean += (Math.min(passed, 0.5) - pace.mean) / Math.min(++pace.frames, 15);
+  if (pace.frames < 15 || pace.mean < SLOW || pace.pixels <= COARSEST) return;
+  draw(Math.max(0.8 * pace.pixels, COARSEST));
+}
+function draw(pixels) {
+  pace.pixels = pixels;
+  pace.frames = 0;
+  viewer.renderer.setPixelRatio(pixels * fullRatio);
+  resize();
+}
+function sharpen() { if (viewer && pace.pixels < 1) draw(1); } // all pixels of what stands still
+
+let last = null;
+function tick(now) {
+  const passed = last === null ? 0 : (now - last) / 1000;
+  last = now;
+  clock.at = now;
+  clock.frames++;
+  if (clock.playing && viewer && onProcessor) spare(passed);
+  if (clock.follow) clock.time = clock.end;
+  else if (clock.playing && clock.end > clock.start) {
+    clock.time += passed * clock.speed;
+    if (clock.time > clock.end) {
+      const span = clock.end - clock.start;
+      clock.time = clock.loop ? clock.start + ((clock.time - clock.start) % span) : clock.end;
+      if (!clock.loop) pause();
+    }
+  }
+  show();
+  if (viewer && viewer.needs_render) {
+    viewer.render();
+    placeNames();
+  }
+  requestAnimationFrame(tick);
+}
+
+// ---- the address keeps time, joint and camera -------------------------------------------------
+
+const kept = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+const hasAddress = location.protocol !== "about:"; // the frame of a notebook has none
+let isRestored = false;
+
+function keep() {
+  if (!isRestored || !hasAddress || data.live) return;
+  const state = { t: clock.time.toFixed(3) };
+  if (picked) state.joint = data.scene.nodes[picked].name;
+  if (isTurned) {
+    const { position } = viewer.camera, { target } = viewer.controls;
+    state.camera = [...position.toArray(), ...target.toArray()].map((x) => x.toPrecision(5)).join(" ");
+  }
+  history.replaceState(null, "", `#${new URLSearchParams(state)}`);
+}
+
+function restore() {
+  if (kept.t !== undefined && Number.isFinite(Number(kept.t))) { pause(); seek(Number(kept.t)); }
+  const place = (kept.camera || "").split(" ").map(Number);
+  if (viewer && place.length === 6 && place.every(Number.isFinite)) {
+    aim(); // near and far of the camera
+    viewer.camera.position.set(...place.slice(0, 3));
+    viewer.controls.target.set(...place.slice(3));
+    viewer.controls.update();
+    isTurned = true;
+  }
+  if (kept.joint) pick(nodeOf(kept.joint));
+  isRestored = true;
+}

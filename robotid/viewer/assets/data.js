@@ -1,0 +1,92 @@
+// What the page shows, and the tables of numbers that its parts read.
+const data = JSON.parse(document.getElementById("data").textContent);
+const byId = (id) => document.getElementById(id);
+const COLOURS = ["#2f7ed8", "#e0671f", "#3a9d5d", "#a855c7", "#b58900", "#c2366b"];
+const LONGEST = 20000; // rows that a live page keeps of each table
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+
+function unpack({ kind, data: text }) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  if (kind === "<u2") return new Uint16Array(bytes.buffer);
+  return kind === "<u4" ? new Uint32Array(bytes.buffer) : new Float32Array(bytes.buffer);
+}
+
+class Table { // times of the log and rows of numbers; in the page times are from the start
+  constructor(t, values) {
+    this.t = t ? Array.from(unpack(t), (x) => data.start + x) : [];
+    const flat = values ? unpack(values) : [];
+    const width = values ? values.shape[1] : 0;
+    this.rows = this.t.map((_, k) => Array.from(flat.subarray(k * width, (k + 1) * width)));
+  }
+  get end() { return this.t.length ? this.t[this.t.length - 1] : data.start; }
+  before(time) { // the last row not after a time; 0 if all are
+    let low = 0, high = this.t.length - 1;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (this.t[middle] <= time) low = middle; else high = middle - 1;
+    }
+    return low;
+  }
+  at(time) { // linear between two rows
+    const k = this.before(time), next = this.rows[k + 1];
+    if (!next || time <= this.t[k]) return this.rows[k];
+    const share = (time - this.t[k]) / (this.t[k + 1] - this.t[k]);
+    return this.rows[k].map((x, i) => x + share * (next[i] - x));
+  }
+  push(t, row) {
+    this.t.push(t);
+    this.rows.push(row);
+    if (this.t.length <= LONGEST) return;
+    const half = (_, k) => k % 2 === 0;
+    this.t = this.t.filter(half);
+    this.rows = this.rows.filter(half);
+  }
+}
+
+const motion = new Table(data.motion.t, data.motion.q);
+const ghostMotion = data.ghost ? new Table(data.ghost.t, data.ghost.q) : null;
+const torques = data.torques;
+// one row: measured of every joint, then each prediction of every joint
+const torqueTable = torques ? new Table(torques.t, torques.values) : null;
+const count = torques ? torques.joints.length : 0;
+const predictions = torques ? torques.labels.length - 1 : 0;
+const bands = data.bands;
+const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, then standard errors
+
+// ---- residuals: one scale of colour for arcs, links and the heat strip ------------------------
+
+const POOR = 0.5; // share of the torque's rms that is as red as it gets where no noise is known
+const UNSURE = "#8a97a5"; // of what is not predicted
+const RAMP = [[43, 131, 186], [255, 255, 191], [215, 25, 28]]; // at 0, a half and 1
+function residualColour(share) { // 0 to 1; of what is not a number, grey
+  if (!Number.isFinite(share)) return UNSURE;
+  const x = 2 * Math.min(Math.max(share, 0), 1), k = x < 1 ? 0 : 1;
+  return `rgb(${RAMP[k].map((c, i) => Math.round(c + (x - k) * (RAMP[k + 1][i] - c)))})`;
+}
+
+const scale = { of: new Array(count).fill(1), full: POOR, unit: "the torque's rms",
+  ...(torques && torques.scale) };
+const largest = new Array(count).fill(0); // [N m or N] what an arc is drawn in proportion to
+function measureTorques() {
+  const squares = new Array(count).fill(0);
+  let rows = 0;
+  largest.fill(0);
+  for (const row of torqueTable.rows) {
+    if (!Number.isFinite(row[0])) continue;
+    rows++;
+    for (let j = 0; j < count; j++) {
+      largest[j] = Math.max(largest[j], Math.abs(row[j]));
+      squares[j] += row[j] ** 2;
+    }
+  }
+  if (torques.scale || !rows) return; // a live page learns it as it goes
+  squares.forEach((sum, j) => { scale.of[j] = Math.sqrt(sum / rows) || 1; });
+}
+const residualShare = (row, j) => // 1 is as red as it gets; NaN without a prediction
+  predictions ? Math.abs(row[j] - row[count + j]) / scale.of[j] / scale.full : NaN;

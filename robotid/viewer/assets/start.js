@@ -1,0 +1,27 @@
+
+// ---- start -----------------------------------------------------------------------------------
+
+slider.min = clock.start;
+slider.max = clock.end;
+if (torques) { measureTorques(); drawTorques(); }
+if (bands) drawBands();
+byId("side").hidden = false;
+drawSwitches();
+data.marks.forEach(addMark);
+if (data.live) listen();
+restore();
+showMasses();
+chooseArcs();
+buttons();
+show();
+requestAnimationFrame(tick);
+
+// for scripts and notebooks: the clock, and the world pose of every node as 16 numbers by columns
+window.replay = { clock, seek, play, pause, pick, pace, viewer, plots, motion, arcs, masses, level, bins,
+  ghost, robot, get picked() { return picked && data.scene.nodes[picked].name; },
+  poses: (which = robot) => {
+    which.root.updateMatrixWorld(true);
+    const inverse = viewer.scene.matrixWorld.clone().invert();
+    return which.joints.map(({ object }) =>
+      inverse.clone().multiply(object.matrixWorld).toArray());
+  } };

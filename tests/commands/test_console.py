@@ -1,0 +1,166 @@
+"""What a user sees on a terminal of 80 columns: progress, wrapped lines, little colour."""
+
+import fcntl
+import json
+import os
+import pty
+import re
+import shlex
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.paths import ROOT
+from helpers.synthetic import exact_log, truth
+
+from robotid._typing import STAGES
+from robotid.cli import main
+from robotid.commands.console import terminal_progress
+from robotid.identification.pipeline import identify
+from robotid.logs.read import write_log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+URDF = str(example_urdf("ur5_robot.urdf"))
+
+
+@pytest.fixture(scope="module")
+def log():
+    model, rng = RobotModel.from_urdf(URDF), np.random.default_rng(0)
+    return exact_log(model, truth(model), rng, samples=900, rate=100.0, noise=0.1)
+
+
+def test_python_hears_of_each_stage_of_logs_in_memory(log):
+    heard = []
+    model = RobotModel.from_urdf(URDF)
+    identify(
+        model, [log], estimator="wls", friction="viscous", progress=lambda *told: heard.append(told)
+    )
+    assert heard == [(name, k, 5, "stages") for k, name in enumerate(STAGES) if k < 4]
+
+
+def test_verbose_says_the_stages_where_there_is_no_terminal(log, tmp_path, capsys):
+    write_log(log, tmp_path / "fit.csv")
+    words = ["identify", URDF, str(tmp_path / "fit.csv"), "--estimator", "wls", "--no-report"]
+    assert main([*words, "--out", str(tmp_path / "out"), "--json", "--verbose"]) == 0
+    assert "1/5" not in capsys.readouterr().err, "beside JSON nothing is said"
+    assert main([*words, "--out", str(tmp_path / "out"), "--verbose"]) == 0
+    printed = capsys.readouterr()
+    said = re.findall(r"^robotid: (\d)/5 (.*)$", printed.err, re.MULTILINE)
+    assert said == [(str(k + 1), name) for k, name in enumerate(STAGES)]
+    assert "/5 " not in printed.out
+
+
+def test_a_stage_stays_above_the_work_it_consists_of(capsys):
+    with terminal_progress(force=True) as show:
+        show("fitting", 2, 5, "stages")
+        show("reducing", 50, 100, "samples")
+    assert re.search(r"3/5 fitting.*\n.*    reducing.*50 %", capsys.readouterr().err)
+
+
+ARM = str(ROOT / "urdf" / "planar_2r.urdf")
+
+
+@pytest.fixture(scope="module")
+def arm_logs(tmp_path_factory):
+    folder, model = tmp_path_factory.mktemp("arm"), RobotModel.from_urdf(ARM)
+    rng = np.random.default_rng(0)
+    for name in ("fit", "keep"):
+        log = exact_log(model, truth(model), rng, samples=800, rate=100.0, noise=0.1)
+        write_log(log, folder / f"{name}.csv")
+    return folder
+
+
+def on_a_terminal(words, columns, **environment):
+    """Run robotid where both its streams are a terminal; return its code and what that got."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, columns, 0, 0))
+    kept = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES", "NO_COLOR", "CI")}
+    run = subprocess.Popen(
+        [sys.executable, "-m", "robotid", *words],
+        stdin=theirs, stdout=theirs, stderr=theirs,
+        env={**kept, "TERM": "xterm-256color", **environment},
+    )  # fmt: skip
+    os.close(theirs)
+    got = b""
+    while True:
+        try:
+            got += os.read(ours, 65536)
+        except OSError:  # its end
+            break
+    os.close(ours)
+    return run.wait(), got.decode()
+
+
+def test_a_terminal_shows_stages_then_lines_that_fit_and_a_tinted_verdict(arm_logs):
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--validate", str(arm_logs / "keep.csv")]
+    words += ["--estimator", "wls", "--friction", "viscous", "--no-report"]
+    code, got = on_a_terminal([*words, "--out", str(arm_logs / "out")], 50)
+    assert code == 0
+    # the stages, in order, before anything stays on the terminal
+    stages = list(dict.fromkeys(re.findall(r"(\d)/5 (\w[a-z ]*\w)", got)))
+    assert stages == [(str(k + 1), name) for k, name in enumerate(STAGES)]
+    last = got.rindex("5/5 writing")
+    assert "verdict" not in got[:last]
+    kept = got[last:].replace("\r", "").partition("planar_2r:")[2]
+    assert "/5 " not in kept
+    assert re.search(r"verdict: \x1b\[3[123]m(good|usable|poor)\x1b\[0m\n", kept)
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", kept).splitlines()
+    long = [line for line in lines if len(line) > 50]
+    # paths and commands, which are copied, are not broken
+    assert all(str(arm_logs) in line for line in long), long
+    assert len(lines) > 30
+    assert "  in wider terminals: gravity only %" in lines
+
+
+def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm_logs, capsys):
+    out = arm_logs / "named"
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--validate", str(arm_logs / "keep.csv")]
+    assert main([*words, "--friction", "viscous", "--no-report", "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    said = printed.out
+    assert printed.err == ""
+    result = json.loads((out / "result.json").read_text())
+    _, fit, keep = result["inputs"]
+    assert f"\nfitted: fit.csv {fit['start']:.4g}-{fit['end']:.4g} s\n" in said
+    assert f"\nnot fitted: keep.csv {keep['start']:.4g}-{keep['end']:.4g} s\n" in said
+    notes = sum(warning["severity"] == "note" for warning in result["warnings"])
+    assert notes
+    flat = " ".join(said.split())
+    assert f"{notes} note{'s' * (notes > 1)} hidden (--verbose)" in flat
+    assert "\nnote: " not in said
+    assert said.count("\x1b") == 0
+    commands = re.findall(r"^ {7}(robotid .*)$", said, re.MULTILINE)
+    (replay,) = [shlex.split(line) for line in commands if " replay " in line]
+    page = arm_logs / "page.html"
+    assert main([*replay[1:], "--html", str(page)]) == 0
+    assert page.stat().st_size > 50_000
+
+
+def test_inspect_says_what_it_found_first_and_a_missing_file_once(tmp_path, capsys):
+    assert main(["inspect", str(tmp_path / "none.urdf")]) == 1
+    printed = capsys.readouterr()
+    missing = f"robotid: there is no URDF file '{tmp_path / 'none.urdf'}'\n"
+    assert (printed.out, printed.err) == ("", missing)
+    urdf = tmp_path / "two.urdf"
+    urdf.write_text(Path(ARM).read_text().replace('value="1.9"', 'value="-1.9"'))
+    assert main(["inspect", str(urdf)]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.startswith("planar_2r: 2 joints: joint_1, joint_2\nerror: negative_mass: ")
+    assert printed.err == f"robotid: no model can be built from {urdf}; see the findings\n"
+
+
+def test_inspect_shows_base_parameters_where_they_are_asked_for(tmp_path, capsys):
+    urdf = tmp_path / "two.urdf"
+    inertia = 'ixx="0.02836842105263158"'
+    urdf.write_text(Path(ARM).read_text().replace(inertia, 'ixx="-1"'))
+    assert main(["inspect", str(urdf)]) == 0
+    short = capsys.readouterr().out
+    assert main(["inspect", str(urdf), "--base"]) == 0
+    long = capsys.readouterr().out
+    assert long.index("error: ") < long.index("base parameters, inertial")
+    assert len(long.splitlines()) > len(short.splitlines()) + 3

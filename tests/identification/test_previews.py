@@ -1,0 +1,224 @@
+"""What a preview expects is what many recordings with that noise show."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+from helpers.fitting import identify
+from helpers.synthetic import truth
+
+from robotid.estimators.batch import solve_factor
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification.previews import TorqueNoise, assumed_noise, preview
+from robotid.identification.settings import EstimatorSettings
+from robotid.identification.survey import hold_log
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.factors import compress
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.used_rows import base_problem
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.motions import random_fourier
+
+STD = np.array([2.0, 3.0, 1.0, 0.3, 0.2, 0.1])  # [N m]
+RATE, DURATION = 100.0, 12.0
+
+
+def white(std=STD):
+    return TorqueNoise(std, np.zeros(len(std)), ("stated",) * len(std))
+
+
+def moved(model, rng, rate=RATE, period=DURATION):
+    t = np.arange(round(DURATION * rate)) / rate
+    q, v, a = random_fourier(model, rng, period=period).evaluate(t)
+    return Log(t=t, q=q, tau=np.zeros_like(q), joints=model.joints), (q, v, a)
+
+
+@pytest.fixture(scope="module")
+def motion(ur5):
+    return moved(ur5, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def recorded(ur5, motion):
+    """The motion with the torques of another robot and noise."""
+    log, state = motion
+    torque = (joint_torque_regressor(ur5, *state) @ truth(ur5)).reshape(log.q.shape)
+    noise = STD * np.random.default_rng(1).standard_normal(torque.shape)
+    return replace(log, tau=torque + noise)
+
+
+@pytest.fixture(scope="module")
+def found(ur5, recorded):
+    return identify(ur5, [recorded], friction="none", estimator="wls")
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_the_errors_expected_are_the_scatter_of_many_recordings(ur5, motion, colour):
+    log, _ = motion
+    time = 0.0 if colour == 0 else (1 + colour) / (1 - colour) / RATE
+    noise = TorqueNoise(STD, np.full(6, time), ("stated",) * 6)
+    ahead = preview(ur5, [log], noise=noise, estimator="wls")
+    mapping, sigma = ahead.expected.mapping, ahead.expected.estimate.sigma
+    rng, thetas = np.random.default_rng(2), []
+    for _ in range(60):
+        wild = rng.standard_normal((len(log.t) + 200, 6))
+        wild = scipy.signal.lfilter([np.sqrt(1 - colour**2)], [1.0, -colour], wild, axis=0)[200:]
+        held = hold_log(ur5, replace(log, tau=STD * wild), SignalSettings())
+        factors = compress(base_problem(ur5, mapping, held.whole.trajectory, held.whole.mask))
+        thetas.append(solve_factor(factors, sigma, np.zeros(len(mapping.K))).theta)
+    scatter = np.sqrt(np.mean(np.square(thetas), axis=0))
+    ratio = ahead.base_error / scatter
+    # a motion is not quite slow beside noise of 0.2 s, whose density falls from 1 Hz on
+    assert np.median(ratio) == pytest.approx(1.0 if colour == 0 else 1.08, abs=0.06)
+    assert ratio.min() > 0.7  # 60 runs tell a scatter to 9 %
+    assert ratio.max() < 1.6
+
+
+def test_what_is_expected_is_what_identify_then_reports(ur5, motion, found):
+    ahead = preview(ur5, [motion[0]], noise=white(), estimator="wls")
+    assert ahead.expected.mapping.base_names == found.mapping.base_names
+    ratio = ahead.base_error / found.wls.std_error
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
+    assert np.quantile(ratio, 0.1) > 0.65  # 18 stretches of one run tell an error to 17 %
+    assert np.quantile(ratio, 0.9) < 1.6
+    # behind the filter the noise leaves what the fit leaves
+    np.testing.assert_allclose(ahead.expected.estimate.sigma, found.wls.sigma, rtol=0.15)
+    assert ahead.expected.determination.rank == found.determination.rank
+
+
+def test_torques_that_a_log_has_are_ignored(ur5, motion, recorded):
+    first, second = (preview(ur5, [log], noise=white()) for log in (motion[0], recorded))
+    np.testing.assert_array_equal(first.standard_error, second.standard_error)
+    np.testing.assert_array_equal(first.bands[0].total, second.bands[0].total)
+
+
+@pytest.mark.parametrize("estimator", ["wls", "ols"])
+def test_errors_are_in_proportion_to_the_noise_and_fall_with_the_root_of_the_length(
+    ur5, motion, estimator
+):
+    log = motion[0]
+    once = preview(ur5, [log], noise=white(), estimator=estimator).base_error
+    thrice = preview(ur5, [log], noise=white(3 * STD), estimator=estimator).base_error
+    np.testing.assert_allclose(thrice, 3 * once, rtol=1e-8)
+    four = preview(ur5, [log] * 4, noise=white(), estimator=estimator).base_error
+    np.testing.assert_allclose(four, once / 2, rtol=1e-8)
+
+
+def test_the_density_of_noise_counts_and_not_the_rate_of_the_rows(ur5, motion):
+    log, noise = motion[0], white()
+    base = preview(ur5, [log], noise=noise, estimator="wls").base_error
+    thinned = SignalSettings(rate=50.0)
+    half = preview(ur5, [log], noise=noise, estimator="wls", signals=thinned).base_error
+    np.testing.assert_allclose(half, base, rtol=0.05)
+    # the same noise over 0.1 s has ten times the density of 0.01 s
+    slow = TorqueNoise(STD, np.full(6, 0.1), ("stated",) * 6)
+    slower = preview(ur5, [log], noise=slow, estimator="wls").base_error
+    np.testing.assert_allclose(slower, np.sqrt(10.0) * base, rtol=1e-8)
+
+
+def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
+    log = motion[0]
+    free = preview(ur5, [log], noise=white(), estimator="wls")
+    kept = preview(ur5, [log], noise=white())
+    assert (kept.base_error <= free.base_error * 1.001).all()
+    assert (kept.base_error <= kept.plausible * 1.001).all()
+    light = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1e-9))
+    np.testing.assert_allclose(light.base_error, free.base_error, rtol=1e-3)
+    assert set(kept.expected.sources) == {"data", "mixed", "prior"}
+    (band,) = free.bands
+    mapping, covariance = free.expected.mapping, free.expected.wls.covariance
+    trajectory = free.expected.fitted[0].recording.trajectory
+    k = band.samples[123]
+    one = trajectory.at(np.array([k]))
+    W = joint_torque_regressor(ur5, one.q, one.v, one.a, one.direction)[:, mapping.independent]
+    std = np.sqrt(np.diag(W @ covariance @ W.T))
+    np.testing.assert_allclose(band.parameters[123], std, rtol=1e-8)
+
+
+def test_a_joint_that_stands_still_is_named(ur5, motion):
+    log = motion[0]
+    q = log.q.copy()
+    q[:, 2] = 0.5
+    ahead = preview(ur5, [replace(log, q=q)], noise=white())
+    assert {"elbow_joint.viscous", "elbow_joint.coulomb"} <= set(
+        ahead.expected.determination.undetermined
+    )
+    assert ahead.words.startswith("log: the motion determines ")
+    assert "elbow_joint.viscous" in ahead.words
+    known = dict(zip(ahead.expected.mapping.names, ahead.expected.sources, strict=True))
+    assert known["elbow_joint.viscous"] == "prior"
+    assert np.isinf(preview(ur5, [replace(log, q=q)], estimator="wls").base_error).any()
+
+
+def test_a_run_before_adds_what_it_said_and_its_noise(ur5, motion, found):
+    log = motion[0]
+    ahead = preview(ur5, [log], given=found, estimator="wls")
+    assert set(ahead.noise.origins) == {"found"}
+    density = np.sqrt(ahead.noise.density(0.0) * RATE)
+    np.testing.assert_allclose(density, STD, rtol=0.35)  # 48 stretches
+    np.testing.assert_allclose(ahead.before, found.wls.std_error, rtol=0.1)
+    # as much again: the errors fall by about a root of 2
+    assert np.median(ahead.gain) == pytest.approx(np.sqrt(2.0), abs=0.1)
+    other = moved(ur5, np.random.default_rng(5))[0]
+    assert (preview(ur5, [other], given=found, estimator="wls").gain >= 1.0).all()
+    alone = preview(ur5, [log], noise=ahead.noise, estimator="wls").base_error
+    together = 1.0 / np.sqrt(ahead.before**-2 + alone**-2)
+    np.testing.assert_allclose(ahead.base_error, together, rtol=0.25)
+
+
+def test_a_short_run_before_counts_by_the_band_of_its_filter(ur5, recorded):
+    short = identify(ur5, [recorded.window(0.0, 3.0)], friction="none", estimator="consistent")
+    assert short.errors.stretches < 12
+    ahead = preview(ur5, [recorded], given=short)
+    assert (ahead.base_error <= ahead.before * 1.001).all()
+
+
+def test_noise_is_stated_or_a_hundredth_of_the_largest_torque(ur5):
+    size = np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0])
+    noise = assumed_noise(ur5, size, {"elbow_joint": 0.7})
+    np.testing.assert_allclose(noise.std, [1.5, 1.5, 0.7, 0.28, 0.28, 0.28])
+    np.testing.assert_array_equal(noise.correlation, 0.1)
+    assert noise.origins[2] == "stated"
+    assert set(noise.origins) == {"stated", "assumed"}
+    before = TorqueNoise(STD, np.full(6, 0.3), ("found",) * 6)
+    told = assumed_noise(ur5, size, {"elbow_joint": 0.7}, 0.0, before)
+    np.testing.assert_allclose(told.std, [2.0, 3.0, 0.7, 0.3, 0.2, 0.1])
+    np.testing.assert_array_equal(told.correlation, [0.3, 0.3, 0.0, 0.3, 0.3, 0.3])
+    with pytest.raises(SettingsError, match="Did you mean 'elbow_joint'"):
+        assumed_noise(ur5, size, {"elbow": 0.7})
+    with pytest.raises(SettingsError, match="noise of 'elbow_joint' is -1, wanted a positive"):
+        assumed_noise(ur5, size, {"elbow_joint": -1.0})
+    with pytest.raises(SettingsError, match="correlation is -1 s"):
+        assumed_noise(ur5, size, {}, -1.0)
+
+
+def test_a_joint_without_an_effort_limit_has_the_torque_of_its_bodies(ur5, motion, tmp_path):
+    text = example_urdf("ur5_robot.urdf").read_text()
+    (tmp_path / "bare.urdf").write_text(re.sub(r'effort="[^"]*"', "", text))
+    bare = RobotModel.from_urdf(tmp_path / "bare.urdf")
+    log, (q, v, a) = motion
+    torque = joint_torque_regressor(ur5, q, v, a) @ ur5.standard_parameters()
+    largest = np.abs(torque.reshape(q.shape)).max(axis=0)
+    std = preview(bare, [log]).noise.std
+    np.testing.assert_allclose(std[:4], 0.01 * largest[:4], rtol=0.1)
+    assert std[1] < 0.01 * 150.0 == preview(ur5, [log]).noise.std[1]
+
+
+def test_a_static_model_is_previewed_too(motion):
+    urdf = example_urdf("ur5_robot.urdf")
+    model = RobotModel.from_urdf(urdf, dynamics="static")
+    t = np.arange(0.0, 100.0, 0.02)
+    q = motion[0].q[(len(motion[0].q) * t / 100.0).astype(int)]
+    smooth = scipy.signal.savgol_filter(q, 201, 3, axis=0)
+    ahead = preview(model, [Log(t, smooth, 0.0 * q, model.joints)], noise=white())
+    assert np.isfinite(ahead.standard_error).all()
+    assert any(source == "data" for source in ahead.expected.sources)
+
+
+def test_nothing_to_preview_is_refused(ur5):
+    with pytest.raises(DataError, match="no motion was given"):
+        preview(ur5, [])

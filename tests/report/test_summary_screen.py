@@ -1,0 +1,107 @@
+"""The first screen: bars, figures and steps against the result."""
+
+import re
+from dataclasses import replace
+from html import unescape
+
+import pytest
+
+from robotid.identification.advice import Origin, next_steps
+from robotid.identification.verdict import GOOD, POOR
+from robotid.report import summary_screen as first
+from robotid.report.summary_screen import joint_errors, summary_screen
+
+ORIGIN = Origin(("arm.toml",), "out")
+
+
+@pytest.fixture(scope="module")
+def screen(identified):
+    return summary_screen(identified, ORIGIN, {"URDF": "arm identified.urdf"})
+
+
+def bars(html):
+    """Return by joint, in order, where its bar ends and where each mark stands [%]."""
+    found = {}
+    for row in re.findall(r"<li class=\"[\w-]*\">(<a .*?)</li>", html, flags=re.DOTALL):
+        name = re.sub(r"<[^>]*>", "", row[: row.index("</a>")])
+        width = re.search(r'<rect y="4" width="([\d.]*)%"', row)
+        marks = [float(x) for x in re.findall(r'<svg x="([\d.]*)%"', row)]
+        found[name] = (float(width[1]), marks)
+    return found
+
+
+def test_each_joint_has_a_bar_of_its_error_the_worst_first(screen, identified):
+    (kept,) = identified.validation
+    errors = {j: m.relative_error_pct for j, m in kept.metrics["estimate"].per_joint.items()}
+    found = bars(screen)
+    assert list(found) == sorted(errors, key=errors.get, reverse=True)
+    for joint, (width, marks) in found.items():
+        measured = kept.metrics["estimate"].per_joint[joint]
+        wls = kept.metrics["wls"].per_joint[joint].relative_error_pct
+        others = [measured.baselines[key] for key in ("urdf_with_drives", "gravity_only", "urdf")]
+        assert 1.5 * width**2 / 100 == pytest.approx(errors[joint], rel=2e-3)
+        wanted = [min(value, 150.0) for value in (wls, *others)]
+        assert [1.5 * x**2 / 100 for x in marks] == pytest.approx(wanted, rel=2e-3)
+    limits = re.findall(r'<line x1="([\d.]*)%"', screen)
+    assert [1.5 * float(x) ** 2 / 100 for x in limits[:2]] == pytest.approx([GOOD, POOR], rel=2e-3)
+
+
+def test_of_several_recordings_the_worst_counts(identified):
+    (kept,) = identified.validation
+    metrics = kept.metrics["estimate"]
+    joint = next(iter(metrics.per_joint))
+    worse = replace(metrics.per_joint[joint], relative_error_pct=99.0)
+    better = {j: replace(m, relative_error_pct=0.1) for j, m in metrics.per_joint.items()}
+    other = replace(metrics, per_joint=better | {joint: worse})
+    second = replace(kept, metrics={**kept.metrics, "estimate": other})
+    errors = joint_errors(replace(identified, validation=(kept, second)))
+    assert next(iter(errors)) == joint
+    for name, (measured, _) in errors.items():
+        wanted = worse if name == joint else metrics.per_joint[name]
+        assert measured == wanted
+
+
+def test_every_joint_has_its_verdict_and_its_reason(screen, identified):
+    said = re.findall(
+        r'<li class="([\w-]*)"><a [^>]*>(.*?)</a>.*?<span class="why">(.*?)</span>', screen
+    )
+    wanted = {
+        joint: (
+            v.status,
+            v.reasons[0].removeprefix(f"{joint}: ").replace(" on kept.csv 0-5.98 s", ""),
+        )
+        for joint, v in identified.verdict.joints.items()
+    }
+    shown = {
+        re.sub("<wbr>", "", name): (status.replace("-", " "), unescape(why))
+        for status, name, why in said
+    }
+    assert shown == wanted
+
+
+def test_masses_and_sources_are_those_of_the_result(screen, identified):
+    before, after = (pi[:60:10].sum() for pi in (identified.prior, identified.standard))
+    assert f"{before:.2f} → {after:.2f} kg" in screen
+    assert f"{identified.determination.rank} of {len(identified.base)}" in screen
+    flex = {k: int(n) for k, n in re.findall(r'<i class="(\w+)" style="flex: (\d+)"', screen)}
+    assert flex == {kind: identified.sources.count(kind) for kind in set(identified.sources)}
+    assert '<a href="arm identified.urdf">URDF</a>' in screen
+
+
+def test_the_steps_stand_in_order_with_what_to_copy(screen, identified):
+    steps = next_steps(identified, ORIGIN)
+    html = screen[screen.index('<ol class="next">') :]
+    assert [unescape(x) for x in re.findall(r"<li><p>(.*?)</p>", html)] == [s.words for s in steps]
+    typed = [
+        unescape(x) for x in re.findall(r'<pre class="command"[^>]*>(.*?)</pre>', html, re.DOTALL)
+    ]
+    assert typed == [block for step in steps for block in step.blocks]
+    assert typed
+
+
+def test_the_best_of_many_joints_are_folded_away(identified, screen, monkeypatch):
+    monkeypatch.setattr(first, "_ROWS", 4)
+    html = summary_screen(identified, ORIGIN, {})
+    shown, folded = html.split("2 more joints, which are predicted better")
+    assert [*bars(shown), *bars(folded)] == list(bars(screen))
+    assert len(bars(shown)) == 4

@@ -1,0 +1,71 @@
+"""Text for people: lines, columns, digits."""
+
+import io
+
+import pytest
+
+from robotid._text import columns, in_digits_of, tinted, wrapped
+
+
+def test_lines_fit_and_keep_their_indentation():
+    text = "  - the robot has to be weighed\nverdict: good"
+    assert wrapped(text, 20, "  ") == "  - the robot has to\n    be weighed\nverdict: good"
+    assert wrapped(text, None) == text
+
+
+def test_neither_names_nor_quoted_paths_are_broken():
+    path = "'/data of mine/long-named-folder/first run.csv'"
+    assert path in wrapped(f"there is no log file {path} in it", 24)
+    assert "left_shoulder-roll-joint-of-arm" in wrapped("a left_shoulder-roll-joint-of-arm", 20)
+
+
+def test_columns_stand_apart_and_those_that_do_not_fit_are_named():
+    rows = [["elbow", "-0.0002363", "1"], ["x", "2", "12345"]]
+    assert columns(["joint", "A", "B-A"], rows) == [
+        "  joint           A    B-A",
+        "  elbow  -0.0002363      1",
+        "  x               2  12345",
+    ]
+    narrow = columns(["joint\n", "A\n[m]", "URDF\n%"], rows, needed=1, width=20)
+    assert narrow[1:] == [
+        "                [m]",
+        "  elbow  -0.0002363",
+        "  x               2",
+        "  in wider terminals: URDF %",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "shown"),
+    [
+        (8.5624, 0.0231, ("8.562", "0.023")),
+        (8.5624, 0.0996, ("8.56", "0.10")),  # not 0.100
+        (1234.4, 120.0, ("1230", "120")),
+        (-0.0001, 0.1, ("0.00", "0.10")),  # not -0.00
+        (-2.83e-7, 1.2e-6, ("-0.3e-06", "1.2e-06")),
+        (3.2e-5, 1.1e-7, ("3.200e-05", "0.011e-05")),
+        (2.0, None, ("2", "-")),
+        (2.0, 0.0, ("2", "-")),
+        (2.34567, float("inf"), ("2.346", "-")),
+    ],
+)
+def test_the_last_digit_of_a_value_is_the_second_of_its_error(value, error, shown):
+    assert in_digits_of(value, error) == shown
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_colour_is_for_terminals_and_no_color_ends_it(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    said = "verdict: poor, so poor"
+    assert tinted(said, "poor", "poor", Terminal()) == "verdict: \x1b[31mpoor\x1b[0m, so poor"
+    assert tinted(said, "poor", "bad", Terminal()) == said
+    assert tinted(said, "poor", "poor", io.StringIO()) == said
+    for name, value in (("NO_COLOR", "1"), ("TERM", "dumb")):
+        with monkeypatch.context() as changed:
+            changed.setenv(name, value)
+            assert tinted(said, "poor", "poor", Terminal()) == said
