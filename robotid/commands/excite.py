@@ -46,7 +46,7 @@ class MotionSettings:
         seed: Of the random starts.
         starts: How many are followed to the end.
         seconds: Time after which the best motion so far is taken [s].
-        rate: Rows per second that are written [Hz].
+        points: Rows per second that are written [Hz].
     """
 
     kind: str = "fourier"
@@ -64,12 +64,12 @@ class MotionSettings:
     seed: int = 0
     starts: int = 3
     seconds: float = np.inf
-    rate: float = 100.0
+    points: float = 100.0
 
     def __post_init__(self) -> None:
         if self.kind not in _BASES:
             raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_BASES)}")
-        for name in ("duration", "starts", "seconds", "rate"):
+        for name in ("duration", "starts", "seconds", "points"):
             value = getattr(self, name)
             if not value > 0:
                 raise SettingsError(f"{name} is {value:g}, wanted more than 0")
@@ -135,7 +135,9 @@ def design_motion(
         SettingsError: If a setting does not fit, or nothing keeps the limits.
     """
     check_file(Path(target))
-    model, run = (job.model(), None) if given is None else result_run(job, given)
+    model, run = job.model(), None
+    if given is not None:
+        _, _, model, run = result_run(job, given)
     limits = MotionLimits.of_model(
         model,
         share=settings.share,
@@ -164,7 +166,7 @@ def design_motion(
         seconds=settings.seconds,
         progress=told,
     )
-    write_motion(design.motion, model.joints, basis.duration, settings.rate, target)
+    write_motion(design.motion, model.joints, basis.duration, settings.points, target)
     return _content(model, design, limits, clearance, settings)
 
 
@@ -201,7 +203,7 @@ def _content(
         "converged": bool(design.is_converged),
         "feasible": True,
         "duration": settings.duration,
-        "rate": settings.rate,
+        "points": settings.points,
         "limits": margins,
         "history": [list(entry) for entry in design.history],
     }

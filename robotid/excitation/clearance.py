@@ -167,7 +167,7 @@ class Clearance:
         q = rng.uniform(low, high, (_TRIED, len(low)))
         near = self.near(self.poses(q), self.least + _APART, self.everything)
         distance = near.distance
-        always = (distance < self.least).mean(axis=1) > _MADE_TO
+        always: Array = (distance < self.least).mean(axis=1) > _MADE_TO
         names = self.named
         self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
         likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
@@ -230,9 +230,10 @@ class Clearance:
         for k, (pair, sample) in enumerate(zip(pairs.tolist(), samples.tolist(), strict=True)):
             two = []
             for hull in self.pairs[pair].tolist():
-                if (hull, sample) not in placed:
-                    placed[hull, sample] = coal.Transform3s(turns[hull, sample], centres[hull, sample])
-                two += [self._hulls[hull].shape, placed[hull, sample]]
+                at = hull, sample
+                if at not in placed:
+                    placed[at] = coal.Transform3s(turns[at], centres[at])
+                two += [self._hulls[hull].shape, placed[at]]
             result.clear()
             bound[pair, sample] = coal.distance(*two, self._request, result)
             witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
@@ -341,7 +342,8 @@ class Clearance:
             velocity = linear + np.cross(angular, x.T[:, None], axis=0)
             along = np.einsum("cjk,kc->kj", velocity, normals)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
-        return out @ self._ratios
+        by_joint: Array = out @ self._ratios
+        return by_joint
 
 
 def _hull(name: str, body: int, points: Array) -> _Hull:

@@ -187,7 +187,8 @@ class Designer:
 
         def follow(designer: Designer, C: Array, rounds: int) -> bool:
             """Follow a start; return whether it settled."""
-            for kept, objective, is_settled in designer._search(C, rounds, is_over):
+            is_settled = False
+            for kept, objective, is_settled in designer._search(C, rounds, is_over):  # noqa: B007
                 if objective < best.objective:
                     best.coefficients, best.objective = kept, objective
                     history.append((time.monotonic() - begun, objective))
@@ -218,13 +219,7 @@ class Designer:
         Args:
             C: Coefficients of a motion, shape (h, n).
         """
-        C = self._feasible(C, 1.0)
-        contact = None
-        for _ in range(0 if self.clearance is None else _HALVINGS):
-            contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
-            if contact is None or contact.distance >= self.clearance.least:
-                break
-            C = _scaled(C, 0.99)
+        C, contact = self._clear(self._feasible(C, 1.0))
         objective, used, _, rows = self._looked_at(C)
         low, *_, high = np.linalg.eigvalsh(self.matrix(rows) - self._known)
         return Design(
@@ -233,6 +228,25 @@ class Designer:
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
             used=np.abs(used).max(axis=1),
             contact=contact,
+        )
+
+    def _clear(self, C: Array) -> tuple[Array, Contact | None]:
+        """Return a motion scaled down until it is clear between its instants, and where it is least.
+
+        Raises:
+            NotConvergedError: If it is not clear at nine tenths of its size.
+        """
+        if self.clearance is None:
+            return C, None
+        for _ in range(_HALVINGS):
+            contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
+            if contact is None or contact.distance >= self.clearance.least:
+                return C, contact
+            C = _scaled(C, 0.99)
+        raise NotConvergedError(
+            f"between the instants that were looked at {contact}, nearer than "
+            f"{1e3 * self.clearance.least:.0f} mm; raise the clearance or try another seed",
+            "max_iterations",
         )
 
     @property
@@ -254,8 +268,8 @@ class Designer:
         n, b, N = rows.W.shape
         scaled = rows.W * self._scale
         flat = scaled.swapaxes(0, 1).reshape(b, n * N)
-        F: Array = flat @ flat.T
-        return F + self._known
+        F: Array = flat @ flat.T + self._known
+        return F
 
     def _looked_at(self, C: Array) -> tuple[float, Array, float, MotionRows]:
         """Return criterion, shares of limits used (6, N, n), least distance and rows."""
@@ -296,9 +310,7 @@ class Designer:
         by_W += self.information.beta[:, None] * by_torque.T[:, None]
         along_q, along_v, along_a = self.information.pull(rows, by_W)
         by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
-        gradient: Array = sum(
-            functions.T @ g for functions, g in zip(D, by_motion, strict=True)
-        )
+        gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
         return value, gradient
 
     def random(self, rng: np.random.Generator) -> Array:
@@ -425,7 +437,8 @@ class Designer:
 def _gravity(model: RobotModel) -> Array:
     """Return the largest torque that gravity asks of each joint over random poses, shape (n,)."""
     reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
-    q = np.random.default_rng(0).uniform(*np.array(reach).T, (_TRIED, len(reach)))
+    low, high = np.array(reach).T
+    q = np.random.default_rng(0).uniform(low, high, (_TRIED, len(reach)))
     torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
     return torque
 

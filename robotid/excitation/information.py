@@ -1,4 +1,4 @@
-"""What a motion will tell: the information of its torques about the base parameters, by gradient."""
+"""What a motion will tell: the information of its torques about base parameters, by gradient."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""What a robot may do while it moves: positions, speeds, torques, and how far a motion is from it."""
+"""What a robot may do while it moves: positions, speeds, torques, and how much a motion uses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

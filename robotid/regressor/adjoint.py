@@ -16,6 +16,7 @@ References:
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from robotid.robot.model import RobotModel
 
 __all__ = ["MotionRegressor", "Poses", "RegressorState"]
 
+_Spatial: TypeAlias = tuple[Array, Array]  # linear and angular part, or force and moment
 #: Where xx, xy, yy, xz, yz, zz of an inertia stand in its matrix.
 _ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 
@@ -42,7 +44,7 @@ class Poses:
 
     R: Array
     p: Array
-    screw: tuple[Array, Array]
+    screw: _Spatial
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +57,11 @@ class RegressorState(Poses):
 
     v: Array  # (m, N)
     a: Array
-    velocity: tuple[Array, Array]
-    acceleration: tuple[Array, Array]
-    own_velocity: tuple[Array, Array]  # in the body's frame
-    own_acceleration: tuple[Array, Array]
-    seen: tuple[Array, Array]  # the screw of j from the frame of i, (3, pairs, N)
+    velocity: _Spatial
+    acceleration: _Spatial
+    own_velocity: _Spatial  # in the body's frame
+    own_acceleration: _Spatial
+    seen: _Spatial  # the screw of j from the frame of i, (3, pairs, N)
     rows: Array
 
 
@@ -116,9 +118,7 @@ class MotionRegressor:
         linear, angular = screw
         velocity = self._summed((linear * v, angular * v))
         turned = _motion_cross(velocity, screw)
-        acceleration = self._summed(
-            (linear * a + turned[0] * v, angular * a + turned[1] * v)
-        )
+        acceleration = self._summed((linear * a + turned[0] * v, angular * a + turned[1] * v))
         acceleration = (acceleration[0] - self._gravity[:, None, None], acceleration[1])
         own_velocity = _into(R, p, velocity)
         own_acceleration = _into(R, p, acceleration)
@@ -145,9 +145,7 @@ class MotionRegressor:
             if not self.slides[i]:
                 along, across = np.outer(axis, axis), _skew(axis)
                 constant, even, odd = turn @ along, turn @ (np.eye(3) - along), turn @ across
-                own = (
-                    constant[..., None] + even[..., None] * cosine[i] + odd[..., None] * sine[i]
-                )
+                own = constant[..., None] + even[..., None] * cosine[i] + odd[..., None] * sine[i]
             place = np.array(M.translation)[:, None] * np.ones(N)
             if self.slides[i]:
                 place = place + (turn @ axis)[:, None] * angle[i]
@@ -162,18 +160,21 @@ class MotionRegressor:
         linear = np.where(slides, axis, _cross(p, axis))
         return Poses(R, p, (linear, np.where(slides, 0.0, axis)))
 
-    def _summed(self, each: tuple[Array, Array]) -> tuple[Array, Array]:
+    def _summed(self, each: _Spatial) -> _Spatial:
         """Return the sums over the joints that carry each body."""
         linear, angular = each
         return self._carried @ linear, self._carried @ angular
 
-    def _gathered(self, each: tuple[Array, Array]) -> tuple[Array, Array]:
+    def _gathered(self, each: _Spatial) -> _Spatial:
         """Return the sums over the bodies that each joint carries."""
         linear, angular = each
         return self._carried.T @ linear, self._carried.T @ angular
 
     def _rows(
-        self, velocity: tuple[Array, Array], acceleration: tuple[Array, Array], seen: tuple[Array, Array]
+        self,
+        velocity: _Spatial,
+        acceleration: _Spatial,
+        seen: _Spatial,
     ) -> Array:
         i = self._bodies
         u, e = seen
@@ -215,15 +216,13 @@ class MotionRegressor:
         c = _motion_cross(state.velocity, s)
         g_v = _pair(c, S_A)
         bent = _adjoint(state.velocity, S_A)
-        g_s = tuple(
-            g + state.a * x + state.v * y for g, x, y in zip(g_s, S_A, bent, strict=True)
-        )
+        g_s = tuple(g + state.a * x + state.v * y for g, x, y in zip(g_s, S_A, bent, strict=True))
         back = _adjoint(s, S_A)
-        S_V = self._gathered(tuple(g - state.v * x for g, x in zip(g_V, back, strict=True)))
+        S_V = self._gathered((g_V[0] - state.v * back[0], g_V[1] - state.v * back[1]))
         g_v = g_v + _pair(s, S_V)
-        g_s = tuple(g + state.v * x for g, x in zip(g_s, S_V, strict=True))
+        g_s = (g_s[0] + state.v * S_V[0], g_s[1] + state.v * S_V[1])
         own = _adjoint(s, g_s)
-        total = self._gathered(tuple(t - x for t, x in zip(turn, own, strict=True)))
+        total = self._gathered((turn[0] - own[0], turn[1] - own[1]))
         g_q = _pair(s, total)
         out = []
         for g in (g_q, g_v, g_a):
@@ -277,21 +276,21 @@ def _dot(x: Array, y: Array) -> Array:
     return product
 
 
-def _pair(x: tuple[Array, Array], y: tuple[Array, Array]) -> Array:
+def _pair(x: _Spatial, y: _Spatial) -> Array:
     return _dot(x[0], y[0]) + _dot(x[1], y[1])
 
 
-def _add(x: tuple[Array, Array], y: tuple[Array, Array]) -> tuple[Array, Array]:
+def _add(x: _Spatial, y: _Spatial) -> _Spatial:
     return x[0] + y[0], x[1] + y[1]
 
 
-def _into(R: Array, p: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
+def _into(R: Array, p: Array, x: _Spatial) -> _Spatial:
     """Return motions of the world as bodies see them: X^-1 x."""
     linear, angular = x
     return _turned_back(R, linear + _cross(angular, p)), _turned_back(R, angular)
 
 
-def _out(R: Array, p: Array, g: tuple[Array, Array]) -> tuple[Array, Array]:
+def _out(R: Array, p: Array, g: _Spatial) -> _Spatial:
     """Return forces on bodies as the world sees them: X^-T g."""
     linear = _turned(R, g[0])
     return linear, _turned(R, g[1]) + _cross(p, linear)
@@ -309,12 +308,12 @@ def _turned_back(R: Array, x: Array) -> Array:
     return out
 
 
-def _motion_cross(x: tuple[Array, Array], y: tuple[Array, Array]) -> tuple[Array, Array]:
+def _motion_cross(x: _Spatial, y: _Spatial) -> _Spatial:
     """Return the spatial cross product of motions, x x y."""
     return _cross(x[1], y[0]) + _cross(x[0], y[1]), _cross(x[1], y[1])
 
 
-def _adjoint(y: tuple[Array, Array], g: tuple[Array, Array]) -> tuple[Array, Array]:
+def _adjoint(y: _Spatial, g: _Spatial) -> _Spatial:
     """Return g^T (y x) as a force: what g . (y x z) is by z."""
     return _cross(g[0], y[1]), _cross(g[0], y[0]) + _cross(g[1], y[1])
 

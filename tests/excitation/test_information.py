@@ -58,9 +58,7 @@ def test_its_gradient_is_that_of_differences(case):
 
     h = 1e-7
     expected = (value(motion + h * d) - value(motion - h * d)) / (2 * h)
-    found = sum(
-        np.sum(g * y) for g, y in zip(information.pull(rows, weights), d, strict=True)
-    )
+    found = sum(np.sum(g * y) for g, y in zip(information.pull(rows, weights), d, strict=True))
     assert found == pytest.approx(expected, rel=1e-5)
 
 
