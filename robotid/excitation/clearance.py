@@ -167,7 +167,9 @@ class Clearance:
         q = rng.uniform(low, high, (_TRIED, len(low)))
         near = self.near(self.poses(q), self.least + _APART, self.everything)
         distance = near.distance
+        is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
         always: Array = (distance < self.least).mean(axis=1) > _MADE_TO
+        always &= is_link[self.pairs].all(axis=1)
         names = self.named
         self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
         likely = distance.min(axis=1, initial=np.inf) < self.least + _APART

@@ -231,7 +231,7 @@ class Designer:
         )
 
     def _clear(self, C: Array) -> tuple[Array, Contact | None]:
-        """Return a motion scaled down until it is clear between its instants, and where it is least.
+        """Return a motion scaled down until it is clear between its instants, too, and how far.
 
         Raises:
             NotConvergedError: If it is not clear at nine tenths of its size.
@@ -295,7 +295,7 @@ class Designer:
         value, by_F = criterion(self.name, self.matrix(rows))
         used = self.limits.used(q, v, a, jerk, torque)
         cost, pushed = multipliers.of_limits(used)
-        by_value = pushed * 2.0 * used / self.limits.sizes[:, None]
+        by_value = pushed * 2.0 * used / (1.0 - _SPARE) ** 2 / self.limits.sizes[:, None]
         by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
         by_v = by_v + by_power * torque
         by_torque = by_torque + by_power * v
@@ -469,11 +469,11 @@ class _Multipliers:
         self._distances: Array | float = 0.0
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
-        """Return the cost of limits and its slope by used^2, shape (6, N, n)."""
+        """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
         return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self._limits)
 
     def of_distances(self, distance: Array, least: float) -> tuple[float, Array]:
-        """Return the cost of distances and its slope by -distance / 5 cm, shape (pairs, N)."""
+        """Return the cost of distances and its slope by what they are short, shape (pairs, N)."""
         return self._cost((least + 2 * _SPARE_WAY - distance) / _SOFT, self._distances)
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
