@@ -16,6 +16,7 @@ from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.design import Design, Designer
 from robotid.excitation.files import write_motion
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.excitation.routes import design_stands, design_sweeps
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
-_BASES = ("fourier", "bspline")
+_KINDS = ("fourier", "bspline", "sweeps", "stands")
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,9 @@ class MotionSettings:
     """What motion is wanted.
 
     Attributes:
-        kind: "fourier" or "bspline".
-        duration: Its length [s].
+        kind: "fourier" or "bspline"; "sweeps", slow ones of joint after joint, which show friction;
+            "stands", which show gravity.
+        duration: Its length [s]; that of sweeps and stands is what they take.
         harmonics: Harmonics of a Fourier series; pieces of B-splines are twice as many.
         criterion: "D", "A", "E" or "condition", as of ``criterion``.
         share: How much of the URDF's limits is used, more than 0 and at most 1.
@@ -67,8 +69,8 @@ class MotionSettings:
     points: float = 100.0
 
     def __post_init__(self) -> None:
-        if self.kind not in _BASES:
-            raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_BASES)}")
+        if self.kind not in _KINDS:
+            raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_KINDS)}")
         for name in ("duration", "starts", "seconds", "points"):
             value = getattr(self, name)
             if not value > 0:
@@ -80,9 +82,9 @@ class MotionSettings:
         Raises:
             SettingsError: If there are too few.
         """
-        if self.kind == "fourier":
-            return FourierBasis(self.duration, self.harmonics)
-        return BSplineBasis(self.duration, 2 * self.harmonics)
+        if self.kind == "bspline":
+            return BSplineBasis(self.duration, 2 * self.harmonics)
+        return FourierBasis(self.duration, self.harmonics)
 
 
 def stated_boxes(words: Sequence[str]) -> tuple[Box, ...]:
@@ -160,13 +162,16 @@ def design_motion(
         if progress is not None:
             progress("designing", start, settings.starts, "starts")
 
-    design = designer.design(
-        np.random.default_rng(settings.seed),
-        starts=settings.starts,
-        seconds=settings.seconds,
-        progress=told,
-    )
-    write_motion(design.motion, model.joints, basis.duration, settings.points, target)
+    rng = np.random.default_rng(settings.seed)
+    if settings.kind == "sweeps":
+        design = design_sweeps(designer, rng)
+    elif settings.kind == "stands":
+        design = design_stands(designer, rng)
+    else:
+        design = designer.design(
+            rng, starts=settings.starts, seconds=settings.seconds, progress=told
+        )
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
     return _content(model, design, limits, clearance, settings)
 
 
@@ -202,7 +207,8 @@ def _content(
         "starts": design.starts,
         "converged": bool(design.is_converged),
         "feasible": True,
-        "duration": settings.duration,
+        "kind": settings.kind,
+        "duration": design.duration,
         "points": settings.points,
         "limits": margins,
         "history": [list(entry) for entry in design.history],

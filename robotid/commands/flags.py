@@ -197,7 +197,8 @@ def _add_excite(parser: argparse.ArgumentParser) -> None:
     words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
     add("--out", metavar="FILE", required=True, help=words)
     add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
-    add("--kind", choices=("fourier", "bspline"), help="default: fourier")
+    words = "sweeps show friction, stands gravity, the others all; default: fourier"
+    add("--kind", choices=("fourier", "bspline", "sweeps", "stands"), help=words)
     add("--duration", metavar="S", type=float, help="default: 10")
     add("--harmonics", metavar="N", type=int, help="of the series; default: 5")
     words = "of the information: D (volume), A (mean), E (weakest) or condition; default: D"

@@ -235,12 +235,15 @@ def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> s
 
 
 def _print_motion(content: dict[str, Any]) -> None:
-    settled = "settled" if content["converged"] else "not settled: more --starts or no --seconds"
+    done = f"in {content['seconds']:.1f} s"
+    if content["starts"]:
+        settled = "" if content["converged"] else "not "
+        done = f"{content['starts']} starts {done}, {settled}settled"
     condition = content["condition_number"]
     say(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
         f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
-        f" {content['starts']} starts in {content['seconds']:.1f} s, {settled}"
+        f" {done}"
     )
     print("\nwhat it leaves of each limit, least where")
     for name, margin in content["limits"].items():

@@ -173,7 +173,8 @@ class Clearance:
         names = self.named
         self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
         likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
-        self.pairs, kept = self.pairs[~always], likely[~always]
+        self.pairs = self.pairs[~always]
+        kept: Array = likely[~always]
         return kept
 
     @cached_property

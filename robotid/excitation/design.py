@@ -31,6 +31,7 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.robot.prior import prior_spread
+from robotid.simulation.motions import Motion
 
 __all__ = ["Design", "Designer"]
 
@@ -60,6 +61,7 @@ class Design:
 
     Attributes:
         motion: The motion.
+        duration: Its length [s].
         objective: Its criterion, the smaller the better.
         condition: Condition number of the base problem, columns in units of what the URDF leaves
             open.
@@ -72,7 +74,8 @@ class Design:
         history: Time since the beginning [s] and criterion of each better motion.
     """
 
-    motion: DesignedMotion
+    motion: Motion
+    duration: float
     objective: float
     condition: float
     used: Array
@@ -220,11 +223,43 @@ class Designer:
             C: Coefficients of a motion, shape (h, n).
         """
         C, contact = self._clear(self._feasible(C, 1.0))
-        objective, used, _, rows = self._looked_at(C)
-        low, *_, high = np.linalg.eigvalsh(self.matrix(rows) - self._known)
+        _, used, _, rows = self._looked_at(C)
+        motion = DesignedMotion(self.basis, C)
+        information = self.matrix(rows)
+        return self._weighed(motion, self.basis.duration, information, used, contact)
+
+    def examined(self, motion: Motion, duration: float, rate: float) -> Design:
+        """Return what any motion tells, and what it uses of limits other than jerk.
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+            rate: Instants per second at which it is looked at [Hz].
+        """
+        t = np.arange(round(duration * rate) + 1) / rate
+        q, v, a = motion.evaluate(t)
+        rows = self.information.rows(q, v, a)
+        used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
+        scale = np.sqrt(1.0 / rate / self.noise)[:, None, None] * self.spread[:, None]
+        flat = (scale * rows.W).swapaxes(0, 1).reshape(len(self.spread), -1)
+        contact = None
+        if self.clearance is not None:
+            contact = self.clearance.nearest(motion, duration)
+        return self._weighed(motion, duration, flat @ flat.T + self.known, used, contact)
+
+    def _weighed(
+        self,
+        motion: Motion,
+        duration: float,
+        information: Array,
+        used: Array,
+        contact: Contact | None,
+    ) -> Design:
+        low, *_, high = np.linalg.eigvalsh(information - self.known)
         return Design(
-            motion=DesignedMotion(self.basis, C),
-            objective=objective,
+            motion=motion,
+            duration=duration,
+            objective=criterion(self.name, information)[0],
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
             used=np.abs(used).max(axis=1),
             contact=contact,
@@ -250,14 +285,17 @@ class Designer:
         )
 
     @property
-    def _known(self) -> Array:
-        return np.eye(len(self.spread)) if self.given is None else self.given
+    def known(self) -> Array:
+        """Information that is there already, in units of the spread, shape (b, b)."""
+        known: Array = np.eye(len(self.spread)) if self.given is None else self.given
+        return known
 
     @cached_property
     def _scale(self) -> Array:
         """What rows are multiplied by, so that their squares are information, (n, b, 1)."""
         step = self.basis.duration / (self._functions.shape[1] - 1)
-        return np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
+        scale: Array = np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
+        return scale
 
     def matrix(self, rows: MotionRows) -> Array:
         """Return the information of a motion and what was known, in units of the spread, (b, b).
@@ -268,7 +306,7 @@ class Designer:
         n, b, N = rows.W.shape
         scaled = rows.W * self._scale
         flat = scaled.swapaxes(0, 1).reshape(b, n * N)
-        F: Array = flat @ flat.T + self._known
+        F: Array = flat @ flat.T + self.known
         return F
 
     def _looked_at(self, C: Array) -> tuple[float, Array, float, MotionRows]:
@@ -324,30 +362,48 @@ class Designer:
         """
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
-        C[0] = self._posture(rng)
+        C[0] = self.postures(rng)[0]
         return self._feasible(C, 1.0 - _SPARE)
 
-    def _posture(self, rng: np.random.Generator) -> Array:
-        """Return a posture that keeps limits and distances at rest, shape (n,)."""
-        reach = rng.uniform(-0.8, 0.8, (_TRIED, len(self.limits.middle)))
+    def postures(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
+        """Return those of random postures that keep limits and distances at rest, shape (k, n).
+
+        Args:
+            rng: Source of the postures.
+            tried: How many are tried.
+
+        Raises:
+            SettingsError: If none of them does.
+        """
+        reach = rng.uniform(-0.8, 0.8, (tried, len(self.limits.middle)))
         reach[:, self.limits.sizes[0] > 2.0] *= 0.6
         q = self.limits.middle + reach * self.limits.sizes[0]
+        kept: Array = q[self.can_rest(q)]
+        if not len(kept):
+            raise SettingsError(self._why_not(*self._at_rest(q)))
+        return kept
+
+    def can_rest(self, q: Array) -> Array:
+        """Return whether postures keep limits and distances at rest, shape (N,), bool.
+
+        Args:
+            q: Postures, shape (N, n) [rad or m].
+        """
+        used, distance = self._at_rest(q)
+        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
+        can: Array = (used.max(axis=(0, 2)) <= 1.0) & (distance >= least)
+        return can
+
+    def _at_rest(self, q: Array) -> tuple[Array, Array]:
+        """Return the shares of limits that postures use, (6, N, n), and least distances, (N,)."""
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
-        used = self.limits.used(q, still, still, still, self.information.torque(rows))
-        worst = np.abs(used).max(axis=(0, 2))
+        used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
         distance = np.full(len(q), np.inf)
         if self.clearance is not None:
             near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
             distance = near.distance.min(axis=0, initial=np.inf)
-            is_clear = distance >= self.clearance.least + _SPARE_WAY
-        else:
-            is_clear = np.ones(len(q), dtype=bool)
-        good = np.flatnonzero((worst < 1.0 - _SPARE) & is_clear)
-        if not len(good):
-            raise SettingsError(self._why_not(np.abs(used), distance))
-        chosen: Array = q[good[0]]
-        return chosen
+        return used, distance
 
     def _why_not(self, used: Array, distance: Array) -> str:
         """Return which limit leaves no posture, and by how much."""
@@ -355,7 +411,7 @@ class Designer:
         kind, joint = np.unravel_index(int(np.argmax(least)), least.shape)
         names = self.information.model.joints
         tried = f"of {used.shape[1]} random postures none can be held at rest"
-        if least[kind, joint] >= 1.0 - _SPARE:
+        if least[kind, joint] > 1.0:
             return (
                 f"{tried}: {names[joint]} needs {100 * least[kind, joint]:.0f} % of its "
                 f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
