@@ -150,14 +150,7 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_verbose(parser)
             _add_serve(parser, "show it in the browser while it runs, in true time")
         case "replay":
-            _add_robot_and_log(parser)
-            results = "result.json, track.json or their folder"
-            add("results", nargs="*", metavar="RESULT", help=results)
-            add("--html", metavar="FILE", help="page to write; default: replay.html")
-            add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
-            _add_serve(parser, "track the log again, in true time, and show it as it goes")
-            group = parser.add_argument_group("the log, unless a RESULT says it")
-            _add_settings(group, _ONLINE)
+            _add_replay(parser)
         case "validate":
             add("result", metavar="RESULT.json")
             add("logs", nargs="+", metavar="LOG")
@@ -193,6 +186,18 @@ def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
         add("--joints", metavar="A,B,...", help="joints to write; default: all")
         _add_settings(parser, _SOURCE)
     _add_json(parser)
+
+
+def _add_replay(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _add_robot_and_log(parser)
+    results = "result.json, track.json or their folder"
+    add("results", nargs="*", metavar="RESULT", help=results)
+    add("--html", metavar="FILE", help="page to write; default: replay.html")
+    add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+    _add_serve(parser, "track the log again, in true time, and show it as it goes")
+    group = parser.add_argument_group("the log, unless a RESULT says it")
+    _add_settings(group, _ONLINE)
 
 
 def _add_preview(parser: argparse.ArgumentParser) -> None:
