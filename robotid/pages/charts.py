@@ -37,6 +37,7 @@ class Series:
             are stacked, what is positive upwards and what is negative downwards.
         half: Half width of a band about a line, of error bars about dots and bars, shape (N,).
         is_faint: Whether it stands back behind the others.
+        is_hidden: Whether it is seen only when its key in the legend is pressed.
     """
 
     label: str
@@ -45,6 +46,7 @@ class Series:
     kind: str = "line"
     half: Array | None = None
     is_faint: bool = False
+    is_hidden: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +123,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
                 "tone": s.tone,
                 "kind": s.kind,
                 "faint": s.is_faint,
+                "hidden": s.is_hidden,
                 "y": _packed(y[rows], is_log=is_log),
                 "half": None if half is None else _packed(half[rows]),
             }
@@ -299,6 +302,7 @@ def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
 
 def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str:
     """Return the chart as an ``<svg>`` of a few points."""
+    series = [item for item in series if not item[0].is_hidden]
     covers = _covers(series)
     legend, height = _legend(chart, _TOP + chart.height + _BOTTOM + _slant(chart.x_names))
     logs = ["x" in chart.logarithmic, "y" in chart.logarithmic]
@@ -366,7 +370,7 @@ def _legend(chart: Chart, height: float) -> tuple[str, float]:
     """
     parts = [f'<text x="4" y="12">{escape(chart.y_label)}</text>']
     place, down = 4 + _LETTER * (len(chart.y_label) + 3), 12.0
-    for series in chart.series:
+    for series in (s for s in chart.series if not s.is_hidden):
         width = 16 + _LETTER * (len(series.label) + 3)
         if place + width > _WIDTH + 3 * _LETTER:
             place, down = float(_LEFT), height + 8

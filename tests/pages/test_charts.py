@@ -69,6 +69,17 @@ def test_what_the_page_holds_is_the_data_to_a_65000th_of_their_range(torque, lin
     assert len(chart_html(torque, "")) < 45_000
 
 
+def test_a_hidden_series_is_in_the_data_alone():
+    wild = Series("wild", np.array([0.0, 900.0]), "urdf", is_hidden=True)
+    series = (wild, Series("tame", np.array([0.0, 1.0]), "text"))
+    html = chart_html(Chart("c", np.arange(2.0), series, "x", "y"), "")
+    assert [s["hidden"] for s in charts(html)[0]["series"]] == [True, False]
+    svg = html.partition("</svg>")[0]
+    assert "wild" not in svg
+    assert "tame" in svg
+    assert "900" not in svg  # nor is the axis made for it
+
+
 def test_a_thinned_line_keeps_its_extremes_its_ends_and_both_sides_of_its_breaks(rng):
     y = rng.normal(size=10_000)
     y[[1234, 7777]] = [-40.0, 50.0]
