@@ -21,6 +21,7 @@ from robotid.commands.flags import (
     add_flags,
     job_from_flags,
     refuse_log_flags,
+    simulation_from_flags,
     source_settings,
     source_words,
     stated_noise,
@@ -269,13 +270,15 @@ def _payload(options: argparse.Namespace) -> None:
 
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT says how its logs are read")
-    found = measure_payload(
-        job_from_flags(options),
-        options.reference,
-        links=options.link,
-        masses=options.mass,
-        find_gains=options.gains,
-    )
+    with _progress(options) as progress:
+        found = measure_payload(
+            job_from_flags(options),
+            options.reference,
+            links=options.link,
+            masses=options.mass,
+            find_gains=options.gains,
+            progress=progress,
+        )
     _show(found, options, "payload")
 
 
@@ -308,6 +311,19 @@ def _export(options: argparse.Namespace) -> None:
     _show(export_result(options.result, options.format, options.out), options, "export")
 
 
+def _simulate(options: argparse.Namespace) -> None:
+    from robotid.commands.simulate import SimulatedFiles, simulate_log
+
+    job, settings = simulation_from_flags(options)
+    urdf = Path(options.urdf) if options.urdf else None
+    files = SimulatedFiles(Path(options.motion), Path(options.out), urdf, options.cutoff)
+    with terminal_progress(quiet=options.json) as progress:
+        content = simulate_log(job, files, settings, progress=progress)
+    _show(content, options, "simulate")
+    if not options.json:
+        print_files("", content["outputs"])
+
+
 def _convert(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
@@ -335,6 +351,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "report": ("write the report of a result again, from its inputs", _report),
     "compare": ("several results side by side", _compare),
     "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
+    "simulate": ("a log of a motion by a robot whose truth is known", _simulate),
     "convert": (
         "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names",
         _convert,

@@ -11,8 +11,16 @@ from robotid.findings import listed
 
 if TYPE_CHECKING:
     from robotid.commands.job import Job
+    from robotid.simulation.settings import Simulation
 
-__all__ = ["add_flags", "job_from_flags", "refuse_log_flags", "source_settings", "source_words"]
+__all__ = [
+    "add_flags",
+    "job_from_flags",
+    "refuse_log_flags",
+    "simulation_from_flags",
+    "source_settings",
+    "source_words",
+]
 
 
 def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -77,6 +85,19 @@ _ONLINE = tuple(
     or (flag in _LOG and not key.startswith("signals."))
 )
 _SOURCE = ("--topic", "--effort", "--stamp")
+#: Flags that say which robot it is, and how a table is read.
+_ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
+#: Key of the file of a plant that each flag of "simulate" states.
+_SIMULATION: Mapping[str, tuple[str, dict[str, Any]]] = {
+    "--seed": ("seed", {"metavar": "N", "type": int}),
+    "--rate": ("rate", {"metavar": "HZ", "type": float}),
+    "--duration": ("duration", {"metavar": "S", "type": float}),
+    "--perturb": ("truth.inertials", {"metavar": "SIZE", "type": float}),
+    "--controller": ("controller.kind", {"metavar": "KIND"}),
+    "--torque-noise": ("sensors.noise.tau", {"metavar": "SHARE", "type": float}),
+    "--limits": ("actuator.effort", {"metavar": "TIMES", "type": float}),
+    "--payload": ("payload.mass", {"metavar": "KG", "type": float}),
+}
 #: Flags that a motion without torques has a use for.
 _MOTION = tuple(
     flag
@@ -150,6 +171,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             add("results", nargs="+", metavar="RESULT.json")
             add("--out", metavar="FILE.html", help="page to write")
             _add_json(parser)
+        case "simulate":
+            _add_simulation(parser)
         case "export" | "convert":
             _add_conversion(parser, command)
 
@@ -181,9 +204,33 @@ def _add_preview(parser: argparse.ArgumentParser) -> None:
     words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
     _add_json(parser)
+    words = "print standard parameters and whole expressions, too; say on stderr what is chosen"
+    parser.add_argument("--verbose", action="store_true", help=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
     flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help="as of identify")
     _add_settings(flags, _MOTION)
+
+
+def _add_simulation(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="URDF")
+    add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
+    add("--out", required=True, metavar="LOG", help="log to write; its truth goes beside it")
+    add("--urdf", metavar="FILE", help="URDF of the true robot to write, too")
+    words = "TOML file of the true robot, its controller, actuators, sensors and payload"
+    add("--plant", metavar="FILE", help=words)
+    add("--cutoff", type=float, metavar="HZ", help="smooth MOTION, a recorded one, to this")
+    _add_json(parser)
+    group = parser.add_argument_group("instead of, or over, the same in --plant")
+    for flag, (key, about) in _SIMULATION.items():
+        group.add_argument(flag, **about, help=_simulation_words(key))
+    _add_settings(parser.add_argument_group("the robot"), _ROBOT)
+
+
+def _simulation_words(key: str) -> str:
+    from robotid.simulation.settings import Simulation
+
+    return Simulation.paths()[key].words
 
 
 def _add_payload(parser: argparse.ArgumentParser) -> None:
@@ -266,6 +313,35 @@ def _add_work(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--scheduler", metavar="ADDRESS", help=words)
     words = "go on from where an interrupted run in --out ended"
     flags.add_argument("--resume", action="store_true", help=words)
+
+
+def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation]":
+    """Return the robot and the settings of a simulation.
+
+    Args:
+        options: The flags of the command "simulate".
+
+    Raises:
+        SettingsError: If the file of the plant cannot be used, or a flag is not usable.
+    """
+    from robotid.commands.job import job_from_settings
+    from robotid.simulation.settings import read_simulation
+
+    given: dict[str, Any] = {}
+    for flag, (path, _) in _SIMULATION.items():
+        value = getattr(options, flag[2:].replace("-", "_"))
+        if value is not None:
+            *tables, key = path.split(".")
+            table_in(given, tables)[key] = value
+    settings, drives = read_simulation(options.plant, given)
+    for joint, entries in drives.items():
+        if named := [entry for entry in entries if isinstance(entry, str)]:
+            raise SettingsError(
+                f"{options.plant}: drives.{joint} has {named[0]!r}; a plant states its terms with "
+                "their shapes, as { term = 'Stribeck', speed = 0.1 }"
+            )
+    table = {"urdf": options.source, "drives": drives, **_stated(options, _ROBOT)}
+    return job_from_settings(table, options.plant or "command line", Path()), settings
 
 
 def stated_noise(options: argparse.Namespace) -> dict[str, float]:

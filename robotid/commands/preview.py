@@ -56,9 +56,9 @@ def preview_job(
     result = load_result(given).content
     model = stated_model(result, job.model())
     (logs,) = survey_logs(job, model, fitted)
-    run = Run.of(
-        Recordings(model, structural_mapping(model), logs), stated_parameters(result, model)
-    )
+    details = result["consistency"].get("fit", {})
+    recordings = Recordings(model, structural_mapping(model), logs)
+    run = Run.of(recordings, stated_parameters(result, model), details)
     hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
     if not any(file_sha256(entry.path) in hashes for entry in job.identification):
         motions = _motions(job, model, job.identification)
