@@ -27,14 +27,7 @@ def main():
         with visit(browser, folder / "report.html", size=(1000, 870)) as seen:
             seen.page.screenshot(path=HERE / "report.png")
         with visit(browser, folder / "replay.html", size=(1200, 640)) as seen:
-            seen.page.wait_for_timeout(3000)  # [ms] the robot is on its way
-            for body in ("wrist_1", "wrist_2", "wrist_3"):  # their ellipsoids hide the robot
-                for box in seen.page.get_by_label(f": {body}_link").all():
-                    box.uncheck()
-            seen.page.mouse.move(400, 300)
-            for _ in range(8):
-                seen.page.mouse.wheel(0, -100)  # nearer
-                seen.page.wait_for_timeout(100)
+            seen.page.evaluate("replay.pause(); replay.seek(6); replay.pick(2)")
             seen.page.wait_for_timeout(1000)
             seen.page.screenshot(path=HERE / "replay.png")
     for picture in HERE.glob("*.png"):

@@ -270,13 +270,15 @@ def _payload(options: argparse.Namespace) -> None:
 
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT says how its logs are read")
-    found = measure_payload(
-        job_from_flags(options),
-        options.reference,
-        links=options.link,
-        masses=options.mass,
-        find_gains=options.gains,
-    )
+    with _progress(options) as progress:
+        found = measure_payload(
+            job_from_flags(options),
+            options.reference,
+            links=options.link,
+            masses=options.mass,
+            find_gains=options.gains,
+            progress=progress,
+        )
     _show(found, options, "payload")
 
 

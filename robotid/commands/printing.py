@@ -133,10 +133,9 @@ def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
         f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
         f"total mass {before:.2f} -> {after:.2f} kg"
     )
-    fitted = [_recording(entry) for entry in result["inputs"] if entry["role"] == "identification"]
+    fitted, kept = (_recordings(result["inputs"], of) for of in ("identification", "validation"))
     say(f"\nfitted: {', '.join(fitted)}", "  ")
     print("\n".join(error_lines(result["identification"], wls["identification"], width)))
-    kept = [_recording(entry) for entry in result["inputs"] if entry["role"] == "validation"]
     for name, ours, theirs in zip(kept, result["validation"], wls["validation"], strict=True):
         say(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, theirs, width)))
@@ -154,9 +153,21 @@ def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
     _print_verdict(verdict)
 
 
-def _recording(entry: Mapping[str, Any]) -> str:
-    """Return the name of a recording's file and the stretch of it."""
-    return f"{Path(entry['path']).name or 'log'} {entry['start']:.4g}-{entry['end']:.4g} s"
+def _recordings(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
+    """Return the file of each recording of a role, with its path if others have its name."""
+    paths = {Path(entry["path"]) for entry in inputs}
+    names = [path.name for path in paths]
+    files = {str(path): path.name if names.count(path.name) == 1 else str(path) for path in paths}
+    return [
+        _window(files[str(Path(entry["path"]))] or "log", entry)
+        for entry in inputs
+        if entry["role"] == role
+    ]
+
+
+def _window(name: str, entry: Mapping[str, Any]) -> str:
+    """Return the name of a recording with the stretch of its log."""
+    return f"{name} {entry['start']:.4g}-{entry['end']:.4g} s"
 
 
 def _worst(result: Mapping[str, Any]) -> str:
@@ -246,12 +257,12 @@ def _print_comparison(content: dict[str, Any]) -> None:
     for remark in content["remarks"]:
         say(f"- {remark}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
-    tables = {f"not fitted: {_recording(e | {'path': e['log']})}, error %": e["per_joint"]
-              for e in content["validation"]}  # fmt: skip
-    for title, per_joint in (
-        *tables.items(),
-        (f"fitted recordings of each, error %{alike}", content["fitted"]),
-    ):
+    tables = [
+        (f"not fitted: {_window(entry['name'], entry)}, error %", entry["per_joint"])
+        for entry in content["validation"]
+    ]
+    tables.append((f"fitted recordings of each, error %{alike}", content["fitted"]))
+    for title, per_joint in tables:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
         say(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
@@ -262,14 +273,14 @@ def _print_comparison(content: dict[str, Any]) -> None:
     for row in content["inputs"]:
         if not all(row["in"]):
             read = listed(label for label, has in zip(labels, row["in"], strict=True) if has)
-            window = f" {row['start']:.4g}-{row['end']:.4g} s" if row["start"] is not None else ""
-            say(f"only {read} read '{row['path']}'{window} ({row['role']})", "  ")
+            name = row["path"] if row["start"] is None else _window(row["path"], row)
+            say(f"only {read} read {name} ({row['role']})", "  ")
 
 
 def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
     say(
         "\nbase parameters to the second digit of their standard errors; last columns: difference "
-        f"to {labels[0]} over the combined standard error"
+        f"to {labels[0]} over the combined standard error, the largest first"
     )
     rows = []
     for entry in content["base_parameters"]:

@@ -126,7 +126,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     if ghost is not None:
         shadow = job.read(LogEntry(Path(ghost)), model, is_motion=True)
         second = (Path(ghost).name, shadow.t, shadow.q)
-    torques = replace(_torques(job, motion, robots), noise=_noise(findings, model))
+    torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     shown, q = model, motion.q
     base = None if second else _base_poses(job, entry, motion)
@@ -227,13 +227,15 @@ def _track(path: Path) -> Mapping[str, Any] | None:
     return content
 
 
-def _torques(job: Job, log: Log, robots: Mapping[str, RobotModel]) -> Torques:
+def _torques(job: Job, log: Log, model: RobotModel, robots: Mapping[str, RobotModel]) -> Torques:
     """Return measured torques, and those of robots loaded by their own parameters."""
     shown, motion = {}, None
     for label, robot in robots.items():
         rows = hold_log(robot, log, job.signals).whole
         motion = rows.trajectory
         shown[label] = _sure(predict(robot, [robot.carried_by], motion)[0], rows.mask)
+    if motion is not None:
+        shown["URDF"] = predict(model, [model.standard_parameters()], motion)[0]
     return Torques(log.t, log.tau) if motion is None else Torques(motion.t, motion.tau, shown)
 
 

@@ -12,19 +12,10 @@ from robotid.pages.html import asset, scaffold
 __all__ = ["page"]
 
 _ASSETS = Path(__file__).parent / "assets"
-_SCRIPTS = [
-    "data",
-    "scene",
-    "masses",
-    "arcs",
-    "plots",
-    "clock",
-    "strip",
-    "picking",
-    "controls",
-    "live",
-    "start",
-]
+_SCRIPTS = (
+    *("data", "scene", "masses", "arcs", "strip", "plots"),
+    *("clock", "picking", "controls", "live", "start"),
+)
 
 
 def page(data: Mapping[str, Any]) -> str:
@@ -42,12 +33,13 @@ def page(data: Mapping[str, Any]) -> str:
     return scaffold(
         title,
         '<link rel="icon" href="data:,">\n'
-        f"<style>{asset('uPlot.min.css')}\n/*tones*/{_asset('replay.css')}</style>\n",
+        f"<style>{asset('uPlot.min.css')}\n/*tones*/{asset('charts.css')}"
+        f"{_asset('replay.css')}</style>\n",
         f'<header><h1>{escape(title)}</h1>{notes}<p id="state" role="status"></p></header>\n'
         f"{_BODY}\n"
         f'<script type="application/json" id="data">{text}</script>\n'
         f"<script>{_viewer()}</script>\n<script>{asset('uPlot.iife.min.js')}</script>\n"
-        f"<script>{_script()}</script>\n",
+        f"<script>{asset('charts.js')}</script>\n<script>{_script()}</script>\n",
         policy=policy,
     )
 
@@ -78,20 +70,21 @@ _OPTIONS = "".join(
 )
 _BODY = f"""\
 <footer aria-label="playback">
+<div id="bar" role="group" aria-label="playback">
+<div><button type="button" id="play">Pause</button>
+<button type="button" id="live" aria-pressed="false" hidden>Follow</button></div>
+<div id="track"><input type="range" id="time" step="any" aria-label="time">
+<div id="now"></div></div>
+<div id="pace"><output id="clock"></output>
+<select id="speed" aria-label="speed">{_OPTIONS}</select>
+<label><input type="checkbox" id="loop" checked> loop</label></div>
+</div>
 <div id="strip" hidden>
 <div id="joints"></div>
 <div id="sheets"><canvas id="sheet" tabindex="0" role="img"
  aria-label="residual of each joint over time; up and down pick a joint"></canvas></div>
 <p class="quiet">Residual, <span class="ramp"></span> from 0 to <span id="full"></span>;
 <span class="hatched"></span> at rest, not used, or no samples. <output id="told"></output></p>
-</div>
-<div id="bar" role="group" aria-label="playback">
-<div><button type="button" id="play">Pause</button>
-<button type="button" id="live" aria-pressed="false" hidden>Follow</button></div>
-<div id="track"><input type="range" id="time" step="any" aria-label="time"><div id="now"></div></div>
-<div id="pace"><output id="clock"></output>
-<select id="speed" aria-label="speed">{_OPTIONS}</select>
-<label><input type="checkbox" id="loop" checked> loop</label></div>
 </div>
 </footer>
 <main aria-label="3-D view">

@@ -49,8 +49,8 @@ def test_a_log_alone_plays_with_its_torques(folder, capsys):
 
 def test_a_result_predicts_and_shows_masses_before_and_after(folder):
     _, data = run(folder, folder / "log.csv", folder / "out")
-    assert data["torques"]["labels"] == ["measured", "identified"]
-    measured, predicted = np.split(data["torques"]["values"], 2, axis=1)
+    assert data["torques"]["labels"] == ["measured", "identified", "URDF"]
+    measured, predicted, _ = np.split(data["torques"]["values"], 3, axis=1)
     known = np.isfinite(predicted)
     assert known.mean() > 0.8
     # the motion is exact and the fit explains it, but for what the filter takes
@@ -64,10 +64,22 @@ def test_a_result_predicts_and_shows_masses_before_and_after(folder):
         assert body["mass"] == pytest.approx(stated[f"{body['name']}.m"])
 
 
+def test_residuals_are_compared_to_those_of_the_identification(folder):
+    _, data = run(folder, folder / "log.csv", folder / "out")
+    result = json.loads((folder / "out" / "result.json").read_text())
+    fitted = result["identification"]["per_joint"]
+    scale = data["torques"]["scale"]
+    assert scale["unit"] == "the noise"
+    assert scale["of"] == [fitted[joint]["rmse"] for joint in result["joints"]]
+    # the log is that of the identification: its residual is the noise
+    strip = np.where(data["torques"]["strip"] < 65_000, data["torques"]["strip"] / 100, np.nan)
+    assert np.sqrt(np.nanmean(strip**2, axis=0)) == pytest.approx(np.ones(6), abs=0.15)
+
+
 def test_two_results_are_called_by_their_folders(folder):
     out = folder / "out" / "result.json"
     _, data = run(folder, folder / "log.csv", out, folder / "out")
-    assert data["torques"]["labels"] == ["measured", "out", "out 2"]
+    assert data["torques"]["labels"] == ["measured", "out", "out 2", "URDF"]
     assert [m["label"] for m in data["masses"]] == ["URDF", "out", "out 2"]
 
 
@@ -103,7 +115,11 @@ def test_a_joint_that_stands_still_has_no_prediction(folder):
     torques = data["torques"]
     rest = (torques["t"] > 16.0) & (torques["t"] < 17.0)
     assert np.isfinite(torques["values"][rest, :6]).all()
-    assert np.isnan(torques["values"][rest, 6:]).all()
+    assert np.isnan(torques["values"][rest, 6:12]).all()
+    strip = torques["strip"]  # of 18 s
+    bins = len(strip)
+    assert (strip[16 * bins // 18 + 1 : 17 * bins // 18] == 65_534).all()
+    assert (strip[5 * bins // 18 : 10 * bins // 18] < 65_000).mean() > 0.8
 
 
 def test_torque_that_the_result_does_not_explain_is_marked(folder):
@@ -181,3 +197,42 @@ def test_a_result_of_another_robot_is_refused(folder, capsys):
     assert main([*words, "--html", str(folder / "p.html")]) == 1
     assert "panda" in capsys.readouterr().err
     assert not (folder / "p.html").exists()
+
+
+def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
+    urdf = example_urdf("solo12.urdf")
+    model = RobotModel.from_urdf(urdf)
+    t = np.arange(300) / 100.0
+    q = 0.2 * np.sin(t[:, None] + np.arange(12))
+    yaw = 3.0 * t  # more than one turn
+    base = np.column_stack(
+        [0.5 * t, -0.2 * t, 0.3 + 0 * t, 0 * t, 0 * t, np.sin(yaw / 2), np.cos(yaw / 2)]
+    )
+    base[150:, 3:] *= -1  # the same turns
+    names = ["base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"]
+
+    def play(table, header):
+        path = tmp_path / "log.csv"
+        np.savetxt(path, table, delimiter=",", header=",".join(header), comments="")
+        code = main(["replay", str(urdf), str(path), "--html", str(tmp_path / "r.html")])
+        return shown((tmp_path / "r.html").read_text(encoding="utf-8")) if code == 0 else None
+
+    columns = ["time", *(f"q_{j}" for j in model.joints), *(f"tau_{j}" for j in model.joints)]
+    rows = np.column_stack([t, q, 0.1 * q])
+    held = play(rows, columns)
+    assert "The base is held fixed; the log does not say where it was." in held["notes"]
+    data = play(np.column_stack([rows, base]), [*columns, *names])
+    assert not any("held fixed" in note for note in data["notes"])
+    assert data["torques"]["labels"] == ["measured"]
+    assert [joint["node"] for joint in data["torques"]["joints"]] == list(range(2, 14))
+    times, moved = data["motion"]["t"], data["motion"]["q"]
+    row = np.abs(times[:, None] - t).argmin(axis=1)
+    np.testing.assert_allclose(moved[:, :3], base[row, :3], atol=1e-6)
+    np.testing.assert_allclose(moved[:, 7:], q[row], atol=1e-6)
+    overlap = np.abs((moved[:, 3:7] * base[row, 3:]).sum(axis=1))
+    np.testing.assert_allclose(overlap, 1.0, atol=1e-6)
+    assert np.linalg.norm(np.diff(moved[:, 3:7], axis=0), axis=1).max() < 0.1
+    capsys.readouterr()
+    base[:, 3:] *= 0.5
+    assert play(np.column_stack([rows, base]), [*columns, *names]) is None
+    assert "log.csv: base_qx to base_qw must be the four numbers" in capsys.readouterr().err

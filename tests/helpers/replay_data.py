@@ -17,6 +17,10 @@ def unpacked(value):
     if isinstance(value, dict) and set(value) == {"kind", "shape", "data"}:
         numbers = np.frombuffer(base64.b64decode(value["data"]), value["kind"])
         return numbers.reshape(value["shape"])
+    if isinstance(value, dict) and set(value) == {"low", "step", "codes"}:
+        codes = unpacked(value["codes"])
+        values = np.array(value["low"]) + np.array(value["step"]) * codes
+        return np.where(codes == 65_535, np.nan, values)
     if isinstance(value, dict):
         return {key: unpacked(x) for key, x in value.items()}
     return [unpacked(x) for x in value] if isinstance(value, list) else value

@@ -68,7 +68,7 @@ def test_the_page_fetches_nothing_and_cannot_be_injected(page):
     assert "default-src 'none'" in outside
     assert "<b>x</b>" not in page
     assert "<title>&lt;b&gt;x&lt;/b&gt;: replay</title>" in outside
-    assert page.count("</script>") == 4
+    assert page.count("</script>") == 5
     assert shown(page)["title"] == "<b>x</b>"
     assert "MeshCat.Viewer" in page
 
@@ -78,10 +78,10 @@ def test_text_from_files_stays_text(arm, motion):
     marks = [Mark(5.5, bad, "payload")]
     html = replay(arm, *motion, marks=marks, notes=[bad], ghost=(bad, *motion)).html
     assert "<img" not in html
-    assert html.count("</script>") == 4
+    assert html.count("</script>") == 5
     data = shown(html)
     assert (data["marks"][0]["label"], data["ghost"]["label"]) == (bad, bad)
-    assert data["marks"][0]["t"] == pytest.approx(0.5)
+    assert data["marks"][0]["t"] == pytest.approx(5.5)
 
 
 def test_keyframes_have_the_true_times_at_the_rate(page):
@@ -151,7 +151,7 @@ def test_torques_are_plotted_with_gaps_and_by_the_name_of_who_predicts(arm, moti
     assert len(holes) == 1
     assert 1.0 < data["t"][holes[0]] < 2.0
     residual = np.delete(data["values"][:, :2] - data["values"][:, 2:], holes, axis=0)
-    np.testing.assert_allclose(residual, 1.0, atol=1e-5)
+    np.testing.assert_allclose(residual, 1.0, atol=4e-4)  # steps of a 65,534th of 12 N m
 
 
 def test_every_series_is_that_of_its_joint_and_of_who_says_so(identified):
@@ -173,7 +173,8 @@ def test_every_series_is_that_of_its_joint_and_of_who_says_so(identified):
     for k, wanted in enumerate(series):
         for j in range(6):
             shown_as = found["values"][real, 6 * k + j]
-            np.testing.assert_allclose(shown_as, wanted[rows, j], rtol=1e-5, atol=1e-5)
+            step = np.ptp(wanted[:, j]) / 65_534
+            np.testing.assert_allclose(shown_as, wanted[rows, j], atol=0.51 * step + 1e-9)
     moved = data["motion"]
     rows = np.abs(moved["t"][:, None] + trajectory.t[0] - trajectory.t).argmin(axis=1)
     np.testing.assert_allclose(moved["q"], trajectory.q[rows], atol=1e-5)
@@ -206,7 +207,7 @@ def test_marks_are_told_in_order_with_their_kind(arm, motion):
     marks = [Mark(6.5, "later", "contact"), Mark(5.25, "first", "payload")]
     data = shown(replay(arm, *motion, marks=marks).html)
     told = [(mark["t"], mark["label"], mark["kind"]) for mark in data["marks"]]
-    assert told == [(0.25, "first", "payload"), (1.5, "later", "contact")]
+    assert told == [(5.25, "first", "payload"), (6.5, "later", "contact")]
 
 
 def test_a_gap_of_the_log_is_marked(arm, motion):
@@ -214,7 +215,7 @@ def test_a_gap_of_the_log_is_marked(arm, motion):
     t = np.where(t > 6.0, t + 1.0, t)
     (mark,) = shown(replay(arm, t, q).html)["marks"]
     assert (mark["kind"], mark["label"]) == ("gap", "gap of 1.01 s")
-    assert mark["t"] == pytest.approx(1.0)
+    assert mark["t"] == pytest.approx(6.0)
 
 
 def test_masses_are_told_per_link_and_label(ur5):

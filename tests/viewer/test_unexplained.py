@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.viewer.unexplained import find_unexplained
+from robotid.viewer.unexplained import find_unexplained, residual_levels
 
 T = np.arange(2000) / 100.0  # [s]
 JOINTS = ("a", "b", "c")
@@ -53,3 +53,11 @@ def test_where_nothing_is_predicted_nothing_is_unexplained(torques):
     predicted[480:580] = np.nan
     assert find_unexplained(T, tau, predicted, JOINTS) == ()
     assert find_unexplained(T, tau, np.full_like(tau, np.nan), JOINTS) == ()
+
+
+def test_levels_are_root_mean_squares_and_say_where_there_is_nothing():
+    t = np.r_[0.1, 0.3, 0.6, 0.9, 1.2, 3.0]
+    residual = np.array([[3.0, 1], [4.0, np.nan], [-1, np.nan], [1, np.nan], [2, -5], [7, 0]])
+    levels = residual_levels(np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]), t, residual)
+    wanted = [[np.sqrt(12.5), 1], [1, -1], [2, 5], [np.nan, np.nan], [7, 0]]
+    np.testing.assert_allclose(levels, wanted)

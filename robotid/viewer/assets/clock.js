@@ -31,15 +31,7 @@ function showRobot(time) {
 
 function showReadings(time) {
   const from = clock.end - clock.start || 1;
-  if (torqueTable && torqueTable.rows.length) {
-    const row = torqueTable.rows[torqueTable.before(time)];
-    torquePlots.forEach((plot, j) => plot.say(torques.labels.map((_, k) => row[k * count + j])));
-  }
-  if (bandTable && bandTable.rows.length) {
-    const row = bandTable.rows[bandTable.before(time)];
-    bandPlots.forEach((plot) => plot.say([row[plot.index]]));
-  }
-  plots.forEach((plot) => plot.move(time));
+  moveCursor(time);
   byId("now").style.left = `${(100 * (time - clock.start)) / from}%`;
   slider.value = time;
   clockText.textContent = `${digits(time)} of ${digits(clock.end)} s`;

@@ -17,11 +17,17 @@ function unpack({ kind, data: text }) {
   return kind === "<u4" ? new Uint32Array(bytes.buffer) : new Float32Array(bytes.buffer);
 }
 
+function unpackColumns({ low, step, codes }) { // numbers in steps of their column
+  const width = codes.shape[1];
+  return Float32Array.from(unpack(codes), (code, i) =>
+    (code === 65535 ? NaN : low[i % width] + step[i % width] * code));
+}
+
 class Table { // times of the log and rows of numbers; in the page times are from the start
   constructor(t, values) {
     this.t = t ? Array.from(unpack(t), (x) => data.start + x) : [];
-    const flat = values ? unpack(values) : [];
-    const width = values ? values.shape[1] : 0;
+    const flat = !values ? [] : values.codes ? unpackColumns(values) : unpack(values);
+    const width = values ? (values.codes || values).shape[1] : 0;
     this.rows = this.t.map((_, k) => Array.from(flat.subarray(k * width, (k + 1) * width)));
   }
   get end() { return this.t.length ? this.t[this.t.length - 1] : data.start; }
@@ -61,6 +67,8 @@ const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, th
 
 // ---- residuals: one scale of colour for arcs, links and the heat strip ------------------------
 
+const style = getComputedStyle(document.documentElement);
+const tone = (name) => style.getPropertyValue(`--${name}`).trim();
 const POOR = 0.5; // share of the torque's rms that is as red as it gets where no noise is known
 const UNSURE = "#8a97a5"; // of what is not predicted
 const RAMP = [[43, 131, 186], [255, 255, 191], [215, 25, 28]]; // at 0, a half and 1

@@ -21,10 +21,9 @@ function refresh() { // the charts of a live page that are in sight, a few times
   if (news) {
     measureTorques();
     placeMarks();
-    plots.forEach((plot) => { plot.stale = true; });
+    refreshCharts();
   }
   news = false;
-  plots.forEach((plot) => plot.refresh());
 }
 
 function listen() {

@@ -45,6 +45,6 @@ function showMasses() { // those asked for, and those of the link that is picked
       body.objects.forEach((object) => { object.visible = on; });
     }
   }
-  robot.joints.forEach((_, i) => robot.fade(i, seeThrough || inside.has(i) ? 0.35 : 1));
+  robot.joints.forEach((_, i) => robot.fade(i, seeThrough ? 0.35 : inside.has(i) ? 0.5 : 1));
   viewer.set_dirty();
 }

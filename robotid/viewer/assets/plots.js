@@ -1,122 +1,96 @@
 
-// ---- plots -----------------------------------------------------------------------------------
+// ---- charts: torques of each joint, parameters over time --------------------------------------
 
-const plots = [];
-const style = getComputedStyle(document.documentElement);
-const tone = (name) => style.getPropertyValue(`--${name}`).trim();
-const ink = () => tone("text");
-const rule = () => tone("line");
+const LASTS = 60; // [s] that a live page shows
+const timeLine = charts.link("time"); // the charts' cursor is the clock's
+const torqueCharts = [], bandCharts = [];
+timeLine.on((time, how) => {
+  if (how === "set" || how === "hover" || !Number.isFinite(time)) return;
+  pause();
+  seek(time);
+});
 
-function axis(extra) {
-  return { stroke: ink, grid: { stroke: rule, width: 1 }, ticks: { stroke: rule, width: 1 },
-    font: "11px system-ui, sans-serif", ...extra };
+function moveCursor(time) { // of the charts; one that follows the pointer stays there
+  const isHovered = timeLine.shown !== timeLine.time && Number.isFinite(timeLine.shown);
+  if (isHovered) timeLine.time = time; else timeLine.set(time);
 }
 
-class Plot { // one chart: columns of a table over time, the clock's cursor, click to seek
-  constructor(parent, { title, unit, series, columns, bands: filled }) {
-    this.columns = columns;
-    this.value = element("output");
-    const heading = element("h3", {}, title, this.value);
-    this.place = element("div", { role: "img", "aria-label": `${title} over time [${unit}]` });
-    this.section = element("section", { class: "plot" }, heading, this.place);
-    parent.append(this.section);
-    this.series = series;
-    this.unit = unit;
-    this.chart = new uPlot({
-      width: Math.max(this.place.clientWidth, 120), height: 118,
-      cursor: { show: false }, legend: { show: false },
-      scales: { x: { time: false, range: () => this.range() } },
-      axes: [axis({ size: 24, space: 60 }), axis({ size: 46, space: 24 })],
-      series: [{}, ...series], bands: filled, padding: [6, 8, 0, 0],
-    }, this.columns(), this.place);
-    this.cursor = element("div", { class: "cursor" });
-    this.chart.over.append(this.cursor);
-    const scrub = (event) => {
-      const left = event.clientX - this.chart.over.getBoundingClientRect().left;
-      pause();
-      seek(this.chart.posToVal(left, "x"));
-    };
-    this.chart.over.addEventListener("pointerdown", (event) => {
-      this.chart.over.setPointerCapture(event.pointerId);
-      scrub(event);
-    });
-    this.chart.over.addEventListener("pointermove", (event) => event.buttons && scrub(event));
-    new ResizeObserver(() => {
-      if (this.place.clientWidth) this.chart.setSize({ width: this.place.clientWidth, height: 118 });
-      this.move(clock.time);
-    }).observe(this.place);
-    plots.push(this);
-  }
-  range() {
-    const end = Math.max(clock.end, clock.start + 1e-3);
-    return [data.live ? Math.max(clock.start, end - 60) : clock.start, end];
-  }
-  refresh() {
-    const { top, bottom } = this.place.getBoundingClientRect();
-    if (!this.stale || bottom < 0 || top > innerHeight) return;
-    this.stale = false;
-    this.chart.setData(this.columns());
-    this.move(clock.time);
-  }
-  move(time) {
-    this.cursor.style.transform = `translateX(${this.chart.valToPos(time, "x")}px)`;
-  }
-  say(numbers) {
-    const words = numbers.map((x) => (Number.isFinite(x) ? x.toPrecision(3) : "–"));
-    this.value.textContent = `${words.join(" / ")} ${this.unit}`;
-  }
-  remove() {
-    this.chart.destroy();
-    this.section.remove();
-    plots.splice(plots.indexOf(this), 1);
-  }
+function span() { // what the charts show if they are not zoomed
+  return [data.live ? Math.max(clock.start, clock.end - LASTS) : clock.start,
+    Math.max(clock.end, clock.start + 1e-3)];
 }
 
-function column(table, index) { // numbers for a chart; gaps in time stay gaps
-  return table.rows.map((row) => (Number.isFinite(row[index]) ? row[index] : null));
+function resting(j) { // stretches of time in which a joint is not used, by the columns of the strip
+  const found = [], wide = (motion.end - data.start) / bins;
+  for (let bin = 0; bin < bins; bin++) {
+    if (levels[bin * count + j] !== UNUSED) continue;
+    const start = data.start + bin * wide, before = found[found.length - 1];
+    if (before && Math.abs(before[1] - start) < wide / 2) before[1] = start + wide;
+    else found.push([start, start + wide]);
+  }
+  return found;
 }
 
-const torquePlots = [];
+function torqueRows(j) { // measured, predicted, and what the first prediction leaves
+  const { rows } = torqueTable;
+  const ys = torques.labels.map((_, k) => rows.map((row) => row[k * count + j]));
+  if (predictions) ys.push(ys[0].map((y, k) => y - ys[1][k]));
+  return ys;
+}
+
 function drawTorques() {
-  const names = torques.labels.map((label, k) =>
-    element("span", { class: "key", style: `--key: ${COLOURS[k % COLOURS.length]}` }, label));
-  const section = element("section", {}, element("h2", {}, "Torque"), element("p", {}, ...names));
+  const tones = torques.labels.map((_, k) => ["text", "predicted"][k] || `tone-${k + 1}`);
+  const marks = data.marks.map(({ t }) => t);
+  const section = element("section", {}, element("h2", {}, "Torque"));
   byId("plots").append(section);
-  torques.joints.forEach((joint, j) => {
-    const plot = new Plot(section, {
-      title: joint.name, unit: joint.unit,
-      series: torques.labels.map((label, k) => ({ label, stroke: COLOURS[k % COLOURS.length],
-        width: 1.25, points: { show: false } })),
-      columns: () => [torqueTable.t, ...torques.labels.map((_, k) => column(torqueTable, k * count + j))],
-    });
-    torquePlots.push(plot);
+  torques.joints.forEach(({ name, unit, node }, j) => {
+    const heading = element("button", { type: "button", class: "plain" }, name);
+    heading.onclick = () => pick(node);
+    const place = element("section", { class: "plot" }, element("h3", {}, heading));
+    place.dataset.node = node;
+    section.append(place);
+    const ys = torqueRows(j), series = torques.labels.map((label, k) =>
+      ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1 }));
+    if (predictions) series.push(
+      { label: "residual", tone: "residual", kind: "line", y: ys[ys.length - 1], half: null });
+    torqueCharts.push(new charts.Chart(place, { title: `torque of ${name} over time`, link: "time",
+      x: torqueTable.t, series, x_label: "time [s]", y_label: `torque [${unit}]`,
+      spans: levels ? resting(j) : [], marks, logarithmic: "", height: 100 }));
   });
 }
 
-const bandPlots = [];
+const bandRows = (i) => [bandTable.rows.map((row) => row[i])];
+const bandHalves = (i) => [bandTable.rows.map((row) => 2 * row[bands.names.length + i])];
+
 function drawBands() {
-  const owners = [...new Set(bands.names.map((name) => name.replace(/\.[^.]*$/, "")))];
+  const ownerOf = (name) => name.replace(/\.[^.]*$/, "");
+  const owners = [...new Set(bands.names.map(ownerOf))];
   const choice = element("select", { id: "owner" }, ...owners.map((o) => element("option", {}, o)));
   const label = element("label", {}, "of ", choice);
   const section = element("section", {}, element("h2", {}, "Parameters"),
     element("p", {}, label, " with two standard errors"));
   byId("plots").append(section);
-  const width = bands.names.length;
   const draw = () => {
-    while (bandPlots.length) bandPlots.pop().remove();
+    while (bandCharts.length) bandCharts.pop().chart.remove();
     bands.names.forEach((name, i) => {
-      if (name.replace(/\.[^.]*$/, "") !== choice.value) return;
-      const error = (k) => bandTable.rows.map((row) => row[i] + k * row[width + i]);
-      bandPlots.push(new Plot(section, {
-        title: name, unit: bands.units[i],
-        series: [{ width: 0, points: { show: false } }, { width: 0, points: { show: false } },
-          { label: name, stroke: COLOURS[1], width: 1.5, points: { show: false } }],
-        columns: () => [bandTable.t, error(2), error(-2), column(bandTable, i)],
-        bands: [{ series: [1, 2], fill: "rgba(224, 103, 31, 0.22)" }],
-      }));
-      bandPlots[bandPlots.length - 1].index = i;
+      if (ownerOf(name) !== choice.value) return;
+      const series = [{ label: name, tone: "tone-2", kind: "line", y: bandRows(i)[0],
+        half: bandHalves(i)[0] }];
+      const chart = new charts.Chart(section, { title: `${name} over time`, link: "time",
+        x: bandTable.t, series, x_label: "time [s]", y_label: bands.units[i], logarithmic: "",
+        height: 100 });
+      bandCharts.push({ i, chart });
     });
   };
   choice.onchange = draw;
   draw();
+}
+
+function refreshCharts() { // of a live page, those in sight
+  timeLine.whole = span();
+  torqueCharts.forEach((chart, j) => {
+    if (timeLine.seen.has(chart)) chart.setData(torqueTable.t, torqueRows(j));
+  });
+  for (const { i, chart } of bandCharts)
+    if (timeLine.seen.has(chart)) chart.setData(bandTable.t, bandRows(i), bandHalves(i));
 }

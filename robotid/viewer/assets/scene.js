@@ -41,7 +41,7 @@ function geometry(part) {
 
 function visible(colour) { // what is almost black would be a hole in the picture
   const made = new THREE.Color(colour), hsl = made.getHSL({});
-  return hsl.l < 0.2 ? made.setHSL(hsl.h, hsl.s, 0.2) : made;
+  return hsl.l < 0.27 ? made.setHSL(hsl.h, hsl.s, 0.27) : made;
 }
 
 class Robot { // the nodes of one robot in the viewer's tree, posed by a row of a motion
@@ -117,7 +117,7 @@ const floats = data.scene.nodes.some((node) => node.kind === "free");
 // ---- light and ground ------------------------------------------------------------------------
 
 const SKIES = { light: { top: [0.93, 0.95, 0.97], low: [0.72, 0.77, 0.82], line: "#8d98a3" },
-  dark: { top: [0.13, 0.15, 0.18], low: [0.06, 0.07, 0.09], line: "#46515c" } };
+  dark: { top: [0.22, 0.25, 0.29], low: [0.11, 0.12, 0.14], line: "#46515c" } };
 const darkness = matchMedia("(prefers-color-scheme: dark)");
 const cell = data.view.cell;
 let ground = null;
@@ -125,10 +125,10 @@ let ground = null;
 function light() {
   for (const name of ["PointLightNegativeX", "PointLightPositiveX", "AmbientLight", "FillLight"])
     viewer.set_property(["Lights", name], "visible", false);
-  const sky = new THREE.HemisphereLight("#ffffff", "#8a8078", 0.55);
+  const sky = new THREE.HemisphereLight("#ffffff", "#8a8078", 0.68);
   sky.position.set(0, 0, 1);
   viewer.set_object(["Lights", "Sky"], sky);
-  for (const [name, power, ...place] of [["key", 0.5, -1, 1.2, 1], ["fill", 0.22, 1.4, 0.1, 0.6]]) {
+  for (const [name, power, ...place] of [["key", 0.58, -1, 1.2, 1], ["fill", 0.28, 1.4, 0.1, 0.6]]) {
     const lamp = new THREE.DirectionalLight("#ffffff", power); // beside the camera, wherever it is
     lamp.name = name;
     lamp.position.set(...place);

@@ -3,6 +3,7 @@
 
 slider.min = clock.start;
 slider.max = clock.end;
+timeLine.whole = span();
 if (torques) { measureTorques(); drawTorques(); }
 if (bands) drawBands();
 byId("side").hidden = false;
@@ -17,7 +18,8 @@ show();
 requestAnimationFrame(tick);
 
 // for scripts and notebooks: the clock, and the world pose of every node as 16 numbers by columns
-window.replay = { clock, seek, play, pause, pick, pace, viewer, plots, motion, arcs, masses, level, bins,
+window.replay = { clock, seek, play, pause, pick, draw, pace, viewer, motion, arcs, masses,
+  level, bins, torqueCharts, bandCharts,
   ghost, robot, get picked() { return picked && data.scene.nodes[picked].name; },
   poses: (which = robot) => {
     which.root.updateMatrixWorld(true);
