@@ -119,7 +119,11 @@ class MotionInformation:
         return np.array(values).reshape(len(own), motion.v.shape[1])
 
     def torque(self, rows: MotionRows) -> Array:
-        """Return the torque along the motion, shape (N, n) [N m or N]."""
+        """Return the torque along the motion, shape (N, n) [N m or N].
+
+        Args:
+            rows: The rows.
+        """
         torque: Array = np.einsum("rcn,c->nr", rows.W, self.beta)
         return torque
 

@@ -209,7 +209,12 @@ def _constants(pin_model: pin.Model, body: int) -> Array:
 
 
 def joint_axis(pin_model: pin.Model, body: int) -> Array:
-    """Return the axis (v, w) of a joint in its own frame, at its neutral position."""
+    """Return the axis (v, w) of a joint in its own frame, at its neutral position, shape (6,).
+
+    Args:
+        pin_model: The robot.
+        body: Number of the joint.
+    """
     data, q = pin_model.createData(), pin.neutral(pin_model)
     joint = pin_model.joints[body]
     axis: Array = pin.computeJointJacobian(pin_model, data, q, body)[:, joint.idx_v]
