@@ -33,6 +33,7 @@ PAGES = {
     "recursive": "online_tracker.md",
     "replay": "replay.md",
     "verdict": "verdicts.md",
+    "preview": "recording.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

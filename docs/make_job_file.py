@@ -1,4 +1,7 @@
-"""Write docs/job_file.md from the fields of the settings: ``python docs/make_job_file.py``."""
+"""Write the keys of job files and of plants from the fields of the settings.
+
+``python docs/make_job_file.py`` writes docs/job_file.md, and the end of docs/simulating.md.
+"""
 
 import math
 from dataclasses import MISSING
@@ -9,8 +12,11 @@ from robotid.identification.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.transmission import Transmission
 from robotid.robot.drives import AUTO, FAMILIES, TERMS
+from robotid.simulation.settings import Simulation
 
 PAGE = Path(__file__).with_name("job_file.md")
+SIMULATING = Path(__file__).with_name("simulating.md")
+KEYS = "## Keys of a plant"  # the rest of that page is written
 START = """# Job file
 
 A job file is TOML: `robotid identify job.toml`. Only `urdf` and one `[[identification]]` are needed; every other key has
@@ -102,6 +108,22 @@ def page():
     return "\n".join(parts) + "\n"
 
 
+def simulating():
+    """Return the text of the page on simulation, the keys of a plant at its end."""
+    text, tables = SIMULATING.read_text().partition(KEYS)[0], {}
+    inside = [("", Simulation)]
+    for at, kind in inside:
+        for field, key in keys(kind):
+            if hasattr(field.type, "entries"):
+                inside.append((f"{at}.{field.name}".strip("."), field.type))
+            else:
+                tables.setdefault(at, []).append(row(field.name, field, key))
+    parts = [f"{text.rstrip()}\n\n{KEYS}\n", *listing(tables.pop(""))]
+    for name, rows in tables.items():
+        parts += [f"\n### `[{name}]`\n", *listing(rows)]
+    return "\n".join(parts) + "\n"
+
+
 def keys(kind):
     """Return each field of a table with what it says of itself."""
     return [(field, key) for field, key, _ in kind.entries()]
@@ -175,3 +197,4 @@ def default_of(field):
 
 if __name__ == "__main__":
     PAGE.write_text(page(), encoding="utf-8")
+    SIMULATING.write_text(simulating(), encoding="utf-8")

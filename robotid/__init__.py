@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from robotid.export.urdf import write_urdf
     from robotid.identification.payload_fit import identify_payload
     from robotid.identification.pipeline import Identification, identify
+    from robotid.identification.previews import preview
     from robotid.identification.settings import EstimatorSettings
     from robotid.logs.data import Log, Trajectory
     from robotid.logs.read import read_log, write_log
@@ -45,6 +46,7 @@ __all__ = [
     "identify_payload",
     "inspect_urdf",
     "load_result",
+    "preview",
     "read_job",
     "read_log",
     "replay",
@@ -70,6 +72,7 @@ _HOMES = {
     "export.urdf": ["write_urdf"],
     "identification.payload_fit": ["identify_payload"],
     "identification.pipeline": ["Identification", "identify"],
+    "identification.previews": ["preview"],
     "identification.settings": ["EstimatorSettings"],
     "logs.data": ["Log", "Trajectory"],
     "logs.read": ["read_log", "write_log"],

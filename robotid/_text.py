@@ -11,6 +11,7 @@ from typing import TextIO
 __all__ = ["columns", "in_digits_of", "terminal_width", "tinted", "wrapped"]
 
 _PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
+_UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number and its unit
 _PLAIN = (-3, 6)  # powers of ten that are written without an exponent
 _GAP = 2  # blanks between columns
 _NARROWEST = 40
@@ -40,7 +41,7 @@ def tinted(text: str, word: str, tone: str, stream: TextIO) -> str:
 
 
 def wrapped(text: str, width: int | None, hang: str = "") -> str:
-    """Return text in lines no longer than a width; neither words nor paths are broken.
+    """Return text in lines no longer than a width; no word, path or number with unit is broken.
 
     Args:
         text: The text; its own lines stay, with their indentation.
@@ -50,7 +51,8 @@ def wrapped(text: str, width: int | None, hang: str = "") -> str:
     if width is None:
         return text
     lines = []
-    for line in _PATH.sub(lambda found: found.group().replace(" ", "\0"), text).split("\n"):
+    whole = _PATH.sub(lambda found: found.group().replace(" ", "\0"), _UNIT.sub("\0", text))
+    for line in whole.split("\n"):
         indent = line[: len(line) - len(line.lstrip())] + hang
         lines += textwrap.wrap(
             line,

@@ -20,7 +20,9 @@ from robotid.commands.console import (
 from robotid.commands.flags import (
     add_flags,
     job_from_flags,
+    motion_settings,
     refuse_log_flags,
+    simulation_from_flags,
     source_settings,
     source_words,
     stated_noise,
@@ -249,6 +251,17 @@ def _doctor(options: argparse.Namespace) -> int:
     return 1 if alarming(findings, job.ignore) else 0
 
 
+def _excite(options: argparse.Namespace) -> None:
+    from robotid.commands.excite import design_motion
+
+    options.logs = []
+    job = job_from_flags(options, needs_logs=False)
+    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+        settings = motion_settings(options)
+        found = design_motion(job, settings, options.out, given=options.given, progress=progress)
+    _show(found, options, "excite")
+
+
 def _preview(options: argparse.Namespace) -> None:
     from robotid.commands.preview import preview_job
 
@@ -269,13 +282,15 @@ def _payload(options: argparse.Namespace) -> None:
 
     if any(map(is_result, options.reference)):
         refuse_log_flags(options, "a RESULT says how its logs are read")
-    found = measure_payload(
-        job_from_flags(options),
-        options.reference,
-        links=options.link,
-        masses=options.mass,
-        find_gains=options.gains,
-    )
+    with _progress(options) as progress:
+        found = measure_payload(
+            job_from_flags(options),
+            options.reference,
+            links=options.link,
+            masses=options.mass,
+            find_gains=options.gains,
+            progress=progress,
+        )
     _show(found, options, "payload")
 
 
@@ -308,6 +323,19 @@ def _export(options: argparse.Namespace) -> None:
     _show(export_result(options.result, options.format, options.out), options, "export")
 
 
+def _simulate(options: argparse.Namespace) -> None:
+    from robotid.commands.simulate import SimulatedFiles, simulate_log
+
+    job, settings = simulation_from_flags(options)
+    urdf = Path(options.urdf) if options.urdf else None
+    files = SimulatedFiles(Path(options.motion), Path(options.out), urdf, options.cutoff)
+    with terminal_progress(quiet=options.json) as progress:
+        content = simulate_log(job, files, settings, progress=progress)
+    _show(content, options, "simulate")
+    if not options.json:
+        print_files("", content["outputs"])
+
+
 def _convert(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
@@ -327,6 +355,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "inspect": ("joints, parameters and faults of a URDF", _inspect),
     "identify": ("identify a robot: JOB.toml, or URDF LOG [LOG ...]", _identify),
     "track": ("run over a log as if live: history, step changes", _track),
+    "excite": ("design the motion to record, within the robot's limits", _excite),
     "preview": ("what a motion will tell, before it is recorded", _preview),
     "replay": ("play a log in the browser: robot, torques, what was identified", _replay),
     "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor),
@@ -335,6 +364,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "report": ("write the report of a result again, from its inputs", _report),
     "compare": ("several results side by side", _compare),
     "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
+    "simulate": ("a log of a motion by a robot whose truth is known", _simulate),
     "convert": (
         "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names",
         _convert,

@@ -146,8 +146,8 @@ def test_the_package_shows_its_public_api_and_nothing_else():
         "Coupling", "EstimatorSettings", "Identification", "Log", "LogSource", "LogUnits",
         "OnlineIdentifier", "RobotIdError", "RobotModel", "SignalSettings", "Trajectory",
         "__version__", "check_logs", "identify", "identify_payload", "inspect_urdf", "load_result",
-        "read_job", "read_log", "replay", "run_job", "write_log", "write_mjcf", "write_ranges",
-        "write_report", "write_sdf", "write_urdf",
+        "preview", "read_job", "read_log", "replay", "run_job", "write_log", "write_mjcf",
+        "write_ranges", "write_report", "write_sdf", "write_urdf",
     ]  # fmt: skip
     with pytest.raises(AttributeError, match="has no attribute 'OLS'"):
         _ = robotid.OLS

@@ -16,10 +16,13 @@ from helpers.paths import DOCS, ROOT
 from helpers.synthetic import exact_log, truth
 
 import robotid
+from robotid.cli import main
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.identification.settings import EstimatorSettings
+from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
+from robotid.simulation.motions import random_fourier
 
 sys.path.append(str(ROOT / "benchmarks"))
 from write_tables import BLOCK, PAGES, digest
@@ -56,6 +59,27 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
         },
     )
     assert job.identification == (LogEntry(tmp_path / "first.csv", 0.5, 30.0),)
+
+
+def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, monkeypatch, ur5):
+    page = (DOCS / "simulating.md").read_text()
+    written = runpy.run_path(str(DOCS / "make_job_file.py"))["simulating"]()
+    assert page == written, "run python docs/make_job_file.py"
+    t = np.arange(0.0, 8.001, 0.01)
+    q = random_fourier(ur5, np.random.default_rng(1), period=8.0).evaluate(t)[0]
+    columns = {f"q_{joint}": q[:, j] for j, joint in enumerate(ur5.joints)}
+    write_columns({"time": t, **columns}, tmp_path / "motion.parquet")
+    (tmp_path / "robot.urdf").write_bytes(example_urdf("ur5_robot.urdf").read_bytes())
+    toml = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
+    (tmp_path / "plant.toml").write_text(toml)
+    monkeypatch.chdir(tmp_path)
+    words = "simulate robot.urdf motion.parquet --out plant.csv --plant plant.toml --duration 0.1"
+    assert main([*words.split(), "--rate", "100"]) == 0
+    line = re.search(r"robotid (simulate .*)", page).group(1)
+    assert main([*line.split(), "--rate", "100"]) == 0
+    _, namespace = run("simulating.md")
+    error = np.abs(namespace["found"].base - namespace["beta"]) / namespace["found"].base_error
+    assert np.mean(error < 3) > 0.9
 
 
 def test_own_robot(tmp_path, monkeypatch, ur5, rng, capsys):

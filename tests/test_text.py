@@ -16,6 +16,8 @@ def test_lines_fit_and_keep_their_indentation():
 def test_neither_names_nor_quoted_paths_are_broken():
     path = "'/data of mine/long-named-folder/first run.csv'"
     assert path in wrapped(f"there is no log file {path} in it", 24)
+    assert wrapped("predicted within 5.5 % of it", 20) == "predicted within\n5.5 % of it"
+    assert wrapped("it weighs 2 or so, 1.25 s", 20) == "it weighs 2 or so,\n1.25 s"
     assert "left_shoulder-roll-joint-of-arm" in wrapped("a left_shoulder-roll-joint-of-arm", 20)
 
 

@@ -10,9 +10,18 @@ from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
 if TYPE_CHECKING:
+    from robotid.commands.excite import MotionSettings
     from robotid.commands.job import Job
+    from robotid.simulation.settings import Simulation
 
-__all__ = ["add_flags", "job_from_flags", "refuse_log_flags", "source_settings", "source_words"]
+__all__ = [
+    "add_flags",
+    "job_from_flags",
+    "refuse_log_flags",
+    "simulation_from_flags",
+    "source_settings",
+    "source_words",
+]
 
 
 def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
@@ -77,6 +86,19 @@ _ONLINE = tuple(
     or (flag in _LOG and not key.startswith("signals."))
 )
 _SOURCE = ("--topic", "--effort", "--stamp")
+#: Flags that say which robot it is, and how a table is read.
+_ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
+#: Key of the file of a plant that each flag of "simulate" states.
+_SIMULATION: Mapping[str, tuple[str, dict[str, Any]]] = {
+    "--seed": ("seed", {"metavar": "N", "type": int}),
+    "--rate": ("rate", {"metavar": "HZ", "type": float}),
+    "--duration": ("duration", {"metavar": "S", "type": float}),
+    "--perturb": ("truth.inertials", {"metavar": "SIZE", "type": float}),
+    "--controller": ("controller.kind", {"metavar": "KIND"}),
+    "--torque-noise": ("sensors.noise.tau", {"metavar": "SHARE", "type": float}),
+    "--limits": ("actuator.effort", {"metavar": "TIMES", "type": float}),
+    "--payload": ("payload.mass", {"metavar": "KG", "type": float}),
+}
 #: Flags that a motion without torques has a use for.
 _MOTION = tuple(
     flag
@@ -118,6 +140,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_job(parser)
         case "preview":
             _add_preview(parser)
+        case "excite":
+            _add_excite(parser)
         case "track":
             _add_robot_and_log(parser)
             _add_out(parser, "robotid-track")
@@ -150,6 +174,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             add("results", nargs="+", metavar="RESULT.json")
             add("--out", metavar="FILE.html", help="page to write")
             _add_json(parser)
+        case "simulate":
+            _add_simulation(parser)
         case "export" | "convert":
             _add_conversion(parser, command)
 
@@ -181,9 +207,101 @@ def _add_preview(parser: argparse.ArgumentParser) -> None:
     words = "time over which that is correlated [s]; 0: from sample to sample; default: 0.1"
     add("--correlation", metavar="S", type=float, help=words)
     _add_json(parser)
+    words = "print standard parameters and whole expressions, too; say on stderr what is chosen"
+    parser.add_argument("--verbose", action="store_true", help=words)
     flags = parser.add_argument_group("instead of a job file or a RESULT, with URDF MOTION")
     flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help="as of identify")
     _add_settings(flags, _MOTION)
+
+
+def _add_simulation(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="URDF")
+    add("motion", metavar="MOTION", help="table of time and q_<joint>, as a log or a design")
+    add("--out", required=True, metavar="LOG", help="log to write; its truth goes beside it")
+    add("--urdf", metavar="FILE", help="URDF of the true robot to write, too")
+    words = "TOML file of the true robot, its controller, actuators, sensors and payload"
+    add("--plant", metavar="FILE", help=words)
+    add("--cutoff", type=float, metavar="HZ", help="smooth MOTION, a recorded one, to this")
+    _add_json(parser)
+    group = parser.add_argument_group("instead of, or over, the same in --plant")
+    for flag, (key, about) in _SIMULATION.items():
+        group.add_argument(flag, **about, help=_simulation_words(key))
+    _add_settings(parser.add_argument_group("the robot"), _ROBOT)
+
+
+def _simulation_words(key: str) -> str:
+    from robotid.simulation.settings import Simulation
+
+    return Simulation.paths()[key].words
+
+
+def _add_excite(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="JOB.toml | URDF")
+    words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
+    add("--out", metavar="FILE", required=True, help=words)
+    add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
+    words = "sweeps show friction, stands gravity, the others all; default: fourier"
+    add("--kind", choices=("fourier", "bspline", "sweeps", "stands"), help=words)
+    add("--duration", metavar="S", type=float, help="default: 10")
+    add("--harmonics", metavar="N", type=int, help="of the series; default: 5")
+    words = "of the information: D (volume), A (mean), E (weakest) or condition; default: D"
+    add("--criterion", choices=("D", "A", "E", "condition"), help=words)
+    add("--share", metavar="X", type=float, help="of the URDF's limits; default: 0.9")
+    for name, unit in (
+        ("acceleration", "rad/s^2 or m/s^2"), ("jerk", "rad/s^3 or m/s^3"), ("power", "W"),
+    ):  # fmt: skip
+        words = f"largest {name} of a joint [{unit}]; may be given again"
+        add(f"--max-{name}", metavar="JOINT=X", action="append", default=[], help=words)
+    words = "distance kept from collisions [m], or none to leave them unlooked at; default: 0.02"
+    add("--clearance", metavar="M", help=words)
+    add("--floor", metavar="M", type=float, help="height of the floor in the root link's frame [m]")
+    words = "a box beside the robot, NAME=x0,y0,z0,x1,y1,z1 [m]; may be given again"
+    add("--box", metavar="BOX", action="append", default=[], help=words)
+    words = "standard deviation of a joint's torque [N m or N]; may be given again"
+    add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
+    add("--seed", metavar="N", type=int, help="of the random starts; default: 0")
+    add("--starts", metavar="N", type=int, help="that are followed to the end; default: 3")
+    add("--seconds", metavar="S", type=float, help="after which the best so far is taken")
+    words = "rows per second that are written; default: 100"
+    add("--points", metavar="HZ", type=float, help=words)
+    _add_json(parser)
+    _add_progress(parser)
+    flags = parser.add_argument_group("the robot, instead of a job file")
+    _add_settings(flags, _ROBOT[:3])
+
+
+def motion_settings(options: argparse.Namespace) -> "MotionSettings":
+    """Return what motion is wanted.
+
+    Args:
+        options: The flags of the command "excite".
+
+    Raises:
+        SettingsError: If a flag is not usable.
+    """
+    from robotid.commands.excite import MotionSettings, stated_boxes
+
+    plain = ("kind", "duration", "harmonics", "criterion", "share", "floor", "seed", "starts",
+             "seconds", "points")  # fmt: skip
+    stated = {name: getattr(options, name) for name in plain}
+    stated = {name: value for name, value in stated.items() if value is not None}
+    stated["noise"] = _pairs(options.noise, "--noise")
+    for name in ("acceleration", "jerk", "power"):
+        stated[name] = _pairs(getattr(options, f"max_{name}"), f"--max-{name}")
+    if options.clearance is not None:
+        stated["clearance"] = _clearance(options.clearance)
+    return MotionSettings(**stated, boxes=stated_boxes(options.box))
+
+
+def _clearance(word: str) -> float | None:
+    if word == "none":
+        return None
+    try:
+        return float(word)
+    except ValueError as error:
+        raise SettingsError(f"--clearance {word!r}: wanted metres, or none") from error
 
 
 def _add_payload(parser: argparse.ArgumentParser) -> None:
@@ -268,6 +386,35 @@ def _add_work(parser: argparse.ArgumentParser) -> None:
     flags.add_argument("--resume", action="store_true", help=words)
 
 
+def simulation_from_flags(options: argparse.Namespace) -> "tuple[Job, Simulation]":
+    """Return the robot and the settings of a simulation.
+
+    Args:
+        options: The flags of the command "simulate".
+
+    Raises:
+        SettingsError: If the file of the plant cannot be used, or a flag is not usable.
+    """
+    from robotid.commands.job import job_from_settings
+    from robotid.simulation.settings import read_simulation
+
+    given: dict[str, Any] = {}
+    for flag, (path, _) in _SIMULATION.items():
+        value = getattr(options, flag[2:].replace("-", "_"))
+        if value is not None:
+            *tables, key = path.split(".")
+            table_in(given, tables)[key] = value
+    settings, drives = read_simulation(options.plant, given)
+    for joint, entries in drives.items():
+        if named := [entry for entry in entries if isinstance(entry, str)]:
+            raise SettingsError(
+                f"{options.plant}: drives.{joint} has {named[0]!r}; a plant states its terms with "
+                "their shapes, as { term = 'Stribeck', speed = 0.1 }"
+            )
+    table = {"urdf": options.source, "drives": drives, **_stated(options, _ROBOT)}
+    return job_from_settings(table, options.plant or "command line", Path()), settings
+
+
 def stated_noise(options: argparse.Namespace) -> dict[str, float]:
     """Return the noise that was stated, by joint [N m or N].
 
@@ -289,11 +436,12 @@ def source_settings(options: argparse.Namespace) -> dict[str, Any]:
     return dict(_stated(options, _SOURCE).get("log", {}))
 
 
-def job_from_flags(options: argparse.Namespace) -> "Job":
+def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
     """Return the job that a command line names or describes.
 
     Args:
         options: The flags of the command.
+        needs_logs: Whether it is of no use without a log.
 
     Raises:
         SettingsError: If a job file is given with flags, or a flag is not usable.
@@ -308,7 +456,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
                 f"leave out {listed(options.logs or given)}"
             )
         return read_job(options.source)
-    if not options.logs:
+    if not options.logs and needs_logs:
         raise SettingsError("no log was given: robotid identify URDF LOG [LOG ...], or JOB.toml")
     kept = getattr(options, "validate", None) or ()
     table = {

@@ -254,17 +254,19 @@ class Job(Settings):
         }
         return {"*": everywhere, **stated}
 
-    def read(self, entry: LogEntry, model: "RobotModel") -> Log:
+    def read(self, entry: LogEntry, model: "RobotModel", *, is_motion: bool = False) -> Log:
         """Return one log of the job, of the model's joints in its order.
 
         Args:
             entry: Which log.
             model: The job's robot.
+            is_motion: Whether it is read for its motion alone.
 
         Raises:
             DataError: If the file cannot be used.
         """
-        return read_log(entry.path, start=entry.start, end=entry.end, **self._reading(model))
+        stated = self._reading(model) | {"start": entry.start, "end": entry.end}
+        return read_log(entry.path, is_motion=is_motion, **stated)
 
     def lay_out(
         self, entry: LogEntry, model: "RobotModel", *, is_motion: bool = False

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from robotid._typing import ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import job_of_result, survey_logs
 from robotid.exceptions import SettingsError
@@ -19,6 +20,8 @@ from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 
 __all__ = ["is_result", "measure_payload", "stated_masses"]
+
+_STAGES = ("reading logs", "fitting")
 
 
 def is_result(path: str | Path) -> bool:
@@ -61,6 +64,7 @@ def measure_payload(
     links: Sequence[str] = (),
     masses: Sequence[str] = (),
     find_gains: bool = False,
+    progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
     """Identify what hangs on links in the logs of a job and not in the references.
 
@@ -70,6 +74,7 @@ def measure_payload(
         links: Links that the payloads hang on; the last moving one if empty.
         masses: Masses that are known, as of ``stated_masses``.
         find_gains: Whether the gains that the job does not state are found, too.
+        progress: Called as its two stages begin.
 
     Returns:
         What ``robotid payload --json`` prints.
@@ -87,6 +92,7 @@ def measure_payload(
         job, entries = job_of_result(
             job, references[0], "give a log without the payload instead: --reference LOG"
         )
+    report_stage(progress, "reading logs", _STAGES)
     model = job.model()
     unknown = [joint for joint in model.joints if joint not in job.gains] if find_gains else []
     job = replace(job, gains={**job.gains, **dict.fromkeys(unknown, 1.0)})
@@ -95,6 +101,7 @@ def measure_payload(
     mapping = structural_mapping(model)
     loaded, reference = (Recordings(model, mapping, logs) for logs in surveyed)
     known = stated_masses(masses, links)
+    report_stage(progress, "fitting", _STAGES)
     found = fit_payloads(loaded, reference, links=links, masses=known, unknown_gains=unknown)
     gains = {joint: gain.value for joint, gain in found.gains.items()}
     own = _chosen_terms(replace(job, gains={**job.gains, **gains}), model, entries)

@@ -1,5 +1,6 @@
 """What the commands found as text: lines that fit the terminal, columns, a little colour."""
 
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
     from robotid.identification.advice import Step
 
 __all__ = ["print_content", "print_files", "print_steps", "say"]
+
+
+_TERM = re.compile(r" [+-] ")  # what stands before each further term of an expression
 
 
 def say(text: str, hang: str = "", tone: str = "") -> None:
@@ -42,14 +46,17 @@ def print_content(
         "paper": _print_paper,
         "inspect": partial(_print_inspection, is_verbose=is_verbose, with_base=with_base),
         "identify": partial(_print_result, is_verbose=is_verbose),
+        "preview": partial(_print_preview, is_verbose=is_verbose),
         "track": _print_track,
         "doctor": partial(_print_examination, is_verbose=is_verbose),
         "validate": _print_validation,
         "payload": _print_payload,
         "report": lambda done: print(f"written: {done['report']}"),
         "compare": _print_comparison,
+        "excite": _print_motion,
         "export": _print_export,
         "convert": _print_conversion,
+        "simulate": _print_simulation,
     }
     prints[command](content)
 
@@ -132,10 +139,9 @@ def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
         f"({structure['base_inertial']} inertial), condition number {structure['condition']:.3g}, "
         f"total mass {before:.2f} -> {after:.2f} kg"
     )
-    fitted = [_recording(entry) for entry in result["inputs"] if entry["role"] == "identification"]
+    fitted, kept = (_recordings(result["inputs"], of) for of in ("identification", "validation"))
     say(f"\nfitted: {', '.join(fitted)}", "  ")
     print("\n".join(error_lines(result["identification"], wls["identification"], width)))
-    kept = [_recording(entry) for entry in result["inputs"] if entry["role"] == "validation"]
     for name, ours, theirs in zip(kept, result["validation"], wls["validation"], strict=True):
         say(f"\nnot fitted: {name}", "  ")
         print("\n".join(error_lines(ours, theirs, width)))
@@ -153,9 +159,21 @@ def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
     _print_verdict(verdict)
 
 
-def _recording(entry: Mapping[str, Any]) -> str:
-    """Return the name of a recording's file and the stretch of it."""
-    return f"{Path(entry['path']).name or 'log'} {entry['start']:.4g}-{entry['end']:.4g} s"
+def _recordings(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
+    """Return the file of each recording of a role, with its path if others have its name."""
+    paths = {Path(entry["path"]) for entry in inputs}
+    names = [path.name for path in paths]
+    files = {str(path): path.name if names.count(path.name) == 1 else str(path) for path in paths}
+    return [
+        _window(files[str(Path(entry["path"]))] or "log", entry)
+        for entry in inputs
+        if entry["role"] == role
+    ]
+
+
+def _window(name: str, entry: Mapping[str, Any]) -> str:
+    """Return the name of a recording with the stretch of its log."""
+    return f"{name} {entry['start']:.4g}-{entry['end']:.4g} s"
 
 
 def _worst(result: Mapping[str, Any]) -> str:
@@ -233,6 +251,37 @@ def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> s
     return worst if any(ranks.get(worst, ())[:2]) else ""
 
 
+def _print_motion(content: dict[str, Any]) -> None:
+    done = f"in {content['seconds']:.1f} s"
+    if content["starts"]:
+        settled = "" if content["converged"] else "not "
+        done = f"{content['starts']} starts {done}, {settled}settled"
+    condition = content["condition_number"]
+    say(
+        f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
+        f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
+        f" {done}"
+    )
+    print("\nwhat it leaves of each limit, least where")
+    for name, margin in content["limits"].items():
+        say(f"  {name:13} {_margin(name, margin)}", 16 * " ")
+
+
+def _margin(name: str, margin: Mapping[str, Any]) -> str:
+    """Return in words what a motion leaves of a limit."""
+    if name != "collision":
+        return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
+    said = "no links or obstacles come near each other"
+    if margin["margin"] is not None:
+        apart, time = 1e3 * margin["margin"], margin["time"]
+        said = f"{apart:5.1f} mm beyond the clearance, {margin['where']} at {time:.2f} s"
+    if margin["unread"]:
+        said += f"; not looked at, since no shape can be read: {listed(margin['unread'])}"
+    if margin["left_alone"]:
+        said += f"; always nearer than that: {listed(margin['left_alone'])}"
+    return said
+
+
 def _print_comparison(content: dict[str, Any]) -> None:
     from robotid.identification.summary import cell
 
@@ -245,12 +294,12 @@ def _print_comparison(content: dict[str, Any]) -> None:
     for remark in content["remarks"]:
         say(f"- {remark}", "  ")
     alike = "" if content["fitted_alike"] else "; other recordings, not comparable"
-    tables = {f"not fitted: {_recording(e | {'path': e['log']})}, error %": e["per_joint"]
-              for e in content["validation"]}  # fmt: skip
-    for title, per_joint in (
-        *tables.items(),
-        (f"fitted recordings of each, error %{alike}", content["fitted"]),
-    ):
+    tables = [
+        (f"not fitted: {_window(entry['name'], entry)}, error %", entry["per_joint"])
+        for entry in content["validation"]
+    ]
+    tables.append((f"fitted recordings of each, error %{alike}", content["fitted"]))
+    for title, per_joint in tables:
         rows = [[e["joint"], *map(cell, e["relative_error_pct"])] for e in per_joint]
         say(f"\n{title}", "  ")
         print("\n".join(columns(["joint", *labels], rows)))
@@ -261,14 +310,14 @@ def _print_comparison(content: dict[str, Any]) -> None:
     for row in content["inputs"]:
         if not all(row["in"]):
             read = listed(label for label, has in zip(labels, row["in"], strict=True) if has)
-            window = f" {row['start']:.4g}-{row['end']:.4g} s" if row["start"] is not None else ""
-            say(f"only {read} read '{row['path']}'{window} ({row['role']})", "  ")
+            name = row["path"] if row["start"] is None else _window(row["path"], row)
+            say(f"only {read} read {name} ({row['role']})", "  ")
 
 
 def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) -> None:
     say(
         "\nbase parameters to the second digit of their standard errors; last columns: difference "
-        f"to {labels[0]} over the combined standard error"
+        f"to {labels[0]} over the combined standard error, the largest first"
     )
     rows = []
     for entry in content["base_parameters"]:
@@ -280,6 +329,75 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
         rows.append([entry["name"], *values, entry["unit"], *differences])
     heads = ["", *labels, "", *[f"{label}-{labels[0]}" for label in labels[1:]]]
     print("\n".join(columns(heads, rows, left=(0, len(labels) + 1))))
+
+
+def _print_preview(content: dict[str, Any], *, is_verbose: bool) -> None:
+    motions = [_window(Path(entry["path"]).name, entry) for entry in content["motions"]]
+    count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
+    say(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
+    say("\nbase parameters: standard errors to be expected, and the share of the plausible spread")
+    keys = {"std_error_before": "before", "gain": "gain", "achieved_std_error": "achieved",
+            "ratio": "ratio"}  # fmt: skip
+    keys = {key: head for key, head in keys.items() if key in content["base_parameters"][0]}
+    rows = []
+    for entry in content["base_parameters"]:
+        error, more = entry["std_error"], len(_TERM.findall(entry["expression"]))
+        short = f"{entry['name']} + {more} more" if more else entry["name"]
+        left = "open" if error is None else f"{100 * min(error / entry['plausible'], 1):.0f} %"
+        name = entry["expression"] if is_verbose else short
+        rows.append([name, _two_digits(error), entry["unit"], left,
+                     *(_two_digits(entry[key]) for key in keys)])  # fmt: skip
+    print("\n".join(columns(["", "+-", "", "left", *keys.values()], rows, left=(0, 2))))
+    parameters = [*content["standard_parameters"], *content["drive_parameters"]]
+    sources = [entry["source"] for entry in parameters]
+    counts = [f"{sources.count(source)} {source}" for source in dict.fromkeys(sources)]
+    say(f"\nstandard parameters, given the URDF: by {listed(counts)}", "  ")
+    if is_verbose:
+        rows = [
+            [e["name"], f"{e['prior']:.4g}", _two_digits(e["std_error"]), e["unit"], e["source"]]
+            for e in parameters
+        ]
+        print("\n".join(columns(["", "prior", "+-", "", "by"], rows, left=(0, 3, 4))))
+    else:
+        say("each of them, and what is in each base parameter: --verbose")
+    _print_expected_torque(content)
+    say(f"\n{content['words']}", "  ")
+    if "achieved" in content:
+        achieved = content["achieved"]
+        say(
+            f"\nthese logs were identified: {achieved['count']} standard errors became "
+            "{:.2f} to {:.2f} times what was expected, eight of ten; median {:.2f}".format(
+                *achieved["range_80"], achieved["median"]
+            )
+        )
+
+
+def _print_expected_torque(content: Mapping[str, Any]) -> None:
+    """Print each joint's torque with its band, and the noise that all rests on."""
+    say(
+        "\ntorque of the motion, 95 % band of a measurement about its prediction, and the part of "
+        "that which is due to the parameters"
+    )
+    rows, noises = [], content["noise"].values()
+    found = ["achieved"] if all("achieved" in noise for noise in noises) else []
+    for (joint, torque), noise in zip(content["torque"].items(), noises, strict=True):
+        cells = [f"{torque[key]:.3g}" for key in ("rms", "half_width", "of_parameters")]
+        achieved = [_two_digits(noise[key]) for key in found]
+        rows.append([joint, *cells, _two_digits(noise["std"]), *achieved, torque["unit"],
+                     f"{noise['correlation']:.2g} s", noise["is"]])  # fmt: skip
+    heads = ["joint", "torque", "band", "part", "noise", *found, "", "over", ""]
+    print("\n".join(columns(heads, rows, left=(0, len(heads) - 3, len(heads) - 1))))
+    if any(noise["is"] == "assumed" for noise in noises):
+        say(
+            "assumed noise is 1 % of the URDF's effort limit, or of the bodies' largest torque "
+            "where there is none. Standard errors are in proportion to it: state it with --noise "
+            "JOINT=N_M, or take it from a run before with --given RESULT",
+            "  ",
+        )
+
+
+def _two_digits(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"
 
 
 def _print_track(found: dict[str, Any]) -> None:
@@ -389,3 +507,19 @@ def _print_paper(result: dict[str, Any]) -> None:
     print("\nrandom motions that converged to 1e-3")
     for name, found in result["trajectories"].items():
         print(f"  {name:10} {found['converged']} of {found['runs']}")
+
+
+def _print_simulation(content: dict[str, Any]) -> None:
+    print(
+        f"{content['robot']}: {content['samples']} samples over {content['duration']:g} s, seed "
+        f"{content['settings']['seed']}"
+    )
+    head = "error of the position"
+    width = max(len(head), *(len(joint) for joint in content["joints"]))
+    print(f"\n{head:{width}}  rms, largest")
+    for joint in content["following"]:
+        line = f"{joint['joint']:{width}}  {joint['rms']:.2g}, {joint['largest']:.2g}"
+        line += f" {joint['unit']}"
+        if joint["at_limit"] > 0:
+            line += f"; at its effort limit for {100 * joint['at_limit']:.2g} % of the time"
+        print(line)

@@ -19,7 +19,6 @@ from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource
-from robotid.logs.table import prefixes
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.viewer.unexplained import find_unexplained
@@ -125,7 +124,8 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     bodies = {label: robot.carried_by for label, robot in robots.items()}
     second = None
     if ghost is not None:
-        second = (Path(ghost).name, *_ghost(job, model, Path(ghost)))
+        shadow = job.read(LogEntry(Path(ghost)), model, is_motion=True)
+        second = (Path(ghost).name, shadow.t, shadow.q)
     torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     shown, q = model, motion.q
@@ -216,24 +216,6 @@ def _noise(findings: Findings, model: RobotModel) -> Array | None:
             return np.array([fitted[joint]["rmse"] for joint in model.joints])
         break
     return None
-
-
-def _ghost(job: Job, model: RobotModel, path: Path) -> tuple[Array, Array]:
-    """Return times and positions of a second motion, which need not have torques."""
-    table = open_table(path, job.source)
-    starts = prefixes()
-    torques = (*starts["tau"], *starts["current"])
-    if any(name.startswith(torques) for name in table.names):
-        log = job.read(LogEntry(path), model)
-        return log.t, log.q
-    found = []
-    for wanted in [("time", "t"), *([s + joint for s in starts["q"]] for joint in model.joints)]:
-        name = next((name for name in wanted if name in table.names), None)
-        if name is None:
-            raise DataError(f"{path.name} has no column {wanted[0]!r}; columns: {table.names}")
-        found.append(name)
-    columns = table.read(found)
-    return columns[found[0]], np.column_stack([columns[name] for name in found[1:]])
 
 
 def _track(path: Path) -> Mapping[str, Any] | None:

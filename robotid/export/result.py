@@ -77,7 +77,10 @@ _SHAPE = {
         "factor": NUMBER,
         "is_stated": FLAG,
     },
-    "consistency": {"is_consistent": FLAG},
+    "consistency": {
+        "is_consistent": FLAG,
+        "fit?": {"prior?": {"weight": NUMBER, "plausible_weight?": NUMBER}},
+    },
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],

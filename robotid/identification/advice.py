@@ -220,7 +220,8 @@ def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) ->
 def _watch(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     words = (
         f"Look at what the torque of {_named(causes, found.model.joints)} does that the model does "
-        "not explain, here under Why and in motion: a channel that holds something else, a spring, a gear that is not round."
+        "not explain, under Why and in motion: a channel that holds something else, a spring, a "
+        "gear that is not round."
     )
     return Step(words, _replay(found, origin))
 

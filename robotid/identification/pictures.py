@@ -26,9 +26,10 @@ __all__ = [
     "unused_spans",
 ]
 
-_DOTS = 1200  # of one friction chart
+_DOTS = 800  # of one friction chart
 _LAGS = 400  # points of one autocorrelation
 _LONGEST_LAG = 2.0  # [s]
+_DWARFED = 4.0  # times the height of the measured torque beyond which the URDF's is hidden
 _PIXELS = 500  # spans closer than one of so many are one
 
 
@@ -77,7 +78,7 @@ def torque_charts(
         f"{kind.capitalize()} of {name} over time: measured, identified, the URDF's",
         t,
         (
-            Series("URDF", urdf, "urdf", is_faint=True),
+            Series("URDF", urdf, "urdf", is_faint=True, is_hidden=_dwarfs(urdf, tau, model)),
             Series("measured", tau, "text", is_faint=True),
             Series("identified, 95 % band", model, "predicted", half=half),
         ),
@@ -101,6 +102,14 @@ def torque_charts(
         height=90,
     )
     return torque, residual
+
+
+def _dwarfs(y: Array, *others: Array) -> bool:
+    """Whether a line would press the others, drawn with it, into a fraction of the height."""
+    rest = np.concatenate(others)
+    every = np.concatenate([rest, y])
+    sizes = [np.ptp(x[np.isfinite(x)]) for x in (every, rest)]
+    return bool(sizes[0] > _DWARFED * sizes[1])
 
 
 def unused_spans(t: Array, used: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:

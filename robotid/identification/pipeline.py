@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid._settings import Settings
-from robotid._typing import Array, ProgressCallback, report_stage
+from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
 from robotid.doctor.urdf_inertials import impossible_inertials
@@ -20,6 +20,7 @@ from robotid.estimators.determination import Determination, base_spread, determi
 from robotid.estimators.estimator import Weighing
 from robotid.exceptions import (
     DataError,
+    ModelError,
     NotConvergedError,
     RankDeficientError,
     SettingsError,
@@ -523,9 +524,9 @@ def identify(
 
     Args:
         model: The robot; or the path of its URDF, all of whose joints move.
-        logs: Recordings to fit: a ``Log`` of the model's joints in its order, the path of a file,
-            a DataFrame with the columns of such a file, or several of these. Files are read
-            whole, as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
+        logs: Recordings to fit: a ``Log`` that has the model's joints, the path of a file, a
+            DataFrame with the columns of such a file, or several of these. Files are read whole,
+            as by ``read_log``; ``robotid.run_job`` reads long ones in pieces.
         validation: Recordings kept apart to measure the prediction with, likewise.
         signals: How logs become trajectories; the defaults if None.
         estimator: Name or settings of the estimator.
@@ -533,10 +534,12 @@ def identify(
             ``wanted_families``: "auto" has it chosen.
         doctor: Whether the doctor looks at the logs first; the verdict counts what it finds.
         ignore: Codes of errors and doubts that you know better.
-        progress: Called as each of ``STAGES`` begins: its name, stages done, in all, "stages".
+        progress: Called as each of ``STAGES`` begins: its name, stages done, in all, "stages"; and
+            in between with the name of a work, units done, in all, and what they are.
 
     Raises:
         DataError: If a log cannot be read, does not fit the model or is too short.
+        ModelError: If the model is no model, nor the path of a URDF that can be used.
         RankDeficientError: If "ols" or "wls" is asked for and the data leave parameters open.
         NotConvergedError: If a solver fails.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
@@ -545,7 +548,11 @@ def identify(
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")
-    model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)
+    if not isinstance(model, RobotModel):
+        if not isinstance(model, str | Path):
+            kind = type(model).__name__
+            raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
+        model = RobotModel.from_urdf(model)
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic)
         for some in (logs, validation)
@@ -591,7 +598,7 @@ def conclude(
         )
     report_stage(progress, "fitting")
     with _explained(found):
-        fit = with_drives(recordings, choice, wanted)
+        fit = with_drives(recordings, choice, wanted, progress=progress)
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
@@ -619,7 +626,7 @@ def _explained(found: Sequence[Finding]) -> Iterator[None]:
         yield
     except (DataError, NotConvergedError, RankDeficientError) as error:
         for finding in found:
-            if finding.severity != "note":
+            if finding.severity != "note" and finding.message != str(error):
                 error.add_note(f"doctor: {finding.severity}: {finding.code}: {finding.message}")
         raise
 
@@ -628,6 +635,8 @@ def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
     wanted: Mapping[str, Sequence[str] | None],
+    *,
+    progress: ProgressCallback | None = None,
 ) -> Identification:
     """Identify a robot's parameters, and the friction of its joints that the logs show.
 
@@ -635,22 +644,28 @@ def with_drives(
         recordings: The recordings.
         choice: Which estimator.
         wanted: Friction of each joint, as of ``wanted_families``.
+        progress: Called with "fits", those done, those in all as far as is known, and "fits".
 
     Raises:
         DataError, RankDeficientError, NotConvergedError: As of ``identify``.
     """
+    report = progress or ignore_progress
+    report("fits", 0, 1, "fits")
     fit = _fitted(recordings, choice)
     drives = choose_drives(fit, wanted)
     if not any(drive.terms for drive in drives):
         return replace(fit, drives=drives)
     rough = _rough(choice)
-    for _ in range(_MOST_SHAPES if any(drive.shapes for drive in drives) else 0):
+    most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
+    for done in range(most):
+        report("fits", 1 + done, 2 + most, "fits")
         moved = settled_shapes(
             replace(_fitted(_with_own(recordings, fit, drives), rough), drives=drives)
         )
         if moved is None:
             break
         drives = moved
+    report("fits", 1 + most, 2 + most, "fits")
     return replace(_fitted(_with_own(recordings, fit, drives), choice), drives=drives)
 
 

@@ -13,6 +13,7 @@ least squares, and with the prior's information that of a consistent fit.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,8 @@ __all__ = [
     "Run",
     "TorqueNoise",
     "assumed_noise",
+    "assumed_parameters",
+    "largest_torques",
     "preview",
     "preview_logs",
 ]
@@ -58,6 +61,9 @@ CORRELATION = 0.1
 _NOISE = 0.01  # the same of its standard deviation, as a share of the largest torque
 _FRICTION = 0.05  # assumed Coulomb friction, and viscous at full speed, likewise
 _FAINTEST = 1e-3  # of the largest torque of all joints, that of one that carries nothing
+#: The same of a consistent fit's prior where "auto" weighs it, and what is plausible beside that:
+#: the heaviest weight that held-out stretches do not reject, of robots as far from their URDF.
+_WEIGHT = (10.0, 1.0)
 _EXACT = 1e-9  # share of the largest residual that every joint has at least
 _LEAST_FREE = 0.1  # share of a joint's rows that are left to tell its noise, at least
 _IMPULSE = 40.0  # periods of the filter after which nothing is left of an impulse
@@ -98,6 +104,8 @@ class Run:
         samples: As of ``Reduction``.
         share: Share of its rows that count as independent [-].
         step: Time between two rows [s].
+        weight: Weight of the prior that its fit chose, and the plausible one; None if it chose
+            none.
     """
 
     stretches: tuple[Factors, ...]
@@ -106,14 +114,16 @@ class Run:
     samples: int
     share: float
     step: float
+    weight: tuple[float, float] | None = None
 
     @classmethod
-    def of(cls, recordings: Recordings, standard: Array) -> "Run":
+    def of(cls, recordings: Recordings, standard: Array, details: Mapping[str, Any]) -> "Run":
         """Return the run of logs that were identified before.
 
         Args:
             recordings: Its fitted logs, of the model with the friction found.
             standard: The parameters found, shape (p,).
+            details: Those of its estimate.
 
         Raises:
             DataError: If a log cannot be used.
@@ -122,7 +132,11 @@ class Run:
         whole = join(reductions)
         stretches = tuple(part.factors for part in reductions if part.factors.rows.any())
         step = float(np.mean([_row_step(log) for log in recordings.fitted]))
-        return cls(stretches, standard, whole.squares, whole.samples, recordings.share, step)
+        prior = details.get("prior")
+        weight = None if prior is None else (prior["weight"], prior.get("plausible_weight", 1.0))
+        return cls(
+            stretches, standard, whole.squares, whole.samples, recordings.share, step, weight
+        )
 
     @property
     def factors(self) -> Factors:
@@ -266,7 +280,8 @@ def preview(
     if given is not None:
         model, settings = given.model, signals or given.asked.signals
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
-        run = Run.of(Recordings(model, given.mapping, logs), given.standard)
+        recordings = Recordings(model, given.mapping, logs)
+        run = Run.of(recordings, given.standard, given.estimate.details)
     read = read_logs(motions, model.joints, prismatic=model.layout.prismatic, is_motion=True)
     held = [hold_log(model, motion, settings) for motion in read]
     return preview_logs(model, held, choice, noise=noise, run=run)
@@ -301,9 +316,10 @@ def preview_logs(
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
     mapping = structural_mapping(model)
-    size = _largest_torques(model, motions)
+    peak, fastest = _seen(model, motions)
+    size = largest_torques(model, peak)
     known = run or like
-    pi = _assumed_parameters(model, motions, size) if known is None else known.standard
+    pi = assumed_parameters(model, size, fastest) if known is None else known.standard
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
@@ -313,11 +329,12 @@ def preview_logs(
     said = said if run is None else said.beside(run)
     prior, spread = model.standard_parameters(), prior_spread(model, said.squares, said.samples)
     ground = Known(prior, spread, said.share, said.sigma)
-    estimate, wls = _errors(model, mapping, said, ground, choice)
+    weight = _WEIGHT if known is None or known.weight is None else known.weight
+    estimate, wls = _errors(model, mapping, said, ground, choice, weight)
     expected = _expected(mapping, motions, pi, said, ground, choice, estimate, wls)
     before = None
     if run is not None:
-        alone, _ = _errors(model, mapping, said.without_motions(), ground, choice)
+        alone, _ = _errors(model, mapping, said.without_motions(), ground, choice, weight)
         before = _base_error(alone, mapping, prior, spread)
     return Preview(expected, noise, before)
 
@@ -452,20 +469,36 @@ def _band(log: SurveyedLog) -> float:
     return float(rate * np.sum(low_pass(impulse, rate, log.signals) ** 2))
 
 
-def _largest_torques(model: RobotModel, motions: Sequence[SurveyedLog]) -> Array:
-    """Return the largest torque of each joint, (n,): the URDF's limit, or that of its bodies."""
+def _seen(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
+    """Return the largest torque and speed of each joint in motions, by the URDF's bodies, (n,)."""
     bodies = model.standard_parameters()
     moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
     peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
+    return peak, np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
+
+
+def largest_torques(model: RobotModel, peak: Array) -> Array:
+    """Return the largest torque of each joint, shape (n,): the URDF's limit, or one that was seen.
+
+    Args:
+        model: The robot.
+        peak: What stands for the limit where the URDF states none, shape (n,) [N m or N].
+    """
     peak = np.maximum(peak, _FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
 
 
-def _assumed_parameters(model: RobotModel, motions: Sequence[SurveyedLog], size: Array) -> Array:
-    """Return the URDF's bodies with friction of a usual size, shape (p,)."""
+def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
+    """Return the URDF's bodies with friction of a usual size, shape (p,).
+
+    Args:
+        model: The robot.
+        size: Largest torque of each joint, shape (n,) [N m or N].
+        fastest: What stands for the largest speed where the URDF states none, shape (n,)
+            [rad/s or m/s].
+    """
     pi = model.standard_parameters()
-    fastest = np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
     for j, limits in enumerate(model.limits):
         speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
         for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):
@@ -489,11 +522,12 @@ def _errors(
     said: _Information,
     known: Known,
     choice: EstimatorSettings,
+    usual: tuple[float, float],
 ) -> tuple[Estimate, Estimate]:
     """Return the estimate and that of WLS to be expected, both at the prior.
 
-    The bounds of a consistent fit are left out, and the weight of its prior is 1 unless one is
-    stated: which bounds bind and which weight predicts best is not known before the data.
+    The bounds of a consistent fit are left out, for which of them bind is not known before the
+    data; nor is the weight of its prior, and the plausible one, unless it is stated: the usual.
     """
     factors, K = said.factors, mapping.K
     plain, alike = (
@@ -502,10 +536,11 @@ def _errors(
     )
     if not isinstance(choice, ConsistentSettings):
         return (alike if choice.name == "ols" else plain), plain
-    weight = 1.0 if isinstance(choice.prior_weight, str) else choice.prior_weight
+    stated = choice.prior_weight
+    weight, plausible = usual if isinstance(stated, str) else (stated, 1.0)
     bounds = {**choice.constraints, "extent": "none"}
     settings = replace(choice, prior_weight=weight, constraints=bounds)
-    fit = consistent_fit(settings, model, mapping, known)
+    fit = replace(consistent_fit(settings, model, mapping, known), plausible_weight=plausible)
     C = fit.programme.covariance_at_prior(weight, fit.rows(factors, said.sigma))
     R, meat = factors.weighted(said.sigma)[:-1, :-1], said.meat(K, said.sigma)
     covariance = about_prior(C, K, said.share**2 * meat, R, said.share, fit.pull)

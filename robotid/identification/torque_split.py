@@ -295,12 +295,12 @@ class JointTorque:
         """Return in words what the residual follows."""
         share = _percent(best.share or 0.0)
         if best.name == "constant":
-            return f"is {share} a constant of {best.means[0]:.2g} {self.unit}"
+            return f"{share} of its square is a constant of {best.means[0]:.2g} {self.unit}"
         usual = self.size(self.quantities[best.name][1]) if best.name == "speed" else 0.0
         low = " at low speed," if abs(best.where) < _SLOW * usual else ""
         return (
-            f"follows the {best.name}, which explains {share} of its square (best seen{low} about "
-            f"{best.where:.2g} {best.unit})"
+            f"follows the {best.name}, which explains {share} of its variance (best seen{low} "
+            f"about {best.where:.2g} {best.unit})"
         )
 
     def _has_changed(self, name: str) -> bool:

@@ -5,6 +5,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.identification.bands import REACH
 from robotid.identification.dependence import Dependence
+from robotid.identification.pictures import unused_spans
 from robotid.identification.torque_split import JointTorque
 from robotid.pages.charts import Chart, Series, broken
 
@@ -24,7 +25,9 @@ _TONES = {
 }
 
 
-def why_charts(torque: JointTorque, *, points: int = _POINTS) -> dict[str, Chart]:
+def why_charts(
+    torque: JointTorque, *, link: str = "time", points: int = _POINTS
+) -> dict[str, Chart]:
     """Return the charts of a joint by what they show.
 
     They are "split", the parts of the torque stacked over time; one for each quantity that the
@@ -33,18 +36,19 @@ def why_charts(torque: JointTorque, *, points: int = _POINTS) -> dict[str, Chart
 
     Args:
         torque: Torque of the joint, from ``joint_torques``.
+        link: What those over time share cursor and zoom with.
         points: About how many rows each of them shows.
     """
-    charts = {"split": _split(torque, points)}
+    charts = {"split": _split(torque, link, points)}
     for dependence in torque.follows:
         if dependence.name in (*torque.quantities, "time"):
-            charts[dependence.name] = _residual(torque, dependence, points)
+            charts[dependence.name] = _residual(torque, dependence, link, points)
     if torque.power is not None:
-        charts["power"] = _power(torque, torque.power, points)
+        charts["power"] = _power(torque, torque.power, link, points)
     return charts
 
 
-def _split(torque: JointTorque, points: int) -> Chart:
+def _split(torque: JointTorque, link: str, points: int) -> Chart:
     k = _first(torque, points)
     parts = {name: torque.parts[name][k] for name in torque.present}
     lines = [*parts.values(), torque.residual[k], torque.tau[k]]
@@ -61,13 +65,13 @@ def _split(torque: JointTorque, points: int) -> Chart:
         ),
         x_label="time [s]",
         y_label=f"torque [{torque.unit}]",
-        link=torque.rows.recordings[0],
-        spans=_unused(torque, k),
+        link=link,
+        spans=unused_spans(torque.rows.t[k], torque.used[k]),
         height=240,
     )
 
 
-def _power(torque: JointTorque, power: Array, points: int) -> Chart:
+def _power(torque: JointTorque, power: Array, link: str, points: int) -> Chart:
     k = _first(torque, points)
     speed = torque.quantities["speed"][1]
     lost = torque.parts.get("friction", np.zeros_like(speed)) * speed
@@ -78,12 +82,12 @@ def _power(torque: JointTorque, power: Array, points: int) -> Chart:
         series=(Series("into friction", heat, "tone-3"), Series("torque × speed", whole, "text")),
         x_label="time [s]",
         y_label="power [W]",
-        link=torque.rows.recordings[0],
+        link=link,
         height=120,
     )
 
 
-def _residual(torque: JointTorque, dependence: Dependence, points: int) -> Chart:
+def _residual(torque: JointTorque, dependence: Dependence, link: str, points: int) -> Chart:
     name, unit = dependence.name, dependence.unit
     x = torque.rows.time if name == "time" else torque.quantities[name][1]
     rows = np.flatnonzero(torque.used)
@@ -100,7 +104,7 @@ def _residual(torque: JointTorque, dependence: Dependence, points: int) -> Chart
         ),
         x_label=f"{name} [{unit}]",
         y_label=f"residual [{torque.unit}]",
-        link=torque.rows.recordings[0] if is_one else "",
+        link=link if is_one else "",
         height=120,
     )
 
@@ -113,10 +117,3 @@ def _first(torque: JointTorque, points: int) -> Array:
 
 def _evenly(count: int, most: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
-def _unused(torque: JointTorque, k: Array) -> tuple[tuple[float, float], ...]:
-    """Return the stretches of time whose rows are not used."""
-    t, edges = torque.rows.t[k], np.flatnonzero(np.diff(np.r_[0, ~torque.used[k], 0]))
-    last = len(t) - 1
-    return tuple((float(t[start]), float(t[min(end, last)])) for start, end in edges.reshape(-1, 2))

@@ -14,7 +14,7 @@ from robotid.logs.parquet_files import ParquetFormat
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Format, Table, WritableFormat
 
-__all__ = ["open_table", "write_columns"]
+__all__ = ["check_suffix", "open_table", "write_columns"]
 
 _FORMATS: dict[str, Format] = {
     ".csv": CsvFormat(),
@@ -27,6 +27,7 @@ _FORMATS: dict[str, Format] = {
     ".db3": BagFormat(),
     ".bag": BagFormat(),
 }
+_WRITTEN = {suffix: f for suffix, f in _FORMATS.items() if isinstance(f, WritableFormat)}
 _LONGEST_NAME = 1000  # characters of a column
 
 
@@ -83,14 +84,26 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
         MissingDependencyError: If a package that writes it is not installed.
         OSError: If the folder cannot be written to.
     """
-    written = {suffix: f for suffix, f in _FORMATS.items() if isinstance(f, WritableFormat)}
-    suffix = path.suffix.lower()
-    if suffix not in written:
-        raise DataError(
-            f"{path.name}: logs are written as {_listed(list(written))} files, not {suffix!r}"
-        )
+    form = _WRITTEN[check_suffix(path)]
     with written_whole(path) as beside:
-        written[suffix].write(table, beside)
+        form.write(table, beside)
+
+
+def check_suffix(path: Path) -> str:
+    """Return the suffix of a file to write, as before the work that makes its content.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: If its suffix names no format that is written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _WRITTEN:
+        raise DataError(
+            f"{path.name}: logs are written as {_listed(list(_WRITTEN))} files, not {suffix!r}"
+        )
+    return suffix
 
 
 def _listed(words: list[str]) -> str:

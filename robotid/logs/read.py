@@ -89,7 +89,7 @@ def read_logs(
     """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
 
     Args:
-        given: A log, a path, a DataFrame, or a sequence of these.
+        given: A log that has these joints, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
         prismatic: Names of joints that slide; the others turn.
         is_motion: Whether they are read for their motion alone, as of ``lay_out``.
@@ -105,11 +105,24 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        log
+        _of_joints(log, joints)
         if isinstance(log, Log)
         else read_log(log, joints, prismatic=prismatic, is_motion=is_motion)
         for log in logs
     )
+
+
+def _of_joints(log: Log, joints: Sequence[str]) -> Log:
+    """Return a log with its columns in the order of some joints, all of which it must have."""
+    absent = [joint for joint in joints if joint not in log.joints]
+    if absent:
+        held = ", ".join(f"{joint!r}: 0.0" for joint in absent)
+        raise DataError(
+            f"{log.name} has the joints {listed(log.joints)}, but not {listed(absent)}, which the "
+            "model has; record them, or if they stood still, lock them where they stood: "
+            f"RobotModel.from_urdf(..., locked={{{held}}})"
+        )
+    return log if log.joints == tuple(joints) else log.select(joints)
 
 
 def _no_log(thing: object) -> DataError:

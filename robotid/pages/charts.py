@@ -21,6 +21,7 @@ _STILL = 200  # points of a line in the still picture
 _WIDTH = 640  # [px] of the still picture
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 10, 20, 34  # [px] around its axes
 _THIN = 0.05  # [px] what covers no more is not drawn
+_LINE = 14  # [px] of a row of labels
 _LETTER = 6.2  # [px] about the width of one
 
 
@@ -36,6 +37,7 @@ class Series:
             are stacked, what is positive upwards and what is negative downwards.
         half: Half width of a band about a line, of error bars about dots and bars, shape (N,).
         is_faint: Whether it stands back behind the others.
+        is_hidden: Whether it is seen only when its key in the legend is pressed.
     """
 
     label: str
@@ -44,6 +46,7 @@ class Series:
     kind: str = "line"
     half: Array | None = None
     is_faint: bool = False
+    is_hidden: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +123,7 @@ def chart_html(chart: Chart, caption: str, *, points: int = _POINTS, still: int 
                 "tone": s.tone,
                 "kind": s.kind,
                 "faint": s.is_faint,
+                "hidden": s.is_hidden,
                 "y": _packed(y[rows], is_log=is_log),
                 "half": None if half is None else _packed(half[rows]),
             }
@@ -298,8 +302,9 @@ def _covers(series: Sequence[_Drawn]) -> list[_Cover]:
 
 def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str:
     """Return the chart as an ``<svg>`` of a few points."""
+    series = [item for item in series if not item[0].is_hidden]
     covers = _covers(series)
-    height = _TOP + chart.height + _BOTTOM + _slant(chart.x_names)
+    legend, height = _legend(chart, _TOP + chart.height + _BOTTOM + _slant(chart.x_names))
     logs = ["x" in chart.logarithmic, "y" in chart.logarithmic]
     edges = [edge for cover in covers for pair in cover for edge in pair]
     values = [x, np.concatenate(edges or [np.empty(0)])]
@@ -319,7 +324,7 @@ def _still(chart: Chart, x: Array, series: Sequence[_Drawn], points: int) -> str
     return (
         f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(chart.title)}" '
         f'font-size="11" fill="currentColor">{_frame(chart, across, up)}{drawn}'
-        f"{_legend(chart)}</svg>"
+        f"{legend}</svg>"
     )
 
 
@@ -358,19 +363,26 @@ def _frame(chart: Chart, across: _Axis, up: _Axis) -> str:
     return "".join(parts)
 
 
-def _legend(chart: Chart) -> str:
-    """Return the name of the values, and a patch of colour and the label of each series."""
+def _legend(chart: Chart, height: float) -> tuple[str, float]:
+    """Return the name of the values with the label of each series, and the height with them.
+
+    Labels that find no place above the axes stand below the picture.
+    """
     parts = [f'<text x="4" y="12">{escape(chart.y_label)}</text>']
-    place = 4 + _LETTER * (len(chart.y_label) + 3)
-    for series in chart.series:
+    place, down = 4 + _LETTER * (len(chart.y_label) + 3), 12.0
+    for series in (s for s in chart.series if not s.is_hidden):
+        width = 16 + _LETTER * (len(series.label) + 3)
+        if place + width > _WIDTH + 3 * _LETTER:
+            place, down = float(_LEFT), height + 8
+            height += _LINE
         opacity = 0.5 if series.is_faint else 1.0
         parts.append(
-            f'<path d="M{place:.0f} 8h12" stroke="var(--{series.tone})" stroke-width="4" '
-            f'stroke-opacity="{opacity}"/>'
-            f'<text x="{place + 16:.0f}" y="12">{escape(series.label)}</text>'
+            f'<path d="M{place:.0f} {down - 4:.0f}h12" stroke="var(--{series.tone})" '
+            f'stroke-width="4" stroke-opacity="{opacity}"/>'
+            f'<text x="{place + 16:.0f}" y="{down:.0f}">{escape(series.label)}</text>'
         )
-        place += 16 + _LETTER * (len(series.label) + 3)
-    return "".join(parts)
+        place += width
+    return "".join(parts), height
 
 
 def _drawn(

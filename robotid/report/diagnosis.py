@@ -29,6 +29,7 @@ _PAIRS = 15  # strongest correlations that are listed
 _STRONG = 0.8  # a correlation worth naming
 _CELL = 11  # [px] of the correlation matrix
 _STEPS = 8  # shades of each sign in it
+_STILL = 100  # points of a friction chart in print
 
 
 def residual_section(found: Identification) -> str:
@@ -150,7 +151,8 @@ def _friction_figures(found: Identification) -> str:
         if chart is None:
             figures.append(f"<p>{escape(joint)}: no rows used.</p>\n")
         else:
-            figures.append(chart_html(chart, f"<strong>{escape(joint)}</strong>"))
+            caption = f"<strong>{escape(joint)}</strong>"
+            figures.append(chart_html(chart, caption, still=_STILL))
     return "".join(figures)
 
 

@@ -107,7 +107,8 @@ def _facts(found: Identification, files: Mapping[str, str]) -> str:
     }
     if files:
         facts["Files"] = ", ".join(
-            f'<a href="{escape(path)}">{escape(kind)}</a>' for kind, path in files.items()
+            f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
+            for kind, path in files.items()
         )
     cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in facts.items())
     return f'<dl class="facts">{cells}</dl>\n'
@@ -147,17 +148,18 @@ def _row(
 ) -> str:
     """Return the row of a joint; the one recording that was kept apart need not be named."""
     status, kind = verdict.status, verdict.status.replace(" ", "-")
-    picture, said = "", percent(None)
+    picture, said, link = "", percent(None), ""
     why = joint_reason(joint, verdict.reasons)
     why = why.replace(alone, "") if alone else why
     if measured is not None:
         metrics, wls = measured
         said = percent(metrics.relative_error_pct)
         picture = _picture(row, joint, metrics, wls)
+        link = f' <a href="#why-{row}" aria-label="why, of {escape(joint)}">why</a>'
     return (
         f'<li class="{kind}"><a class="code" href="#torque-{row}">{code(joint).html}</a>'
         f'{picture}<span class="number">{said.html} %</span><strong>{status}</strong>'
-        f'<span class="why">{escape(why)}</span></li>\n'
+        f'<span class="why">{escape(why)}{link}</span></li>\n'
     )
 
 
@@ -205,7 +207,7 @@ def _next(found: Identification, origin: Origin) -> str:
     steps = "".join(
         f"<li><p>{escape(step.words)}</p>"
         + "".join(
-            f'<div class="copy"><pre class="command" tabindex="0">{escape(block)}</pre></div>'
+            f'<div class="copy"><pre class="command">{escape(block)}</pre></div>'
             for block in step.blocks
         )
         + "</li>\n"

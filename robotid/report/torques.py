@@ -48,11 +48,10 @@ def torques_section(found: Identification) -> str:
 def _said(found: Identification, shown: Sequence[Evaluation], left: Sequence[Evaluation]) -> str:
     """Return what the charts show, and of which recordings."""
     parts = [
-        "<p>Measured torque, the identified model's with its 95 % band, from the uncertainty of "
-        "the parameters and the noise of the fit, and the URDF's; below, the residual (measured − "
-        "identified). Shaded: rows not used, because the joint stands still and the sign of its "
-        "friction is unknown, and gaps of the recording. Charts of one recording share cursor and "
-        "zoom: drag to zoom, double-click or Escape to see all.</p>\n"
+        "<p>Measured torque, the identified model's with its 95 % band, the URDF's; below, the "
+        "residual (measured − identified). Shaded: rows not used, for the joint stands still and "
+        "the sign of its friction is unknown, and gaps. Drag to zoom; double-click or Escape shows "
+        "all.</p>\n"
     ]
     if not found.validation:
         parts.append("<p>No log was kept apart: these are the fitted logs.</p>\n")

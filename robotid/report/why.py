@@ -2,17 +2,20 @@
 
 from html import escape
 
+from robotid.identification.dependence import LEAST
 from robotid.identification.pipeline import Identification
 from robotid.identification.torque_split import JointTorque, joint_torques
 from robotid.identification.why_pictures import why_charts
 from robotid.pages.charts import Chart, chart_html
-from robotid.pages.html import Cell, code, number, percent, table, text
+from robotid.pages.html import Cell, code, folded, number, percent, table, text
 
 __all__ = ["why_section"]
 
-_POINTS = 400  # of a chart
-_ALL_POINTS = 2400  # of one chart of every joint together
-_STILL = 60  # of them, in print
+_POINTS = 300  # of a chart
+_ALL_POINTS = 1800  # of one chart of every joint together
+_FEWEST_POINTS = 100
+_STILL, _STILL_SPLIT = 30, 80  # of them, in print
+_MOST = 12  # joints with all their charts; others have those that say something
 
 
 def why_section(found: Identification) -> str:
@@ -24,9 +27,17 @@ def why_section(found: Identification) -> str:
     torques = sorted(joint_torques(found), key=_missed, reverse=True)
     shown = ", ".join(torques[0].rows.recordings)
     kind = "kept apart" if torques[0].fitted is not None else "fitted, for none was kept apart"
-    points = max(100, min(_POINTS, _ALL_POINTS // len(torques)))
+    points = max(_FEWEST_POINTS, min(_POINTS, _ALL_POINTS // len(torques)))
+    names = [e.recording.name for e in found.validation or found.fitted]
+    first = torques[0].rows.recordings[0]
+    link = f"recording {names.index(first)}" if first in names else "fitted"  # as torques_section
     joints = "".join(
-        _joint(torque, found.model.row_names.index(torque.joint), points, is_open=k == 0)
+        folded(
+            f"why-{found.model.row_names.index(torque.joint)}",
+            f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}",
+            _joint(torque, link, points, is_full=k < _MOST),
+            is_open=k == 0,
+        )
         for k, torque in enumerate(torques)
     )
     return (
@@ -43,20 +54,24 @@ def _missed(torque: JointTorque) -> float:
     return rms["residual"] / rms["measured"] if rms["measured"] > 0 else -1.0
 
 
-def _joint(torque: JointTorque, row: int, points: int, *, is_open: bool) -> str:
-    summary = f"<strong>{code(torque.joint).html}</strong>: {escape(torque.sentence)}"
-    body = ""
-    if torque.used.any():
-        charts = why_charts(torque, points=points)
-        split = _chart(charts.pop("split"), "Torque in parts, stacked; shaded: rows not used")
-        small = "".join(_chart(chart, _caption(torque, name)) for name, chart in charts.items())
-        body = f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
-    opened = " open" if is_open else ""
-    return f'<details id="why-{row}"{opened}><summary>{summary}</summary>\n{body}</details>\n'
+def _joint(torque: JointTorque, link: str, points: int, *, is_full: bool) -> str:
+    """Return table and charts of a joint, all or those alone that say what its residual follows."""
+    if not torque.used.any():
+        return ""
+    charts = why_charts(torque, link=link, points=points)
+    said = "Torque in parts, stacked; shaded: rows not used"
+    split = _chart(charts.pop("split"), said, _STILL_SPLIT)
+    sure = {d.name for d in torque.follows if d.is_sure}
+    small = "".join(
+        _chart(chart, _caption(torque, name))
+        for name, chart in charts.items()
+        if is_full or name in sure
+    )
+    return f'{_parts(torque)}{split}<div class="plots">\n{small}</div>\n'
 
 
-def _chart(chart: Chart, caption: str) -> str:
-    return chart_html(chart, caption, points=2 * len(chart.x), still=_STILL)
+def _chart(chart: Chart, caption: str, still: int = _STILL) -> str:
+    return chart_html(chart, caption, points=2 * len(chart.x), still=still)
 
 
 def _caption(torque: JointTorque, name: str) -> str:
@@ -66,11 +81,14 @@ def _caption(torque: JointTorque, name: str) -> str:
             "-", "−"
         )
     (dependence,) = (d for d in torque.follows if d.name == name)
-    said = "too few stretches to tell"
-    if dependence.is_sure:
-        said = f"<strong>explains {percent(100 * (dependence.share or 0.0)).html} % of it</strong>"
-    elif dependence.share is not None:
-        said = "explains no more than chance"
+    share = percent(100 * (dependence.share or 0.0)).html
+    said = "explains nothing"
+    if dependence.share is None:
+        said = "too little was recorded to tell"
+    elif dependence.is_sure:
+        said = f"<strong>explains {share} % of its variance</strong>"
+    elif dependence.share >= LEAST:
+        said = f"explains {share} %, perhaps by chance"
     return f"Residual against {name}: {said}"
 
 

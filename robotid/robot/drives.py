@@ -24,9 +24,12 @@ __all__ = [
     "DRIVE_TERMS",
     "FAMILIES",
     "TERMS",
+    "Bristles",
     "DriveMotion",
     "DriveTerm",
     "Family",
+    "Lag",
+    "LoadFriction",
     "Shape",
     "term_from_dict",
 ]
@@ -354,7 +357,31 @@ class PositionCoulomb(DriveTerm):
 
 
 @dataclass(frozen=True)
-class Presliding(DriveTerm):
+class Bristles(DriveTerm):
+    """Friction x z that is taken up over a way: dz/ds = sign(v) - z / g(v) along s = |q| / s_0."""
+
+    displacement: float = 0.01
+
+    is_nonnegative = True
+    follows_direction = True
+    remembers = True
+
+    def level(self, v: Array) -> Array:
+        """Return g, what z ends at beside its sign, as v.
+
+        Args:
+            v: Speeds [rad/s or m/s].
+        """
+        raise NotImplementedError
+
+    def _column(self, motion: DriveMotion) -> Array:
+        if motion.begins is None:
+            return motion.direction * self.level(motion.v)
+        return _taken_up(motion, self.level, self.displacement)
+
+
+@dataclass(frozen=True)
+class Presliding(Bristles):
     """Friction that a drive takes up over a way after each reversal, tau = x z.
 
     dz/ds = 1 - z sign(v) along the way s = q / s_0: z goes from -1 to 1 after a reversal.
@@ -363,21 +390,14 @@ class Presliding(DriveTerm):
         Dahl (1968), A solid friction model.
     """
 
-    displacement: float = 0.01
-
     label = "presliding"
-    is_nonnegative = True
-    follows_direction = True
-    remembers = True
 
-    def _column(self, motion: DriveMotion) -> Array:
-        if motion.begins is None:
-            return motion.direction
-        return _taken_up(motion, lambda v: np.ones_like(v), self.displacement)
+    def level(self, v: Array) -> Array:
+        return np.ones_like(v)
 
 
 @dataclass(frozen=True)
-class LuGre(DriveTerm):
+class LuGre(Bristles):
     """Presliding with Stribeck's hook: dz/ds = 1 - z sign(v) / g(v), g = 1 + c exp(-(w/w_s)^2).
 
     References:
@@ -385,22 +405,13 @@ class LuGre(DriveTerm):
         friction; without its micro-damping.
     """
 
-    displacement: float = 0.01
     speed: float = 0.1
     excess: float = 0.5
 
     label = "lugre"
-    is_nonnegative = True
-    follows_direction = True
-    remembers = True
 
-    def _level(self, v: Array) -> Array:
+    def level(self, v: Array) -> Array:
         return 1.0 + self.excess * np.exp(-((v / self.speed) ** 2))
-
-    def _column(self, motion: DriveMotion) -> Array:
-        if motion.begins is None:
-            return motion.direction * self._level(motion.v)
-        return _taken_up(motion, self._level, self.displacement)
 
 
 def _taken_up(motion: DriveMotion, level: Callable[[Array], Array], displacement: float) -> Array:

@@ -1,32 +1,66 @@
-"""The simulated plant: forward dynamics with drives, a tracking controller, sensor noise -> Log."""
+"""The simulated robot: a plant that a controller makes follow a motion, and the log of it."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 
-from robotid._typing import Array
-from robotid.exceptions import DataError
-from robotid.logs.data import Log
+from robotid._typing import Array, ProgressCallback, ignore_progress
+from robotid.exceptions import DataError, SettingsError
+from robotid.logs.data import Log, Trajectory
+from robotid.regressor.memory import remember
+from robotid.regressor.prediction import predict
+from robotid.robot.bodies import link_transfer
+from robotid.robot.drives import Lag
 from robotid.robot.model import RobotModel
+from robotid.robot.parameters import pseudo_inertia
 from robotid.simulation.motions import Motion
-from robotid.simulation.plant import RobotPlant, rk4
+from robotid.simulation.plant import Friction, RobotPlant
+from robotid.simulation.sensors import measure
+from robotid.simulation.settings import (
+    Actuator,
+    Controller,
+    Noise,
+    Payload,
+    Simulation,
+    by_joint,
+)
+from robotid.simulation.truth import another_robot
 
-__all__ = ["Noise", "another_robot", "simulate"]
+__all__ = ["Noise", "Run", "another_robot", "carried", "follow", "lateness", "simulate"]
 
-_BANDWIDTH = 20.0  # [rad/s] of the tracking controller
-_SUBSTEPS = 2  # Runge-Kutta steps per sample, at least
-_LONGEST_STEP = 0.005  # [s] of Runge-Kutta, whatever the rate of the log
+_LONGEST_STEP = 2.5e-3  # [s] of the integration, whatever the rate of the log
+_ELASTIC_STEP = 0.3  # of 1 / w of the fastest elastic gear
+_SHORTEST_STEP = 1e-6  # [s] of the integration; a stiffer gear is refused
+_CHUNK = 1024  # steps that a motion is evaluated for at once
+_LEAST_INERTIA = 0.02  # [kg m^2 or kg] that PD gains are reckoned with, at least
+
+# ROS34PW2, a Rosenbrock W-method: order 3 whatever matrix damps it, L-stable
+_GAMMA = 4.3586652150845900e-01
+_ALPHA = np.zeros((4, 4))
+_ALPHA[1, 0] = 8.7173304301691801e-01
+_ALPHA[2, :2] = 8.4457060015369423e-01, -1.1299064236484185e-01
+_ALPHA[3, 2] = 1.0
+_BELOW = np.zeros((4, 4))
+_BELOW[1, 0] = -8.7173304301691801e-01
+_BELOW[2, :2] = -9.0338057013044082e-01, 5.4180672388095326e-02
+_BELOW[3, :3] = 2.4212380706095346e-01, -1.2232505839045147e00, 5.4526025533510214e-01
+_WEIGHTS = np.array([*_BELOW[3, :2], 1.5452602553351020e00, _GAMMA])
+_STAGES = _ALPHA.sum(axis=1)  # when each stage is, in steps
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of white sensor noise; 0 for none."""
+@dataclass(frozen=True, eq=False)
+class Run:
+    """How a robot moved, exactly; arrays of shape (N, n)."""
 
-    q: float = 0.0  # of positions [rad or m]
-    v: float = 0.0  # of velocities [rad/s or m/s]
-    tau: float = 0.0  # of torques, as a share of each joint's root mean square torque [-]
+    t: Array  # shape (N,) [s]
+    q: Array  # [rad or m]
+    v: Array  # [rad/s or m/s]
+    a: Array  # [rad/s^2 or m/s^2]
+    tau: Array  # [N m or N]
+    reference: Array  # position that was wanted [rad or m]
+    saturated: Array  # share of the time that each drive gave its most, shape (n,) [-]
 
 
 def simulate(
@@ -38,12 +72,9 @@ def simulate(
     duration: float,
     rng: np.random.Generator,
     noise: Noise | None = None,
+    settings: Simulation | None = None,
 ) -> Log:
-    """Return what the sensors of a simulated robot log, v and the torque u, as it tracks a motion.
-
-    The plant is M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u with the parameters pi,
-    integrated by Runge-Kutta of order 4. The controller knows the model's own inertias only, not
-    pi: u = RNEA(q_r, v_r, a_r) + diag(M) (w^2 (q_r - q) + 2 w (v_r - v)).
+    """Return what the sensors of a simulated robot log as it follows a motion.
 
     Args:
         model: The robot as the controller believes it to be, with a fixed base.
@@ -52,84 +83,395 @@ def simulate(
         rate: Sample rate of the log [Hz].
         duration: Length of the log [s].
         rng: Source of the noise.
-        noise: Sensor noise; none if None.
+        noise: Sensor noise, in the place of that of the settings.
+        settings: Controller, actuators, sensors and payload; if None, the URDF's inverse dynamics
+            and PD without limits, and sensors without faults.
 
     Raises:
         DataError: If the base floats, or the simulation diverges.
+        SettingsError: If a setting does not fit the robot.
     """
-    plant = _TrackedPlant(model, pi)
-    t = np.arange(round(duration * rate) + 1) / rate
-    substeps = max(_SUBSTEPS, math.ceil(1.0 / rate / _LONGEST_STEP - 1e-9))
-    h = 1.0 / rate / substeps
-    q_r, v_r, a_r = motion.evaluate(h / 2 * np.arange(2 * substeps * (len(t) - 1) + 1))
-    q, v, tau = (np.empty((len(t), len(model.joints))) for _ in range(3))
-    q_k, v_k = q_r[0], v_r[0]
-    for k in range(len(t)):
-        first = 2 * substeps * k  # index on the grid of half steps
-        q[k], v[k] = q_k, v_k
-        tau[k] = plant.torque(q_k, v_k, q_r[first], v_r[first], a_r[first])
-        if k + 1 < len(t):
-            for i in range(first, first + 2 * substeps, 2):
-                reference = [x[i : i + 3] for x in (q_r, v_r, a_r)]  # start, middle, end
-                q_k, v_k = plant.advance(q_k, v_k, reference, h)
-        if not (np.isfinite(q_k).all() and np.isfinite(v_k).all()):
-            raise DataError(f"the simulation diverged at t = {t[k]:.3f} s; slow the motion down")
-    level = noise or Noise()
-    return Log(
-        t=t,
-        q=q + level.q * rng.standard_normal(q.shape),
-        v=v + level.v * rng.standard_normal(v.shape),
-        tau=tau + level.tau * np.sqrt(np.mean(tau**2, axis=0)) * rng.standard_normal(tau.shape),
-        joints=model.joints,
-    )
+    chosen = settings or Simulation()
+    sensors = chosen.sensors if noise is None else replace(chosen.sensors, noise=noise)
+    run = follow(model, pi, motion, rate=rate, duration=duration, settings=chosen)
+    return measure(run, sensors, model.joints, rng, lateness=lateness(model, pi, chosen))
 
 
-def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
-    """Return standard parameters, shape (p,), of a robot like the model, but not the same.
+def follow(
+    model: RobotModel,
+    pi: Array,
+    motion: Motion,
+    *,
+    rate: float,
+    duration: float,
+    settings: Simulation,
+    progress: ProgressCallback = ignore_progress,
+) -> Run:
+    """Return how a robot moves as it follows a motion, before any sensor.
 
-    Every link is 10 to 30 % heavier or lighter, 1.2 kg more are at 10 cm from the last joint, the
-    drives have armature and friction.
+    The plant is that of ``RobotPlant`` with the parameters pi. An elastic gear has the motor angle
+    th and gives tau = k dead(th - q) + d (w - v); rotor and friction are then on the motor's side.
+    It is integrated by a Rosenbrock W-method of order 3, which stays stable where friction holds.
 
     Args:
-        model: The robot as its URDF describes it.
-        rng: Source of the differences.
+        model: As of ``simulate``.
+        pi: As of ``simulate``.
+        motion: As of ``simulate``.
+        rate: As of ``simulate``.
+        duration: As of ``simulate``.
+        settings: Controller, actuators and payload, and the side of elastic gears that is seen.
+        progress: Told of the seconds that are done.
+
+    Raises:
+        DataError: If the base floats, or the simulation diverges.
+        SettingsError: If a setting does not fit the robot.
+
+    References:
+        Rang, Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential
+        algebraic equations of index 1.
     """
-    size = model.layout.n_inertial
-    pi = model.standard_parameters()
-    by_body = pi[:size].reshape(-1, 10)
-    change = rng.uniform(0.1, 0.3, len(by_body)) * rng.choice([-1, 1], len(by_body))
-    by_body *= 1 + change[:, None]
-    mass, reach = 1.2, 0.1  # [kg], [m]
-    tool = [mass, 0.0, mass * reach, 0.0, mass * reach**2, 0.0, 0.0, 0.0, 0.0, mass * reach**2]
-    by_body[-1] += tool
-    by_body[-1] += [0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-3]  # a tool has an extent
-    for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
-        pi[i] = rng.uniform(*term.usual)
-    return pi
+    t = np.arange(round(duration * rate) + 1) / rate
+    loaded = carried(model, pi, settings.payload)
+    taken_up = settings.payload.start if settings.payload.mass > 0 else math.inf
+    if settings.controller.kind == "perfect":
+        return _perfect(model, pi, loaded, motion, t, taken_up)
+    loops = [_Loop(model, x, settings) for x in (pi, loaded)]
+    steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
+    h = 1.0 / rate / steps
+    loop, *later = loops if taken_up > 0 else loops[1:]
+    seen = np.empty((len(t), 4, len(model.joints)))
+    reference, limited = np.empty_like(seen[:, 0]), np.zeros(len(model.joints))
+    y: Array | None = None
+    for k, wanted in enumerate(_wanted(loop.controller, motion, len(t), steps, h)):
+        if later and t[k] >= taken_up - 1e-9 / rate:
+            loop = later.pop()
+        y = loop.start(*wanted[0, 0, :3]) if y is None else y
+        F = loop.friction(y)
+        f = loop.rate(y, wanted[0, 0], F)
+        seen[k], reference[k] = loop.seen(y, f, wanted[0, 0]), wanted[0, 0, 0]
+        limited += loop.is_limited(y, wanted[0, 0])
+        if not np.isfinite(seen[k]).all():
+            raise DataError(
+                f"the simulation diverged at t = {t[k]:.3f} s; slow the motion down, or lower the "
+                "controller's gains or bandwidth"
+            )
+        if k % 1000 == 0:
+            progress("simulating", round(t[k]), round(t[-1]), "s")
+        if k + 1 < len(t):
+            for i, stages in enumerate(wanted):
+                F = F if i == 0 else loop.friction(y)
+                f = f if i == 0 else loop.rate(y, stages[0], F)
+                y = _advance(loop, y, stages, h, F, f)
+    q, v, a, tau = seen.transpose(1, 0, 2)
+    return Run(t, q, v, a, tau, reference, limited / len(t))
 
 
-class _TrackedPlant:
-    """The true robot and its controller."""
+def _wanted(
+    controller: "_Torque", motion: Motion, samples: int, steps: int, h: float
+) -> Iterator[Array]:
+    """Yield q, v, a and torque fed forward of each sample's steps and stages, (steps, 4, 4, n)."""
+    several = max(1, _CHUNK // steps)  # samples at once
+    for first in range(0, samples, several):
+        count = min(several, samples - first)
+        begins = h * np.arange(steps * first, steps * (first + count))
+        times = (begins[:, None] + _STAGES * h).reshape(-1)
+        q, v, a = motion.evaluate(times)
+        grid = np.stack([q, v, a, controller.ahead(q, v, a)], axis=1)
+        yield from grid.reshape(count, steps, len(_STAGES), 4, -1)
 
-    def __init__(self, model: RobotModel, pi: Array) -> None:
-        self.model, self.plant = model, RobotPlant(model, pi)
-        self.data = model.pin_model.createData()
-        mass = self.plant.mass_matrix(np.zeros(len(model.joints)))
-        self.inertia = np.maximum(np.diag(mass), 0.02)
 
-    def torque(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array) -> Array:
-        """Return the controller's torque."""
-        G, w = self.model.velocity_map, _BANDWIDTH
-        x = self.model.configurations(q_r[None])[0]
-        forward = pin.rnea(self.model.pin_model, self.data, x, G @ v_r, G @ a_r)
-        command: Array = G.T @ forward + self.inertia * (w**2 * (q_r - q) + 2 * w * (v_r - v))
-        return command
+def carried(model: RobotModel, pi: Array, payload: Payload) -> Array:
+    """Return the parameters of a robot that carries a payload, shape (p,).
 
-    def advance(self, q: Array, v: Array, reference: list[Array], h: float) -> tuple[Array, Array]:
-        """Return the state one step later; q, v, a of the motion at its start, middle and end."""
+    Args:
+        model: The robot.
+        pi: Its parameters without it, shape (p,).
+        payload: The payload.
 
-        def acceleration(q: Array, v: Array, share: float) -> Array:
-            u = self.torque(q, v, *(x[round(2 * share)] for x in reference))
-            return self.plant.acceleration(q, v, u)
+    Raises:
+        ModelError: If the URDF has no such link.
+        SettingsError: If there can be no such payload, or its link is fixed to the world.
+    """
+    if payload.mass == 0.0:
+        return pi
+    link = payload.link or model.layout.bodies[-1]
+    body, transfer = link_transfer(model, link)
+    if body < 0:
+        raise SettingsError(f"payload: link {link!r} is fixed to the world; name one that moves")
+    m, c = payload.mass, np.array(payload.com)
+    xx, xy, yy, xz, yz, zz = payload.inertia
+    central = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    about_link = central + m * (c @ c * np.eye(3) - np.outer(c, c))
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = about_link.tolist()
+    own = np.array([m, *(m * c), xx, xy, yy, xz, yz, zz])
+    if np.linalg.eigvalsh(pseudo_inertia(own)[0])[0] < -1e-9 * m:
+        raise SettingsError(
+            f"payload: inertia is {list(payload.inertia)}, which no body has: each moment about an "
+            "axis is at most the sum of the other two, and none is negative"
+        )
+    found = pi.copy()
+    found[10 * body : 10 * body + 10] += transfer @ own
+    return found
 
-        return rk4(acceleration, q, v, h)
+
+def _perfect(
+    model: RobotModel, pi: Array, loaded: Array, motion: Motion, t: Array, taken_up: float
+) -> Run:
+    """Return the run of a robot that follows exactly, by inverse dynamics."""
+    q, v, a = motion.evaluate(t)
+    none = np.zeros_like(q)
+    segment = np.zeros(len(t), dtype=int)
+    rows = Trajectory(t, q, v, a, none, model.joints, None, segment)
+    torques = []
+    for x in [pi] if loaded is pi else [pi, loaded]:
+        robot = model.with_reference(x)
+        torques += predict(robot, [x], remember(robot, rows))
+    tau = np.where((t >= taken_up)[:, None], torques[-1], torques[0])
+    return Run(t, q, v, a, tau, q, np.zeros(q.shape[1]))
+
+
+def lateness(model: RobotModel, pi: Array, settings: Simulation) -> Array:
+    """Return how late the terms of the drives make each logged torque, shape (n,) [s].
+
+    Args:
+        model: The robot.
+        pi: Its true standard parameters, shape (p,).
+        settings: Those of the run; the torques of a perfect one are late already.
+
+    Raises:
+        SettingsError: If a drive that turns with several joints is late.
+    """
+    late = np.zeros(len(model.joints))
+    if settings.controller.kind == "perfect":  # whose inverse dynamics have it
+        return late
+    drives = pi[model.layout.n_inertial :]
+    for (d, term), value in zip(model.layout.drive_parameters, drives, strict=True):
+        if isinstance(term, Lag) and value:
+            drive = model.layout.drives[d]
+            if drive in model.layout.couplings or value < 0:
+                raise SettingsError(
+                    f"{drive.name}.lag is {value:g} s, wanted 0 or more of a joint's own drive: a "
+                    "torque that several joints share is late in none of them alone"
+                )
+            late[d] += value
+    return late
+
+
+class _Loop:
+    """The true robot and its controller as dy/dt = f(y, reference).
+
+    y has q and v of the joints, th and w of the motors if gears are elastic, then what presliding
+    has taken up.
+    """
+
+    def __init__(self, model: RobotModel, pi: Array, settings: Simulation) -> None:
+        self.plant = plant = RobotPlant(model, pi)
+        mass = plant.mass_matrix(np.zeros(len(model.joints)))
+        self.controller = _Torque(model, settings.controller, mass)
+        self.limit = _limits(model, settings.actuator)
+        self.has_limits, self.n = bool(np.isfinite(self.limit).any()), len(model.joints)
+        self.is_at_motor = settings.sensors.side == "motor"
+        self.gear = _Gear(plant, settings.actuator) if settings.actuator.is_elastic else None
+        self.longest_step = self._longest_step()
+
+    def start(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the state that follows a motion from its start, gears wound up, friction slid."""
+        moving = [q, v]
+        if self.gear is not None:
+            load = self.plant.bodies_torque(q, v, a)
+            moving += [q + self.gear.twist(load), v]
+        _, taken_up = self.plant.taking_up(v)
+        return np.concatenate([*moving, taken_up])
+
+    def friction(self, y: Array) -> Friction:
+        """Return the friction of a state."""
+        _, _, motor, w, z = self._parts(y)
+        return self.plant.friction(motor, w, z)
+
+    def rate(self, y: Array, wanted: Array, F: Friction) -> Array:
+        """Return dy/dt; wanted are q, v, a and the torque fed forward, shape (4, n)."""
+        q, v, motor, w, z = self._parts(y)
+        u = self.torque(motor, w, wanted)
+        if self.gear is None:
+            moved = [v, self.plant.acceleration(q, v, u, F)]
+        else:
+            load = self.gear.torque(q, v, motor, w)
+            a = self.plant.free_acceleration(q, v, load, rotors=False)
+            spun = self.gear.rotors @ (u - load - self.plant.friction_torque(F, w, load))
+            moved = [v, a, w, spun]
+        if len(z):
+            r, end = self.plant.taking_up(w)
+            moved.append(r * (end - z))
+        return np.concatenate(moved)
+
+    def torque(self, q: Array, v: Array, wanted: Array) -> Array:
+        """Return what the drives give."""
+        u = self.controller.of(q, v, *wanted)
+        return np.clip(u, -self.limit, self.limit) if self.has_limits else u
+
+    def is_limited(self, y: Array, wanted: Array) -> Array | bool:
+        """Return which drives give their most, shape (n,), bool."""
+        if not self.has_limits:
+            return False
+        _, _, motor, w, _ = self._parts(y)
+        limited: Array = np.abs(self.torque(motor, w, wanted)) >= self.limit
+        return limited
+
+    def seen(self, y: Array, f: Array, wanted: Array) -> Array:
+        """Return q, v, a and tau where the sensors are, shape (4, n)."""
+        q, v, motor, w, _ = self._parts(y)
+        n = self.n
+        if self.gear is None or not self.is_at_motor:
+            load = None if self.gear is None else self.gear.torque(q, v, motor, w)
+            return np.stack(
+                [q, v, f[n : 2 * n], self.torque(q, v, wanted) if load is None else load]
+            )
+        return np.stack([motor, w, f[3 * n : 4 * n], self.torque(motor, w, wanted)])
+
+    def damped(self, y: Array, h: float, F: Friction) -> Callable[[Array, Array], Array]:
+        """Return (f, s) -> (1 - g h J)^-1 (f + h J s), J being that of friction, g the method's.
+
+        Friction falls to 0 with the speed along the chord of F(w), presliding at its rate.
+        """
+        q, v, motor, w, z = self._parts(y)
+        load = np.zeros(self.n)
+        if self.plant.is_loaded:
+            still = np.zeros(self.n)
+            load = (
+                self.plant.bodies_torque(q, v, still)
+                if self.gear is None
+                else self.gear.torque(q, v, motor, w)
+            )
+        r, _ = self.plant.taking_up(w) if len(z) else (z, z)
+        B = h * self.plant.chord(F, w, load)  # (n, n)
+        inertia = self.plant.mass_matrix(q) if self.gear is None else self.plant.armature
+        inverse = np.linalg.inv(inertia + _GAMMA * B)
+        keep, lose, n = inverse @ inertia, inverse @ B, self.n
+        own = slice(n, 2 * n) if self.gear is None else slice(3 * n, 4 * n)
+
+        def solve(f: Array, s: Array) -> Array:
+            k = f.copy()
+            k[own] = keep @ f[own] - lose @ s[own]
+            if len(r):
+                k[-len(r) :] = (f[-len(r) :] - h * r * s[-len(r) :]) / (1.0 + _GAMMA * h * r)
+            return k
+
+        return solve
+
+    def _parts(self, y: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Return q and v of the joints, those of the drives, and the states of presliding."""
+        n = self.n
+        if self.gear is None:
+            return y[:n], y[n : 2 * n], y[:n], y[n : 2 * n], y[2 * n :]
+        return y[:n], y[n : 2 * n], y[2 * n : 3 * n], y[3 * n : 4 * n], y[4 * n :]
+
+    def _longest_step(self) -> float:
+        """Return the step that resolves all of it [s]."""
+        if self.gear is None:
+            return _LONGEST_STEP
+        w = self.gear.fastest(self.plant.mass_matrix(np.zeros(self.n)) - self.plant.armature)
+        step = min(_LONGEST_STEP, _ELASTIC_STEP / w)
+        if step < _SHORTEST_STEP:
+            raise SettingsError(
+                f"actuator: the elastic gears swing at {w / (2 * np.pi):.3g} Hz, too fast to "
+                "simulate; lower stiffness or damping, or leave them out for rigid gears"
+            )
+        return step
+
+
+def _advance(loop: _Loop, y: Array, wanted: Array, h: float, F: Friction, f: Array) -> Array:
+    """Return the state one step later.
+
+    Args:
+        loop: The robot.
+        y: The state.
+        wanted: Of each stage as of ``_Loop.rate``, shape (4, 4, n).
+        h: The step [s].
+        F: Friction of the state.
+        f: Rate of the state.
+    """
+    solve = loop.damped(y, h, F)
+    K = np.zeros((4, len(y)))
+    K[0] = solve(f, K[0])
+    for i in range(1, 4):
+        x = y + h * (_ALPHA[i] @ K)
+        K[i] = solve(loop.rate(x, wanted[i], loop.friction(x)), _BELOW[i] @ K)
+    after: Array = y + h * (_WEIGHTS @ K)
+    return after
+
+
+class _Gear:
+    """Springs with play between motors and joints."""
+
+    def __init__(self, plant: RobotPlant, actuator: Actuator) -> None:
+        joints = plant.model.joints
+        self.k = by_joint(actuator.stiffness, joints, "actuator: stiffness", np.inf)
+        self.d = by_joint(actuator.damping, joints, "actuator: damping")
+        self.play = by_joint(actuator.backlash, joints, "actuator: backlash") / 2
+        if np.isinf(self.k).any():
+            joint = joints[int(np.argmax(np.isinf(self.k)))]
+            raise SettingsError(
+                f"actuator: stiffness is not stated for {joint!r}; state it for every joint"
+            )
+        if np.linalg.eigvalsh(plant.armature)[0] <= 0.0:
+            least = joints[int(np.argmin(plant.armature.diagonal()))]
+            raise SettingsError(
+                f"the motor of {least!r} has no armature, which an elastic gear needs; state it in "
+                f'[truth.values], as "{least}.armature" = 0.1 [kg m^2]'
+            )
+        self.rotors = np.linalg.inv(plant.armature)
+
+    def torque(self, q: Array, v: Array, motor: Array, w: Array) -> Array:
+        """Return what the gears give to the joints, shape (n,)."""
+        twist = motor - q
+        wound = twist - np.clip(twist, -self.play, self.play)
+        is_held = np.abs(twist) >= self.play
+        tau: Array = self.k * wound + self.d * (w - v) * is_held
+        return tau
+
+    def twist(self, tau: Array) -> Array:
+        """Return the angle of the motor before the joint that gives a torque at rest."""
+        before: Array = tau / self.k + self.play * np.sign(tau)
+        return before
+
+    def fastest(self, bodies: Array) -> float:
+        """Return the largest rate of the gears, of swinging or of damping [1/s]."""
+        lightest = self.rotors.diagonal() + np.linalg.inv(bodies).diagonal()
+        return float(np.max(np.maximum(np.sqrt(self.k * lightest), self.d * lightest)))
+
+
+class _Torque:
+    """The controller: it knows the bodies of the URDF, its gains suit the true mass matrix."""
+
+    def __init__(self, model: RobotModel, settings: Controller, mass: Array) -> None:
+        self.kind, self.w = settings.kind, settings.bandwidth
+        self.nominal = RobotPlant(model, model.standard_parameters())
+        inertia = np.maximum(mass.diagonal(), _LEAST_INERTIA)
+        stated = [
+            by_joint(x, model.joints, f"controller: {name}", np.nan)
+            for name, x in (("kp", settings.kp), ("kd", settings.kd))
+        ]
+        usual = inertia * self.w**2, 2 * inertia * self.w
+        self.kp, self.kd = (np.where(np.isnan(x), y, x) for x, y in zip(stated, usual, strict=True))
+
+    def ahead(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the torque that is fed forward along a motion, shape (N, n)."""
+        if self.kind != "feedforward":
+            return np.zeros_like(q)
+        return np.stack([self.nominal.bodies_torque(*one) for one in zip(q, v, a, strict=True)])
+
+    def of(self, q: Array, v: Array, q_r: Array, v_r: Array, a_r: Array, ahead: Array) -> Array:
+        """Return the torque that is asked of the drives, shape (n,)."""
+        if self.kind == "computed_torque":
+            w = self.w
+            return self.nominal.bodies_torque(q, v, a_r + w**2 * (q_r - q) + 2 * w * (v_r - v))
+        u: Array = ahead + self.kp * (q_r - q) + self.kd * (v_r - v)
+        return u
+
+
+def _limits(model: RobotModel, actuator: Actuator) -> Array:
+    """Return the most that each drive gives, shape (n,) [N m or N]; infinite without a limit."""
+    stated = by_joint(actuator.limits, model.joints, "actuator: limits", np.nan)
+    share = actuator.effort
+    urdf = [share * j.effort if share and j.effort > 0 else np.inf for j in model.limits]
+    return np.where(np.isnan(stated), urdf, stated)

@@ -1,7 +1,8 @@
-"""Motions to follow: Fourier series within a robot's limits, quintics from rest to rest."""
+"""Motions to follow: Fourier series within limits, quintics from rest to rest, samples."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -9,8 +10,9 @@ from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
 
-__all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "random_fourier"]
+__all__ = ["FourierTrajectory", "Motion", "ProgramMotion", "SampledMotion", "random_fourier"]
 
+_ORDER = 5  # of the polynomials through samples
 _HARMONICS = 5  # of a random motion
 _ROTARY_REACH = 1.2  # [rad] amplitude of a joint whose limits are wider or unknown
 _LINEAR_REACH = 0.15  # [m]
@@ -93,6 +95,44 @@ class ProgramMotion(Motion):
         q = self.start + A * (6 * s**5 - 15 * s**4 + 10 * s**3)
         v = A * (30 * s**4 - 60 * s**3 + 30 * s**2) / T
         a = A * (120 * s**3 - 180 * s**2 + 60 * s) / T**2
+        return q, v, a
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMotion(Motion):
+    """A motion through samples: by pieces of order 5 through q, v and a, or a spline through q.
+
+    Both have a continuous acceleration; time starts at the first sample.
+    """
+
+    t: Array  # shape (N,) [s]
+    q: Array  # shape (N, n) [rad or m]
+    v: Array | None = None  # [rad/s or m/s]
+    a: Array | None = None  # [rad/s^2 or m/s^2]
+
+    def __post_init__(self) -> None:
+        if len(self.t) < _ORDER + 1:
+            raise DataError(f"the motion has {len(self.t)} rows, wanted at least {_ORDER + 1}")
+
+    @property
+    def duration(self) -> float:
+        """How long it takes [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    @cached_property
+    def _curves(self) -> tuple[Any, Any, Any]:
+        """The position and its derivatives, functions of time since the start."""
+        from scipy.interpolate import BPoly, make_interp_spline
+
+        t = self.t - self.t[0]
+        if self.v is None or self.a is None:
+            curve = make_interp_spline(t, self.q, k=_ORDER)
+        else:
+            curve = BPoly.from_derivatives(t, np.stack([self.q, self.v, self.a], axis=1))
+        return curve, curve.derivative(1), curve.derivative(2)
+
+    def evaluate(self, t: Array) -> tuple[Array, Array, Array]:
+        q, v, a = (curve(t) for curve in self._curves)
         return q, v, a
 
 

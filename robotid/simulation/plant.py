@@ -1,29 +1,64 @@
 """The true robot: forward dynamics by Pinocchio, with the drives that a URDF does not know."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, NotConvergedError
-from robotid.regressor.columns import drive_motion
+from robotid.robot.drives import Bristles, DriveMotion, DriveTerm, Lag, LoadFriction
 from robotid.robot.mass_matrix import drive_inertia, rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["RobotPlant", "rk4"]
+__all__ = ["Friction", "RobotPlant", "rk4"]
 
 _ITERATIONS = 200  # of the load and its friction, which shrink by the size of the parameter
-_SETTLED = 1e-12  # relative change of the acceleration that ends them
-_SIGN_SPEED = 2e-3  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
+_SETTLED = 1e-12  # relative change of the load that ends them
+_SIGN_SPEED = 2e-4  # [rad/s or m/s] speed over which the plant's Coulomb friction changes sign
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Drives that have one term in common."""
+
+    term: DriveTerm
+    drives: Array | slice  # their k numbers
+    theta: Array  # its parameters, shape (k,)
+    states: slice  # their places among the states of bristles; empty without any
+    none: Array  # zeros, shape (k,)
+    one: Array  # ones, shape (k,)
+
+    def torque(self, angle: Array, w: Array) -> Array:
+        """Return what it adds, for positive direction and unit load, shape (k,)."""
+        d = self.drives
+        column = self.term.column(
+            DriveMotion(angle[d], w[d], self.none, self.one, self.one, self.none)
+        )
+        return self.theta * column
+
+
+@dataclass(frozen=True)
+class Friction:
+    """The torque of drives that move, ``along * sign(w) + rest``, all of shape (d,).
+
+    Beside it ``loaded * sign(w)`` times the size of the load of each.
+    """
+
+    along: Array
+    rest: Array
+    loaded: Array
 
 
 class RobotPlant:
     """The plant M(q) a + b(q, v) + Ia a + Fv v + Fc sign(v) + off = u of a robot.
 
-    The drives' terms are those of the model; sign(v) is tanh(v / 2 mm/s), so that it can be
+    The drives' terms are those of the model; sign(v) is tanh(v / 0.2 mm/s), so that it can be
     integrated; drives that turn with several joints load all of them. Friction that grows with the
-    load knows the load of this very instant. A plant has no past: presliding slides, nothing lags.
+    load knows the load of this very instant. What presliding has taken up, z, is a state of the
+    plant with the rate of ``taking_up``; where it is not given, the drives have slid for long.
+    A torque that comes late (``Lag``) does so in what is measured, not in the plant.
 
     Args:
         model: The robot, with a fixed base.
@@ -38,13 +73,26 @@ class RobotPlant:
             raise DataError("a robot with a floating base cannot be simulated without contacts")
         if pi.shape != (len(model.layout.names),):
             raise DataError(f"pi has shape {pi.shape}, wanted ({len(model.layout.names)},)")
-        self.model = model
+        self.model, self.pi = model, pi
         self._bodies = model.with_parameters(pi)
         self._data = self._bodies.pin_model.createData()
-        theta = pi[model.layout.n_inertial :]
-        self._theta = model.layout.drive_loads * theta  # (n, k)
-        self._armature = drive_inertia(model.layout, pi)
-        self._is_loaded = bool(theta[list(model.layout.remembering)].any())
+        self.armature = drive_inertia(model.layout, pi)  # (n, n)
+        self.ratios = model.layout.drive_ratios  # (d, n)
+        self._share = self.ratios / np.sum(self.ratios**2, axis=1, keepdims=True).clip(min=1e-300)
+        self._groups = _grouped(model, pi)
+        self.n_states = sum(g.states.stop - g.states.start for g in self._groups)
+        self.is_loaded = any(isinstance(g.term, LoadFriction) for g in self._groups)
+        G, A = model.velocity_map, self.armature
+        # joints that are Pinocchio's own, each with a rotor of its own: its ABA does it all
+        self._is_plain = np.array_equal(G, np.eye(len(G))) and np.array_equal(
+            A, np.diag(A.diagonal())
+        )
+        self._is_angle = (
+            model.pin_model.nq == model.pin_model.nv and not model.position_offset.any()
+        )
+        self._driven = pin.Model(self._bodies.pin_model)
+        if self._is_plain:
+            self._driven.armature = A.diagonal().copy()
 
     def mass_matrix(self, q: Array) -> Array:
         """Return D(q), the mass matrix with the drives' armature, shape (n, n).
@@ -52,8 +100,11 @@ class RobotPlant:
         Args:
             q: Joint coordinates, shape (n,) [rad or m].
         """
+        if self._is_plain:
+            mass: Array = pin.crba(self._driven, self._data, self._configuration(q))
+            return mass.copy()
         x = self.model.configurations(q[None])
-        mass: Array = rigid_mass_matrices(self._bodies, x, self._data)[0] + self._armature
+        mass = rigid_mass_matrices(self._bodies, x, self._data)[0] + self.armature
         return mass
 
     def bias(self, q: Array, v: Array) -> Array:
@@ -63,55 +114,178 @@ class RobotPlant:
             q: Joint coordinates, shape (n,) [rad or m].
             v: Joint velocities, shape (n,) [rad/s or m/s].
         """
-        rigid = self._rigid(q, v)
-        return rigid + self._drives(q, v, rigid)
+        rigid = self.bodies_torque(q, v, 0.0 * v)
+        return rigid + self.friction_torque(self.friction(q, v), v, rigid)
 
-    def _rigid(self, q: Array, v: Array) -> Array:
-        """Return the torque of the bodies at constant velocity, shape (n,) [N m or N]."""
-        G, x = self.model.velocity_map, self.model.configurations(q[None])[0]
-        rigid: Array = G.T @ pin.nonLinearEffects(self._bodies.pin_model, self._data, x, G @ v)
+    def bodies_torque(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the torque that the bodies alone ask for, shape (n,) [N m or N].
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad or m].
+            v: Joint velocities, shape (n,) [rad/s or m/s].
+            a: Joint accelerations, shape (n,) [rad/s^2 or m/s^2].
+        """
+        G, x = self.model.velocity_map, self._configuration(q)
+        rigid: Array = G.T @ pin.rnea(self._bodies.pin_model, self._data, x, G @ v, G @ a)
         return rigid
 
-    def _drives(self, q: Array, v: Array, load: Array) -> Array:
-        """Return the torque of the drives at constant velocity, shape (n,) [N m or N]."""
-        layout = self.model.layout
-        signs = np.tanh(layout.drive_ratios @ v / _SIGN_SPEED)
-        motion = drive_motion(layout, q[None], v[None], 0.0 * v[None], signs[None], load[None])
-        columns = [term.column(motion.of(d))[0] for d, term in layout.drive_parameters]
-        torque: Array = self._theta @ np.array(columns)
+    def friction(self, q: Array, v: Array, z: Array | None = None) -> Friction:
+        """Return the torque of the drives but for their inertia and the sign of their speed.
+
+        Args:
+            q: Coordinates of what the drives turn, shape (n,) [rad or m].
+            v: Their velocities, shape (n,) [rad/s or m/s].
+            z: What presliding has taken up, shape (n_states,) [-]; None: drives that have slid.
+        """
+        angle, w = self.ratios @ q, self.ratios @ v
+        along, rest, loaded = np.zeros((3, len(w)))
+        for group in self._groups:
+            term = group.term
+            if z is not None and isinstance(term, Bristles):
+                rest[group.drives] += group.theta * z[group.states]
+            elif isinstance(term, LoadFriction):
+                loaded[group.drives] += group.torque(angle, w)
+            elif term.follows_direction:
+                along[group.drives] += group.torque(angle, w)
+            else:
+                rest[group.drives] += group.torque(angle, w)
+        return Friction(along, rest, loaded)
+
+    def friction_torque(self, F: Friction, v: Array, load: Array) -> Array:
+        """Return the torque of the drives but for their inertia, shape (n,) [N m or N].
+
+        Args:
+            F: As of ``friction``.
+            v: As of ``friction``.
+            load: Torque of the bodies, shape (n,) [N m or N].
+        """
+        along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
+        torque: Array = self.ratios.T @ (along * np.tanh(self.ratios @ v / _SIGN_SPEED) + F.rest)
         return torque
 
-    def acceleration(self, q: Array, v: Array, u: Array) -> Array:
+    def chord(self, F: Friction, v: Array, load: Array) -> Array:
+        """Return the friction that follows the sign of the speed, over the speed, shape (n, n).
+
+        Args:
+            F: As of ``friction``.
+            v: As of ``friction``.
+            load: As of ``friction_torque``.
+        """
+        along = F.along + F.loaded * np.abs(self._share @ load) if self.is_loaded else F.along
+        x = np.maximum(np.abs(self.ratios @ v) / _SIGN_SPEED, 1e-6)  # tanh(x) / x is 1 at 0
+        slope = np.maximum(along, 0.0) * np.tanh(x) / (x * _SIGN_SPEED)
+        over: Array = (self.ratios.T * slope) @ self.ratios
+        return over
+
+    def taking_up(self, v: Array) -> tuple[Array, Array]:
+        """Return how presliding is taken up, dz/dt = r (g sign(w) - z): r [1/s], g sign(w).
+
+        Args:
+            v: Velocities of what the drives turn, shape (n,) [rad/s or m/s].
+        """
+        w = self.ratios @ v
+        rate, end = np.zeros((2, self.n_states))
+        for group in self._groups:
+            if isinstance(group.term, Bristles):
+                speed = w[group.drives]
+                level = group.term.level(speed)
+                rate[group.states] = np.abs(speed) / (group.term.displacement * level)
+                end[group.states] = np.sign(speed) * level
+        return rate, end
+
+    def acceleration(self, q: Array, v: Array, u: Array, F: Friction | None = None) -> Array:
         """Return the acceleration of a torque, D(q)^-1 (u - C(q, v)) [rad/s^2 or m/s^2], as q.
 
         Args:
             q: Joint coordinates, shape (n,), or (R, n) for R robots [rad or m].
             v: Joint velocities, shape as q [rad/s or m/s].
             u: Torque, shape as q [N m or N].
+            F: Friction of one robot, if it is known.
+
+        Raises:
+            NotConvergedError: If friction that grows with the load would hold any load.
 
         References:
             Tzvetkova, (11).
         """
-        if q.ndim == 1 and not self._is_loaded:
-            return np.linalg.solve(self.mass_matrix(q), u - self.bias(q, v))
-        if q.ndim == 1:
-            return self._loaded_acceleration(q, v, u)
-        return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
+        if q.ndim == 2:
+            return np.stack([self.acceleration(*one) for one in zip(q, v, u, strict=True)])
+        F = self.friction(q, v) if F is None else F
+        sign = np.tanh(self.ratios @ v / _SIGN_SPEED)
+        free = u - self.ratios.T @ (F.along * sign + F.rest)
+        a = self.free_acceleration(q, v, free)
+        return self._loaded(q, free, a, F.loaded * sign) if self.is_loaded else a
 
-    def _loaded_acceleration(self, q: Array, v: Array, u: Array) -> Array:
+    def free_acceleration(self, q: Array, v: Array, tau: Array, *, rotors: bool = True) -> Array:
+        """Return the acceleration of bodies and rotors that a torque leaves, shape (n,).
+
+        Args:
+            q: Joint coordinates, shape (n,) [rad or m].
+            v: Joint velocities, shape (n,) [rad/s or m/s].
+            tau: The torque that friction has been taken from, shape (n,) [N m or N].
+            rotors: Whether the drives' rotors turn with the bodies.
+        """
+        x, G = self._configuration(q), self.model.velocity_map
+        if self._is_plain:
+            robot = self._driven if rotors else self._bodies.pin_model
+            a: Array = pin.aba(robot, self._data, x, v, tau)
+            return a.copy()
+        D = rigid_mass_matrices(self._bodies, x[None], self._data)[0] + rotors * self.armature
+        bias = G.T @ pin.nonLinearEffects(self._bodies.pin_model, self._data, x, G @ v)
+        return np.linalg.solve(D, tau - bias)
+
+    def _loaded(self, q: Array, free: Array, a: Array, coefficient: Array) -> Array:
         """Return the acceleration whose load makes the friction that leaves it, by iteration."""
-        D, rigid = self.mass_matrix(q), self._rigid(q, v)
-        bodies, load, a = D - self._armature, rigid, np.zeros_like(u)
+        D = self.mass_matrix(q)
+        lost = np.linalg.solve(D, self.ratios.T * coefficient)  # (n, d), a per load
+        bare = self._share @ (free - self.armature @ a)  # load of the drives without it
+        slope = self._share @ (self.ratios.T * coefficient - self.armature @ lost)
+        load = bare
+        if not np.isfinite(bare).all():  # of a state that has diverged
+            return a
         for _ in range(_ITERATIONS):
-            before, a = a, np.linalg.solve(D, u - rigid - self._drives(q, v, load))
-            load = rigid + bodies @ a
-            if np.abs(a - before).max() <= _SETTLED * (1.0 + np.abs(a).max()):
-                return a
+            before, load = load, bare - slope @ np.abs(load)
+            if np.abs(load - before).max() <= _SETTLED * (1.0 + np.abs(load).max()):
+                settled: Array = a - lost @ np.abs(load)
+                return settled
         raise NotConvergedError(
             f"the friction that grows with the load does not settle in {_ITERATIONS} steps: its "
             "parameters are too large for a drive that moves",
             "max_iterations",
         )
+
+    def _configuration(self, q: Array) -> Array:
+        """Return Pinocchio's configuration, shape (nq,)."""
+        if self._is_plain and self._is_angle:
+            return q
+        x: Array = self.model.configurations(q[None])[0]
+        return x
+
+
+def _grouped(model: RobotModel, pi: Array) -> tuple[_Group, ...]:
+    """Return the terms of the drives that are neither inertia nor of what is measured."""
+    theta = pi[model.layout.n_inertial :]
+    terms: dict[DriveTerm, list[int]] = {}
+    for k, (_, term) in enumerate(model.layout.drive_parameters):
+        if theta[k] != 0.0 and not term.is_inertia and not isinstance(term, Lag):
+            terms.setdefault(term, []).append(k)
+    groups, states = [], 0
+    for term, numbers in terms.items():
+        drives = [model.layout.drive_parameters[k][0] for k in numbers]
+        is_all = drives == list(range(len(model.layout.drives)))
+        more = len(numbers) if isinstance(term, Bristles) else 0
+        groups.append(
+            _Group(
+                term,
+                slice(None) if is_all else np.array(drives),
+                theta[numbers],
+                slice(states, states + more),
+                np.zeros(len(numbers)),
+                np.ones(len(numbers)),
+            )
+        )
+        states += more
+    return tuple(groups)
 
 
 def rk4(

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
@@ -369,6 +370,9 @@ def test_demo_runs_from_nothing_and_finds_the_truth(tmp_path, capsys):
     count = int(printed.split(" of 58 base")[0].split()[-1])
     assert count >= 55  # 58 intervals of 99.7 % and a little model error of the friction's edge
     assert (out / "replay.html").stat().st_size > 100_000
+    links = re.findall(r'<a href="([^"#]+)"', (out / "report.html").read_text(encoding="utf-8"))
+    assert len(links) == 4
+    assert {name for name in links if (out / name).is_file()} == set(links)
     assert str(out / "report.html") in printed
 
 

@@ -20,6 +20,7 @@ from helpers.synthetic import exact_log, truth
 from robotid._typing import STAGES
 from robotid.cli import main
 from robotid.commands.console import terminal_progress
+from robotid.commands.printing import print_content
 from robotid.identification.pipeline import identify
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -40,7 +41,8 @@ def test_python_hears_of_each_stage_of_logs_in_memory(log):
     identify(
         model, [log], estimator="wls", friction="viscous", progress=lambda *told: heard.append(told)
     )
-    assert heard == [(name, k, 5, "stages") for k, name in enumerate(STAGES) if k < 4]
+    stages = [(name, k, 5, "stages") for k, name in enumerate(STAGES) if k < 4]
+    assert heard == [*stages[:3], ("fits", 0, 1, "fits"), stages[3]]
 
 
 def test_verbose_says_the_stages_where_there_is_no_terminal(log, tmp_path, capsys):
@@ -164,3 +166,72 @@ def test_inspect_shows_base_parameters_where_they_are_asked_for(tmp_path, capsys
     long = capsys.readouterr().out
     assert long.index("error: ") < long.index("base parameters, inertial")
     assert len(long.splitlines()) > len(short.splitlines()) + 3
+
+
+def test_logs_of_one_name_are_named_by_their_paths(arm_logs, tmp_path, capsys):
+    other = tmp_path / "fit.csv"
+    other.write_bytes((arm_logs / "keep.csv").read_bytes())
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), str(other), "--estimator", "wls"]
+    words += ["--friction", "viscous", "--no-report", "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(rf"fitted: {arm_logs}/fit.csv 0-7.99 s, {other} 0-7.99 s", said)
+
+
+def test_compare_keeps_columns_apart_and_files_of_one_name_too(arm_logs, tmp_path, capsys):
+    words = ["identify", ARM, str(arm_logs / "fit.csv"), "--validate", str(arm_logs / "keep.csv")]
+    for cutoff in ("8", "9"):
+        out = ["--cutoff", cutoff, "--estimator", "wls", "--no-report", "--friction", "viscous"]
+        assert main([*words, *out, "--out", str(tmp_path / cutoff)]) == 0
+    capsys.readouterr()
+    results = [str(tmp_path / cutoff / "result.json") for cutoff in ("8", "9")]
+    assert main(["compare", *results]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[-1] for line in lines[:2]] == results
+    assert "not fitted: keep.csv 0-7.99 s, error %" in lines
+    contents = [json.loads(Path(result).read_text()) for result in results]
+    by_name = [{e["name"]: e for e in content["base_parameters"]} for content in contents]
+    for name, entry in by_name[0].items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        _, first, second, *unit, difference = line.split()
+        assert float(first) == pytest.approx(entry["value"], abs=0.06 * entry["std_error"])
+        found = by_name[1][name]
+        assert float(second) == pytest.approx(found["value"], abs=0.06 * found["std_error"])
+        assert " ".join(unit) == entry["unit"]
+        error = np.hypot(entry["std_error"], found["std_error"])
+        assert float(difference) == pytest.approx(
+            (found["value"] - entry["value"]) / error, abs=0.06
+        )
+
+
+def finding(joint, code, share, severity="warning"):
+    message = f"run.csv: {share:g} % of {joint}'s torque is odd"
+    evidence = {"share": share / 100}
+    return {"code": code, "severity": severity, "where": f"run.csv: {joint}", "message": message,
+            "evidence": evidence}  # fmt: skip
+
+
+def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
+    joints = ["arm_1", "arm_6", "arm_7"]
+    findings = [
+        *(finding(joint, "stepped", 20) for joint in ("arm_6", "arm_7")),
+        *(finding(joint, "odd", share) for joint, share in (("arm_6", 37), ("arm_7", 68))),
+        finding("arm_1", "noise", 1, "note"),
+    ]
+    content = {"findings": findings, "joints": joints}
+    print_content("doctor", content)
+    assert capsys.readouterr().out.splitlines() == [
+        "warning: stepped: run.csv: 20 % of arm_6, arm_7's torque is odd",
+        "warning: odd: run.csv: 37 to 68 % of arm_6, arm_7's torque is odd",
+        "4 findings, 2 causes; worst: arm_7; 1 note hidden (--verbose)",
+    ]
+    findings.append(finding("arm_1", "reversed", 1, "error"))  # graver than any two warnings
+    print_content("doctor", content, is_verbose=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "error: reversed: run.csv: 1 % of arm_1's torque is odd"
+    assert lines[-2:] == [
+        "note: noise: run.csv: 1 % of arm_1's torque is odd",
+        "6 findings, 4 causes; worst: arm_1",
+    ]
+    print_content("doctor", {"findings": [], "joints": joints})
+    assert capsys.readouterr().out == "nothing was found\n"

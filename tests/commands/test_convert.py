@@ -181,4 +181,5 @@ def test_the_flags_of_identify_say_where_the_signals_are(tmp_path, ur5, rng, cap
     )
     assert main([*words, "--stamp", "wall"]) == 2
     assert main([*words, "--topic", "/arm", "--effort", "current"]) == 1
-    assert "has the current 'effort_shoulder_pan_joint' but no gain" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"joints {', '.join(ur5.joints)} have currents but no gain" in said

@@ -99,7 +99,10 @@ def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
     cut[0] = cut[0].replace("q_elbow", "x_elbow")
     (folder / "design.csv").write_text("\n".join(cut) + "\n")
     assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1
-    assert "design.csv has no column 'q_elbow_joint'; columns: " in capsys.readouterr().err
+    assert (
+        "design.csv has no column 'q_elbow_joint'; position columns found: "
+        in capsys.readouterr().err
+    )
 
 
 def test_a_joint_that_stands_still_has_no_prediction(folder):

@@ -1,17 +1,17 @@
 """Logs of a robot whose drives have terms of their own."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from helpers.synthetic import perfect
 from robotid.identification.pipeline import identify
-from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
-from robotid.logs.signals import process
-from robotid.regressor.memory import remember
-from robotid.regressor.prediction import predict
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.closed_loop import another_robot
+from robotid.simulation.closed_loop import Noise, another_robot
 from robotid.simulation.motions import random_fourier
+from robotid.simulation.settings import Sensors
 
 EXACT = SignalSettings(cutoff=None, trim=0.0)
 JOINTS = ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")
@@ -56,15 +56,27 @@ def driven_log(
         still: Numbers of joints that stand.
     """
     rng = np.random.default_rng(seed)
-    t = np.arange(round(duration * rate)) / rate
-    q, v, a = random_fourier(model, rng, period=duration / 3).evaluate(speed * t)
-    q, v, a = reach * q, reach * speed * v, reach * speed**2 * a
-    for j in still:
-        q[:, j], v[:, j], a[:, j] = 0.3, 0.0, 0.0
-    log = Log(t=t, q=q, v=v, a=a, tau=np.zeros_like(q), joints=model.joints)
-    tau = predict(model, [pi], remember(model, process(log, EXACT)))[0]
-    tau = tau + noise * np.sqrt(np.mean(tau**2, axis=0)) * rng.standard_normal(tau.shape)
-    return Log(t=t, q=q, v=v, a=a, tau=tau, joints=model.joints)
+    motion = _Scaled(random_fourier(model, rng, period=duration / 3), reach, speed, still)
+    sensors = Sensors(acceleration=True, noise=Noise(tau=noise))
+    length = (round(duration * rate) - 1) / rate
+    return perfect(model, pi, motion, rng, rate=rate, duration=length, sensors=sensors)
+
+
+@dataclass(frozen=True)
+class _Scaled:
+    """A motion that goes further, or faster, or whose joints stand in part."""
+
+    motion: object
+    reach: float
+    speed: float
+    still: tuple
+
+    def evaluate(self, t):
+        q, v, a = self.motion.evaluate(self.speed * t)
+        q, v, a = self.reach * q, self.reach * self.speed * v, self.reach * self.speed**2 * a
+        for j in self.still:
+            q[:, j], v[:, j], a[:, j] = 0.3, 0.0, 0.0
+        return q, v, a
 
 
 def found_in(model, logs, **options):

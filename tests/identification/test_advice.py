@@ -61,6 +61,10 @@ def test_an_error_comes_before_a_warning_and_three_steps_are_enough(identified):
     assert next(step.words for step in steps) == "Not_known is so; do something."
     assert steps[0].blocks == ("robotid doctor 'my job.toml'",)
     assert words(steps)[1:] == ["State", "If"]
+    grave = told(
+        identified, warning("torque_delay", delay=0.01), warning("spikes", severity="error")
+    )
+    assert words(next_steps(grave, JOB))[:2] == ["Look", "If"]
 
 
 @pytest.mark.parametrize(

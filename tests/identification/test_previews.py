@@ -96,6 +96,16 @@ def test_torques_that_a_log_has_are_ignored(ur5, motion, recorded):
     np.testing.assert_array_equal(first.bands[0].total, second.bands[0].total)
 
 
+def test_velocities_of_a_motion_are_taken_if_they_are_those_of_its_positions(ur5, motion):
+    log, (_, v, a) = motion
+    with_rates = preview(ur5, [replace(log, v=v, a=a)], noise=white(), estimator="wls")
+    assert with_rates.expected.fitted[0].recording.signals.velocity == "measured"
+    wrong = preview(ur5, [replace(log, v=np.roll(v, 3, axis=1))], noise=white(), estimator="wls")
+    assert wrong.expected.fitted[0].recording.signals.velocity == "differentiated"
+    without = preview(ur5, [log], noise=white(), estimator="wls")
+    np.testing.assert_allclose(with_rates.base_error, without.base_error, rtol=0.1)
+
+
 @pytest.mark.parametrize("estimator", ["wls", "ols"])
 def test_errors_are_in_proportion_to_the_noise_and_fall_with_the_root_of_the_length(
     ur5, motion, estimator
@@ -123,7 +133,7 @@ def test_the_density_of_noise_counts_and_not_the_rate_of_the_rows(ur5, motion):
 def test_the_prior_only_helps_and_bands_are_of_the_motion(ur5, motion):
     log = motion[0]
     free = preview(ur5, [log], noise=white(), estimator="wls")
-    kept = preview(ur5, [log], noise=white())
+    kept = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1.0))
     assert (kept.base_error <= free.base_error * 1.001).all()
     assert (kept.base_error <= kept.plausible * 1.001).all()
     light = preview(ur5, [log], noise=white(), estimator=EstimatorSettings(prior_weight=1e-9))

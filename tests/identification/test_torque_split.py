@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -9,9 +10,17 @@ import pytest
 from helpers.driven import ELBOW, EXACT, LIFT, WRIST, arm, driven, driven_log
 from helpers.misfits import coloured
 from helpers.synthetic import truth
+from scipy.signal import butter, sosfiltfilt
 
 from robotid.exceptions import DataError
-from robotid.identification.torque_split import JointTorque, Rows, joint_torques, split_torque
+from robotid.identification.torque_split import (
+    JointTorque,
+    Rows,
+    _quick_shares,
+    joint_torques,
+    split_torque,
+)
+from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.memory import remember
 from robotid.regressor.prediction import predict
@@ -215,7 +224,7 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
     assert [d.name for d in found.follows if d.is_sure] == [name]
     said = found.sentence
     if name == "constant":
-        assert re.search(r"4\d % a constant of (1|0.9\d|1.0) N m", said)
+        assert re.search(r"4\d % of its square is a constant of (1|0.9\d|1.0) N m", said)
         assert "Zero the torque sensor" in said
     else:
         assert f"follows the {name}, which explains" in said
@@ -260,3 +269,26 @@ def test_what_the_fitted_recordings_do_not_show_has_changed(rng):
     before, after = (torque(x + noise, v, q, load) for x in (0.0, np.tanh(v)))
     assert "Try another friction model" in replace(after, fitted=after).sentence
     assert "something has changed since" in replace(after, fitted=before).sentence
+
+
+@pytest.mark.parametrize(("kind", "low", "high"), [("noise", 0.9, 1.0), ("slow", 0.046, 0.07)])
+def test_filtered_noise_is_quick_and_what_is_slow_is_not(kind, low, high):
+    rng, rate, cutoff, N = np.random.default_rng(0), 500.0, 10.0, 20_000
+    t, segment = np.arange(N) / rate, np.arange(N) // 500
+    if kind == "noise":
+        sos = butter(4, cutoff, fs=rate, output="sos")
+        r = sosfiltfilt(sos, rng.standard_normal(N))
+    else:  # 1 - cos(2 pi f L) of f = cutoff / 20, for L = 1 / cutoff; its sign changes at gaps
+        r = (-1.0) ** segment * np.cos(2 * np.pi * cutoff / 20 * t)
+    mask = np.ones((N, 1), bool)
+    mask[:100] = False
+    r = np.where(mask[:, 0], r, 1e3)
+    e = SimpleNamespace(
+        recording=SimpleNamespace(
+            trajectory=SimpleNamespace(tau=r[:, None], segment=segment, rate=rate),
+            signals=SignalSettings(cutoff=cutoff), mask=mask,
+        ),
+        torques={"estimate": np.zeros((N, 1))},
+    )  # fmt: skip
+    (quick,) = _quick_shares([e])
+    assert low <= quick <= high

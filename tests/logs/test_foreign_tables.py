@@ -9,7 +9,7 @@ from helpers.synthetic import exact_log, truth
 
 import robotid
 from robotid.commands.convert import convert
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, ModelError
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.read import read_log, read_logs, write_log
@@ -186,3 +186,18 @@ def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tm
     ]
     with pytest.raises(DataError, match="no log was given; at least one is needed"):
         robotid.identify(ur5, [])
+    with pytest.raises(ModelError, match="model is a NoneType, wanted a RobotModel or the path"):
+        robotid.identify(None, first)
+
+
+def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    (back,) = read_logs(log.select(ur5.joints[::-1]), ur5.joints)
+    assert back.joints == ur5.joints
+    np.testing.assert_array_equal(back.tau, log.tau)
+    with refused(
+        "log has the joints elbow_joint, but not wrist_1_joint, which the model has; record them, "
+        "or if they stood still, lock them where they stood: RobotModel.from_urdf(..., "
+        "locked={'wrist_1_joint': 0.0})"
+    ):
+        read_logs(log.select(["elbow_joint"]), ["elbow_joint", "wrist_1_joint"])

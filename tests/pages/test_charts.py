@@ -69,6 +69,17 @@ def test_what_the_page_holds_is_the_data_to_a_65000th_of_their_range(torque, lin
     assert len(chart_html(torque, "")) < 45_000
 
 
+def test_a_hidden_series_is_in_the_data_alone():
+    wild = Series("wild", np.array([0.0, 900.0]), "urdf", is_hidden=True)
+    series = (wild, Series("tame", np.array([0.0, 1.0]), "text"))
+    html = chart_html(Chart("c", np.arange(2.0), series, "x", "y"), "")
+    assert [s["hidden"] for s in charts(html)[0]["series"]] == [True, False]
+    svg = html.partition("</svg>")[0]
+    assert "wild" not in svg
+    assert "tame" in svg
+    assert "900" not in svg  # nor is the axis made for it
+
+
 def test_a_thinned_line_keeps_its_extremes_its_ends_and_both_sides_of_its_breaks(rng):
     y = rng.normal(size=10_000)
     y[[1234, 7777]] = [-40.0, 50.0]
@@ -266,3 +277,21 @@ def test_without_scripts_the_still_pictures_stand_in_the_page(browser, demo):
     with visit(browser, demo, java_script_enabled=False) as seen:
         assert seen.page.locator("figure.chart svg").first.is_visible()
         assert seen.page.locator(".explore").count() == 0
+
+
+def test_labels_of_many_series_stay_inside_the_still_picture():
+    x, names = np.arange(3.0), ("gravity", "inertia", "Coriolis", "motor inertia", "friction")
+    every = (*names, "offset", "residual", "measured")
+    series = tuple(Series(name, x, "text") for name in every)
+    html = chart_html(Chart("many", x, series, "time [s]", "torque [N m]"), "")
+    _, _, width, height = map(float, re.search(r'viewBox="([^"]*)"', html)[1].split())
+    labels = {t: (float(a), float(b)) for a, b, t in re.findall(
+        r'<text x="([\d.]+)" y="([\d.]+)">([^<]*)</text>', html)}  # fmt: skip
+    assert set(every) < set(labels)
+    for name in every:
+        place, down = labels[name]
+        assert place + 6.2 * len(name) <= width
+        assert down < height
+    assert labels["measured"][1] > labels["gravity"][1]
+    few = chart_html(Chart("few", x, series[:2], "time [s]", "torque [N m]"), "")
+    assert float(re.search(r'viewBox="([^"]*)"', few)[1].split()[3]) < height

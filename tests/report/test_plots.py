@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from helpers.figures import torques
 from helpers.pages import chart
 
 from robotid.identification.information import information
+from robotid.identification.pictures import torque_charts
 from robotid.identification.residuals import autocorrelation, spectrum
 from robotid.robot.parameters import INERTIAL_TERMS
 
@@ -54,6 +56,14 @@ def test_torque_is_drawn_as_measured_identified_urdf_and_residual(
     close(lower["series"][1]["y"][np.isfinite(t)], tau - predicted[:, j] + blank)
     assert np.isnan(upper["series"][1]["y"]).sum() == np.isnan(t).sum() == 1
     assert upper["link"] == lower["link"] != ""
+
+
+def test_a_urdf_that_would_dwarf_the_torque_is_hidden_at_first(identified, kept):
+    torques = dict(kept.torques)
+    for factor, wanted in ((1.0, False), (100.0, True)):
+        torques["urdf"] = factor * kept.torques["urdf"]
+        upper, _ = torque_charts(identified, replace(kept, torques=torques), 1)
+        assert [series.is_hidden for series in upper.series] == [wanted, False, False]
 
 
 @pytest.mark.parametrize("j", JOINTS)

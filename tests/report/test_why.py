@@ -101,7 +101,13 @@ def test_the_browser_draws_what_sums_to_the_prediction(section, browser, tmp_pat
 
 
 def test_the_section_stays_small(section):
-    assert len(section) < 6 * 100_000
+    assert len(section) < 6 * 90_000
+
+
+def test_of_many_joints_the_worst_have_all_charts_and_the_others_the_split(identified, monkeypatch):
+    monkeypatch.setattr("robotid.report.why._MOST", 2)
+    counts = [len(charts(part)) for part in why_section(identified).split("<details")[1:]]
+    assert counts == [7, 7, 1, 1, 1, 1]
 
 
 def test_the_residual_against_speed_is_drawn_with_its_mean(section, torques):
@@ -119,3 +125,10 @@ def test_the_residual_against_speed_is_drawn_with_its_mean(section, torques):
     )  # fmt: skip
     assert chart["x_label"] == "speed [rad/s]"
     assert x[0] >= speed.centres[0] - 1e-6
+
+
+def test_charts_over_time_share_the_cursor_of_the_torques(report):
+    links = {chart["title"]: chart["link"] for chart in charts(report)}
+    split = {link for title, link in links.items() if "the sum of" in title}
+    measured = {link for title, link in links.items() if "measured, identified" in title}
+    assert split == measured == {"recording 0"}

@@ -1,16 +1,19 @@
 import re
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.synthetic import truth
 
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import Lag, LoadFriction, Presliding
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
-from robotid.simulation.closed_loop import Noise, simulate
+from robotid.simulation.closed_loop import Noise, carried, follow, simulate
 from robotid.simulation.motions import FourierTrajectory, random_fourier
+from robotid.simulation.settings import Actuator, Controller, Payload, Simulation
 
 
 def test_a_fourier_motion_keeps_its_derivatives(rng):
@@ -57,7 +60,7 @@ def test_the_log_of_the_plant_obeys_its_own_equation(ur5, rng):
     log = simulate(ur5, pi, random_fourier(ur5, rng), rate=1000.0, duration=2.0, rng=rng)
     a = np.gradient(log.v, log.t, axis=0)
     tau = (joint_torque_regressor(ur5, log.q, log.v, a) @ pi).reshape(log.tau.shape)
-    smooth = (np.abs(log.v) > 0.02).all(axis=1)  # the plant's friction is tanh(v / 2 mm/s)
+    smooth = (np.abs(log.v) > 0.02).all(axis=1)  # the plant's friction is tanh(v / 0.2 mm/s)
     smooth[[0, 1, -2, -1]] = False  # one-sided differences
     error = np.abs(tau - log.tau)[smooth].max()
     assert error < 2e-3 * np.abs(log.tau).max()
@@ -100,3 +103,129 @@ def test_the_plant_is_integrated_in_short_steps_whatever_the_rate_of_the_log(ur5
         for rate in (25.0, 200.0)
     )
     np.testing.assert_allclose(rare.q, often.q[::8], atol=1e-3)
+
+
+def followed(model, pi, settings, *, seed=1, rate=500.0, duration=2.0):
+    motion = random_fourier(model, np.random.default_rng(seed))
+    return follow(model, pi, motion, rate=rate, duration=duration, settings=settings)
+
+
+def error_of(run):
+    return np.abs(run.q - run.reference).max()
+
+
+def test_computed_torque_with_the_right_bodies_follows_all_but_exactly(ur5):
+    pi = ur5.standard_parameters()
+    kinds = {
+        kind: error_of(followed(ur5, pi, Simulation(controller=Controller(kind))))
+        for kind in ("pd", "feedforward", "computed_torque", "perfect")
+    }
+    assert kinds["computed_torque"] < 1e-4
+    assert kinds["feedforward"] < 1e-4
+    assert kinds["pd"] > 0.02  # it knows no gravity
+    assert kinds["perfect"] == 0.0
+
+
+def test_more_bandwidth_follows_better(ur5):
+    pi, errors = truth(ur5), []
+    for w in (10.0, 40.0):
+        loop = Controller("computed_torque", bandwidth=w)
+        errors.append(error_of(followed(ur5, pi, Simulation(controller=loop))))
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_a_perfect_log_is_inverse_dynamics_drives_that_remember_included(ur5):
+    own = {"elbow_joint": (LoadFriction(), Presliding(displacement=0.05))}
+    model = ur5.with_terms(own)
+    pi = truth(model)
+    run = followed(model, pi, Simulation(controller=Controller("perfect")), rate=1000.0)
+    loop = followed(
+        model, pi, Simulation(controller=Controller(bandwidth=100.0)), rate=1000.0
+    )  # a plant with states that is made to do the same
+    late = run.t > 0.3
+    difference = (loop.tau - run.tau)[late][:, 2]
+    assert np.sqrt(np.mean(difference**2)) < 0.02 * np.sqrt(np.mean(run.tau[:, 2] ** 2))
+
+
+def test_drives_give_no_more_than_their_limits(ur5):
+    pi, most = truth(ur5), {"elbow_joint": 12.0}
+    free = followed(ur5, pi, Simulation())
+    held = followed(ur5, pi, Simulation(actuator=Actuator(effort=1.0, limits=most)))
+    assert np.abs(free.tau[:, 2]).max() > 15.0
+    assert np.abs(held.tau[:, 2]).max() == 12.0
+    assert (np.abs(held.tau) <= [j.effort for j in ur5.limits]).all()
+    assert held.saturated[2] == np.mean(np.abs(held.tau[:, 2]) == 12.0) > 0.0
+    assert (free.saturated == 0.0).all()
+
+
+def test_a_payload_is_taken_up_in_time(ur5):
+    load = Payload("ee_link", 2.0, com=(0.1, 0.0, 0.05), inertia=(0.01, 0, 0.01, 0, 0, 0.01),
+                   start=1.0)  # fmt: skip
+    pi = truth(ur5)
+    loaded = carried(ur5, pi, load)
+    assert loaded[50] - pi[50] == pytest.approx(2.0)
+    x, v = np.array([[0.3, -1.0, 0.7, 0.2, 0.4, 0.1]]), np.zeros((1, 6))
+    more = joint_torque_regressor(ur5, x, v, v) @ (loaded - pi)
+    robot = ur5.pin_model.copy()
+    hand = robot.frames[robot.getFrameId("ee_link")]
+    arm = pin.Inertia(2.0, np.array([0.1, 0.0, 0.05]), 0.01 * np.eye(3))
+    robot.appendBodyToJoint(hand.parentJoint, arm, hand.placement)
+    with_it = pin.rnea(robot, robot.createData(), x[0], v[0], v[0])
+    without = pin.rnea(ur5.pin_model, ur5.pin_model.createData(), x[0], v[0], v[0])
+    np.testing.assert_allclose(more, with_it - without, atol=1e-9)
+    for kind in ("perfect", "feedforward"):
+        run, empty = (
+            followed(ur5, pi, Simulation(controller=Controller(kind), payload=p))
+            for p in (load, Payload())
+        )
+        first = int(np.argmax(np.abs(run.tau - empty.tau).max(axis=1) > 1e-9))
+        assert run.t[first] == pytest.approx(1.0, abs=0.003)
+
+
+def test_what_no_payload_can_be_is_refused(ur5):
+    flat = Payload("ee_link", 1.0, inertia=(1.0, 0.0, 0.1, 0.0, 0.0, 0.1))
+    with pytest.raises(SettingsError, match=r"payload: inertia is \[1.0, 0.0, .* no body has"):
+        carried(ur5, truth(ur5), flat)
+    with pytest.raises(SettingsError, match="link 'base_link' is fixed to the world"):
+        carried(ur5, truth(ur5), Payload("base_link", 1.0))
+
+
+def test_a_torque_that_lags_is_late_in_the_log_of_its_joint(ur5, rng):
+    model = ur5.with_terms({"elbow_joint": (Lag(),)})
+    pi = truth(model)
+    pi[model.layout.names.index("elbow_joint.lag")] = 0.01
+    motion = random_fourier(model, np.random.default_rng(1))
+    log = simulate(model, pi, motion, rate=500.0, duration=1.0, rng=rng)
+    run = followed(model, pi, Simulation(), duration=1.0)
+    np.testing.assert_allclose(log.tau[5:, 2], run.tau[:-5, 2], atol=1e-9)
+    np.testing.assert_array_equal(log.tau[:, 3], run.tau[:, 3])
+
+
+def test_an_elastic_gear_needs_a_rotor_and_stiffness_for_every_joint(ur5):
+    soft = Actuator(stiffness={"elbow_joint": 1e4})
+    for actuator, words in (
+        (soft, "stiffness is not stated for 'shoulder_pan_joint'; state it for every joint"),
+        (Actuator(stiffness=1e4), "has no armature, which an elastic gear needs"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            followed(ur5, ur5.standard_parameters(), Simulation(actuator=actuator))
+    with pytest.raises(SettingsError, match="backlash is of elastic gears; state their stiffness"):
+        Actuator(backlash=0.01)
+    with pytest.raises(SettingsError, match="perfect, which knows no limits and no elastic gears"):
+        Simulation(controller=Controller("perfect"), actuator=Actuator(effort=1.0))
+    with pytest.raises(SettingsError, match="kp and kd are for kind pd or feedforward"):
+        Controller("computed_torque", kp=3.0)
+
+
+def test_stiff_gears_of_an_arm_move_as_rigid_ones(ur5):
+    pi = truth(ur5)
+    rigid = followed(ur5, pi, Simulation(), duration=0.5)
+    stiff = followed(ur5, pi, Simulation(actuator=Actuator(stiffness=1e5)), duration=0.5)
+    assert np.abs(stiff.q - rigid.q).max() < 2e-3
+    assert np.abs(stiff.q - rigid.q).max() > 1e-6  # and yet not the same
+
+
+def test_gains_beyond_reason_are_told(ur5):
+    wild = Simulation(controller=Controller("pd", kp=1e7, kd=1e6))
+    with pytest.raises(DataError, match=r"the simulation diverged at t = .* lower the"):
+        followed(ur5, truth(ur5), wild)

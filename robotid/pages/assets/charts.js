@@ -113,7 +113,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
   constructor(parent, what) {
     this.what = what;
     this.link = link(what.link);
-    this.hidden = new Set();
+    this.hidden = new Set(what.series.flatMap(({ hidden }, i) => (hidden ? [i] : [])));
     this.below = (what.x_label ? 56 : 36) + this.slant(); // [px] that the x axis takes
     this.plot = null;
     this.index = -1; // row under the cursor
@@ -149,7 +149,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     const swatch = element("i", { style: `--key: var(--${series.tone})` });
     const value = element("b");
     const button = element("button",
-      { type: "button", tabindex: -1, "aria-pressed": true }, swatch, series.label, value);
+      { type: "button", tabindex: -1, "aria-pressed": !this.hidden.has(i) }, swatch, series.label, value);
     button.onclick = () => this.toggle(i);
     this.keys.append(button);
     if (series.half) value.className = "wide";
@@ -167,6 +167,8 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
     this.x = x;
     this.ys = ys;
     this.halves = halves;
+    this.place.setAttribute("aria-valuemin", x.length ? x[0] : 0);
+    this.place.setAttribute("aria-valuemax", x.length ? x[x.length - 1] : 1);
     this.stack();
     if (!this.plot) return;
     this.plot.setData(this.columns(), false);
@@ -290,7 +292,7 @@ class Chart { // what: as charts.py says; x, y and half are arrays, NaN where th
       axes: [axis({ size: 28, label: name || null, labelSize: name ? 20 : 0, labelGap: 2, space: 70,
         labelFont: "11px system-ui, sans-serif", ...decades("x"), ...named }),
       axis({ size: 54, space: 22, ...decades("y") })],
-      series: [{}, ...series.map(({ tone: colour, kind, faint }) => ({
+      series: [{}, ...series.map(({ tone: colour, kind, faint }, i) => ({ show: !this.hidden.has(i),
         stroke: () => tone(colour), width: 1.3, alpha: faint ? FAINT : 1, points: { show: false },
         ...(kind === "line" ? {} : { paths: () => null }) }))],
       hooks: { draw: [() => this.move()], drawAxes: [(u) => this.paint(u)], setSelect: [(u) => this.select(u)] },

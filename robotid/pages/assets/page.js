@@ -5,8 +5,7 @@
 const folds = [...document.querySelectorAll("details")];
 
 function reveal() {
-  const key = decodeURIComponent(location.hash.slice(1));
-  const target = key && document.getElementById(key);
+  const target = document.getElementById(location.hash.slice(1));
   if (!target) return;
   for (let at = target; at; at = at.parentElement) if (at.localName === "details") at.open = true;
   target.scrollIntoView();

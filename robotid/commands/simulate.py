@@ -1,0 +1,172 @@
+"""A simulated log of a motion, with the truth that it was made from beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._files import check_file, file_sha256, write_json
+from robotid._typing import Array, ProgressCallback, ignore_progress
+from robotid.commands.job import Job, LogEntry
+from robotid.exceptions import SettingsError
+from robotid.export.urdf import write_urdf
+from robotid.logs.data import Log
+from robotid.logs.formats import check_suffix
+from robotid.logs.read import write_log
+from robotid.logs.settings import SignalSettings
+from robotid.logs.signals import process
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.model import RobotModel
+from robotid.simulation.closed_loop import Run, carried, follow, lateness
+from robotid.simulation.motions import SampledMotion
+from robotid.simulation.sensors import measure
+from robotid.simulation.settings import Simulation
+from robotid.simulation.truth import draw_parameters
+from robotid.versions import __version__
+
+__all__ = ["SimulatedFiles", "simulate_log"]
+
+_SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class SimulatedFiles:
+    """What a simulation reads and writes.
+
+    Attributes:
+        motion: The motion to follow: a table of time and positions.
+        log: The log to write; its truth goes beside it, as ``<log stem>.truth.json``.
+        urdf: A URDF of the true robot to write, too, or None.
+        cutoff: Cut-off of the filter that smooths a recorded motion [Hz]; None: it is as it is.
+    """
+
+    motion: Path
+    log: Path
+    urdf: Path | None = None
+    cutoff: float | None = None
+
+    @property
+    def truth(self) -> Path:
+        """The file of the truth."""
+        return self.log.with_name(f"{self.log.stem}.truth.json")
+
+
+def simulate_log(
+    job: Job,
+    files: SimulatedFiles,
+    settings: Simulation,
+    *,
+    progress: ProgressCallback | None = None,
+) -> dict[str, Any]:
+    """Simulate a robot that follows a motion; write its log and the truth.
+
+    Args:
+        job: The robot: its URDF, its joints and the terms of its drives.
+        files: What is read and written.
+        settings: What differs from the URDF, what drives the robot, and what its sensors do.
+        progress: Told of the seconds that are done.
+
+    Returns:
+        The content of the truth's file.
+
+    Raises:
+        DataError: If a file cannot be used, or the simulation diverges.
+        ModelError: If the URDF cannot be used.
+        SettingsError: If a setting does not fit the robot or the motion.
+    """
+    for path in (files.log, files.truth, *([files.urdf] if files.urdf else [])):
+        check_file(path)
+    check_suffix(files.log)
+    model = job.model()
+    motion = _motion(job, model, files)
+    duration = motion.duration if settings.duration is None else settings.duration
+    if duration > motion.duration + 1e-9:
+        raise SettingsError(
+            f"duration is {duration:g} s, but the motion lasts {motion.duration:g} s; state less, "
+            "or give a longer motion"
+        )
+    rng = np.random.default_rng(settings.seed)
+    pi = draw_parameters(model, settings.truth, rng)
+    run = follow(
+        model, pi, motion, rate=settings.rate, duration=duration, settings=settings,
+        progress=progress or ignore_progress,
+    )  # fmt: skip
+    late = lateness(model, pi, settings)
+    log = measure(run, settings.sensors, model.joints, rng, lateness=late)
+    content = _truth(model, pi, settings, run, log) | {
+        "urdf": str(job.urdf),
+        "motion": {"path": str(files.motion), "sha256": file_sha256(files.motion)},
+        "outputs": [str(path) for path in (files.log, files.truth, files.urdf) if path],
+    }
+    write_log(log, files.log)
+    if files.urdf:
+        write_urdf(model, pi, files.urdf, dynamics=True)
+    write_json(content | {"log_sha256": file_sha256(files.log)}, files.truth)
+    return content
+
+
+def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion:
+    table = job.read(LogEntry(files.motion), model, is_motion=True)
+    if files.cutoff is None:
+        return SampledMotion(table.t, table.q, table.v, table.a)
+    smooth = process(
+        table, SignalSettings(cutoff=files.cutoff, velocity="differentiated", trim=0.0)
+    )
+    return SampledMotion(smooth.t, smooth.q, smooth.v, smooth.a)
+
+
+def _truth(
+    model: RobotModel, pi: Array, settings: Simulation, run: Run, log: Log
+) -> dict[str, Any]:
+    """Return what the log was made from, and how well the robot followed."""
+    layout, size = model.layout, model.layout.n_inertial
+    urdf = model.standard_parameters()
+    mapping = structural_mapping(model)
+    units = [layout.units[i] for i in mapping.independent]
+
+    def base(parameters: Array) -> list[dict[str, Any]]:
+        entries = _entries(mapping.base_names, units, mapping.to_base(parameters))
+        words = zip(entries, mapping.expressions, strict=True)
+        return [entry | {"expression": expression} for entry, expression in words]
+
+    loaded = carried(model, pi, settings.payload)
+    standard = _entries(layout.names, layout.units, pi)
+    for entry, value in zip(standard[:size], urdf.tolist(), strict=False):
+        entry["urdf"] = value
+    error = run.q - run.reference
+    content: dict[str, Any] = {
+        "schema_version": _SCHEMA_VERSION,
+        "robotid": __version__,
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": settings.to_dict(),
+        "model": model.options,
+        "samples": len(log.t),
+        "duration": float(run.t[-1]),
+        "standard_parameters": standard[:size],
+        "drive_parameters": standard[size:],
+        "base_parameters": base(pi),
+        "following": [
+            {"joint": joint, "rms": rms, "largest": largest, "unit": unit, "at_limit": share}
+            for joint, rms, largest, unit, share in zip(
+                model.joints,
+                np.sqrt(np.mean(error**2, axis=0)).tolist(),
+                np.abs(error).max(axis=0).tolist(),
+                ["m" if joint in layout.prismatic else "rad" for joint in model.joints],
+                run.saturated.tolist(),
+                strict=True,
+            )
+        ],
+    }
+    if settings.payload.mass > 0:
+        content["base_parameters_with_payload"] = base(loaded)
+    return content
+
+
+def _entries(names: Sequence[str], units: Sequence[str], values: Array) -> list[dict[str, Any]]:
+    return [
+        {"name": name, "value": value, "unit": unit}
+        for name, unit, value in zip(names, units, values.tolist(), strict=True)
+    ]

@@ -1,0 +1,140 @@
+"""The true parameters of a simulated robot: near its URDF's, and always possible."""
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import ModelError, SettingsError
+from robotid.findings import listed
+from robotid.logs.data import suggestion
+from robotid.robot.drives import Lag, LoadFriction
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.simulation.settings import Truth
+
+__all__ = ["another_robot", "draw_parameters", "perturbed_bodies"]
+
+_USUAL_EFFORT = 50.0  # [N m or N] of a joint whose drive has the terms' usual values
+_IMPOSSIBLE = -1e-9  # smallest eigenvalue of a body's pseudo-inertia, of the largest
+
+
+def draw_parameters(model: RobotModel, settings: Truth, rng: np.random.Generator) -> Array:
+    """Return the true standard parameters of a robot like the model, shape (p,).
+
+    Args:
+        model: The robot as its URDF describes it.
+        settings: How far it may differ, and what is stated.
+        rng: Source of the differences.
+
+    Raises:
+        ModelError: If a body of the URDF is none that can be.
+        SettingsError: If a parameter that is stated is unknown, or makes a body or a drive
+            impossible.
+    """
+    layout = model.layout
+    pi = model.standard_parameters()
+    pi[: layout.n_inertial] = perturbed_bodies(model, settings.inertials, rng)
+    usual = settings.drives == "usual"
+    effort = {joint.name: joint.effort for joint in model.limits}
+    for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+        drawn = rng.uniform(*term.usual)
+        own = [x / _USUAL_EFFORT for j, _ in layout.drives[d].ratios if (x := effort[j]) > 0]
+        size = 1.0 if isinstance(term, Lag | LoadFriction) else min([1.0, *own])
+        pi[i] = usual * size * drawn
+    for name, value in settings.values.items():
+        if name not in layout.names:
+            raise SettingsError(
+                f"truth: values: {name!r} is not a parameter of {model.name}"
+                f"{suggestion(name, layout.names)} Known: {listed(layout.names, 12)}"
+            )
+        pi[layout.names.index(name)] = value
+    _check(model, pi)
+    return pi
+
+
+def perturbed_bodies(model: RobotModel, size: float, rng: np.random.Generator) -> Array:
+    """Return inertial parameters of bodies near the model's, shape (10 bodies,).
+
+    Body by body J' = J^1/2 exp(S) J^1/2, S being symmetric and normal with ten independent
+    coordinates of one standard deviation in the metric d^2 = 1/2 tr(log(J^-1 J')^2): no frame, no
+    unit and no body is preferred, and J' is positive wherever J is.
+
+    Args:
+        model: The robot as its URDF describes it.
+        size: Standard deviation of each coordinate [-].
+        rng: Source of the differences.
+
+    Raises:
+        ModelError: If a body of the URDF is none that can be.
+
+    References:
+        Wensing, Kim, Slotine (2018), Linear Matrix Inequalities for Physically Consistent
+        Inertial Parameter Identification; Lee, Park (2018), A Geometric Algorithm for Robust
+        Multibody Inertial Parameter Identification, (13).
+    """
+    bodies = model.standard_parameters()[: model.layout.n_inertial]
+    if size == 0.0:
+        return bodies
+    found = []
+    for name, J in zip(model.layout.bodies, pseudo_inertia(bodies), strict=True):
+        values, axes = np.linalg.eigh(J)
+        if values[0] < _IMPOSSIBLE * max(values[-1], 0.0) or values[-1] < 0:
+            raise ModelError(
+                f"body {name!r} of the URDF cannot be: the smallest eigenvalue of its "
+                f"pseudo-inertia is {values[0]:.3g}, wanted 0 or more. Correct its inertial "
+                "(robotid inspect), or state inertials = 0 in [truth]"
+            )
+        root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+        found.append(inertial_from_pseudo_inertia(root @ _random_factor(size, rng) @ root))
+    return np.concatenate(found)
+
+
+def another_robot(model: RobotModel, rng: np.random.Generator) -> Array:
+    """Return standard parameters, shape (p,), of a robot like the model, but not the same.
+
+    Every link is 10 to 30 % heavier or lighter, 1.2 kg more are at 10 cm from the last joint, the
+    drives have armature and friction.
+
+    Args:
+        model: The robot as its URDF describes it.
+        rng: Source of the differences.
+    """
+    size = model.layout.n_inertial
+    pi = model.standard_parameters()
+    by_body = pi[:size].reshape(-1, 10)
+    change = rng.uniform(0.1, 0.3, len(by_body)) * rng.choice([-1, 1], len(by_body))
+    by_body *= 1 + change[:, None]
+    mass, reach = 1.2, 0.1  # [kg], [m]
+    tool = [mass, 0.0, mass * reach, 0.0, mass * reach**2, 0.0, 0.0, 0.0, 0.0, mass * reach**2]
+    by_body[-1] += tool
+    by_body[-1] += [0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-3]  # a tool has an extent
+    for i, (_, term) in enumerate(model.layout.drive_parameters, start=size):
+        pi[i] = rng.uniform(*term.usual)
+    return pi
+
+
+def _random_factor(size: float, rng: np.random.Generator) -> Array:
+    """Return exp(S), S as of ``perturbed_bodies``: 1/2 tr(S^2) is a sum of ten squares."""
+    S = np.zeros((4, 4))
+    S[np.triu_indices(4, 1)] = rng.standard_normal(6)
+    S = S + S.T + np.diag(np.sqrt(2.0) * rng.standard_normal(4))
+    values, axes = np.linalg.eigh(size * S)
+    factor: Array = axes * np.exp(values) @ axes.T
+    return factor
+
+
+def _check(model: RobotModel, pi: Array) -> None:
+    """Refuse parameters that no body and no drive can have."""
+    layout = model.layout
+    bodies = pseudo_inertia(pi[: layout.n_inertial])
+    for name, J in zip(layout.bodies, bodies, strict=True):
+        values = np.linalg.eigvalsh(J)
+        if values[0] < _IMPOSSIBLE * max(values[-1], 0.0):
+            raise SettingsError(
+                f"truth: body {name!r} cannot be: the smallest eigenvalue of its pseudo-inertia "
+                f"is {values[0]:.3g}, wanted 0 or more; state other values, or inertials = 0.1 to "
+                "draw possible ones"
+            )
+    for i in np.flatnonzero(layout.is_nonnegative() & (pi < 0)):
+        raise SettingsError(
+            f"truth: {layout.names[i]} is {pi[i]:g} {layout.units[i]}, wanted 0 or more"
+        )
