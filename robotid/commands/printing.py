@@ -332,7 +332,7 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
 
 
 def _print_preview(content: dict[str, Any], *, is_verbose: bool) -> None:
-    motions = [_window(Path(entry["path"]).name, entry) for entry in content["motions"]]
+    motions = _recordings(content["motions"], "motion")
     count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
     say(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
     say("\nbase parameters: standard errors to be expected, and the share of the plausible spread")
