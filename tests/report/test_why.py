@@ -1,6 +1,7 @@
 """The section that says why: its sentences, its tables, and its charts in the browser."""
 
 import re
+from dataclasses import replace
 from html import unescape
 
 import numpy as np
@@ -10,7 +11,7 @@ from helpers.pages import charts, number, percent, tables
 
 from robotid.identification.torque_split import joint_torques
 from robotid.pages.html import page
-from robotid.report.why import why_section
+from robotid.report.why import _caption, why_section
 
 
 @pytest.fixture(scope="module")
@@ -132,3 +133,19 @@ def test_charts_over_time_share_the_cursor_of_the_torques(report):
     split = {link for title, link in links.items() if "the sum of" in title}
     measured = {link for title, link in links.items() if "measured, identified" in title}
     assert split == measured == {"recording 0"}
+
+
+def test_captions_say_what_a_quantity_explains_and_power_what_is_done(torques):
+    torque = replace(torques["elbow_joint"])
+    dependence = replace(torque.follows[2], share=0.413, chance=1e-5)
+    for change, said in (
+        ({}, "<strong>explains 41.3 % of its variance</strong>"),
+        ({"chance": 0.01}, "explains 41.3 %, perhaps by chance"),
+        ({"share": 0.05}, "explains nothing"),
+        ({"share": None}, "too little was recorded to tell"),
+    ):
+        torque.__dict__["follows"] = (replace(dependence, **change),)
+        assert _caption(torque, "speed") == f"Residual against speed: {said}"
+    power = torque.power[torque.used]
+    said = f"Mechanical power: mean {power.mean():.3g} W, peak {np.abs(power).max():.3g} W"
+    assert _caption(torque, "power") == said.replace("-", "−")
