@@ -18,6 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
+    "five_minutes": "own_robot.md",
     "validation": "how_good.md",
     "priors": "new_motion.md",
     "uncertainty": "trust.md",

@@ -20,6 +20,7 @@ from robotid.commands.console import (
 from robotid.commands.flags import (
     add_flags,
     job_from_flags,
+    motion_settings,
     refuse_log_flags,
     simulation_from_flags,
     source_settings,
@@ -250,6 +251,17 @@ def _doctor(options: argparse.Namespace) -> int:
     return 1 if alarming(findings, job.ignore) else 0
 
 
+def _excite(options: argparse.Namespace) -> None:
+    from robotid.commands.excite import design_motion
+
+    options.logs = []
+    job = job_from_flags(options, needs_logs=False)
+    with terminal_progress(quiet=options.json, force=options.progress) as progress:
+        settings = motion_settings(options)
+        found = design_motion(job, settings, options.out, given=options.given, progress=progress)
+    _show(found, options, "excite")
+
+
 def _preview(options: argparse.Namespace) -> None:
     from robotid.commands.preview import preview_job
 
@@ -343,6 +355,7 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "inspect": ("joints, parameters and faults of a URDF", _inspect),
     "identify": ("identify a robot: JOB.toml, or URDF LOG [LOG ...]", _identify),
     "track": ("run over a log as if live: history, step changes", _track),
+    "excite": ("design the motion to record, within the robot's limits", _excite),
     "preview": ("what a motion will tell, before it is recorded", _preview),
     "replay": ("play a log in the browser: robot, torques, what was identified", _replay),
     "doctor": ("what is wrong with logs: JOB.toml, or URDF LOG ...", _doctor),

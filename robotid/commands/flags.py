@@ -10,6 +10,7 @@ from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
 if TYPE_CHECKING:
+    from robotid.commands.excite import MotionSettings
     from robotid.commands.job import Job
     from robotid.simulation.settings import Simulation
 
@@ -139,6 +140,8 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_job(parser)
         case "preview":
             _add_preview(parser)
+        case "excite":
+            _add_excite(parser)
         case "track":
             _add_robot_and_log(parser)
             _add_out(parser, "robotid-track")
@@ -147,14 +150,7 @@ def add_flags(parser: argparse.ArgumentParser, command: str) -> None:
             _add_verbose(parser)
             _add_serve(parser, "show it in the browser while it runs, in true time")
         case "replay":
-            _add_robot_and_log(parser)
-            results = "result.json, track.json or their folder"
-            add("results", nargs="*", metavar="RESULT", help=results)
-            add("--html", metavar="FILE", help="page to write; default: replay.html")
-            add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
-            _add_serve(parser, "track the log again, in true time, and show it as it goes")
-            group = parser.add_argument_group("the log, unless a RESULT says it")
-            _add_settings(group, _ONLINE)
+            _add_replay(parser)
         case "validate":
             add("result", metavar="RESULT.json")
             add("logs", nargs="+", metavar="LOG")
@@ -190,6 +186,18 @@ def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
         add("--joints", metavar="A,B,...", help="joints to write; default: all")
         _add_settings(parser, _SOURCE)
     _add_json(parser)
+
+
+def _add_replay(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _add_robot_and_log(parser)
+    results = "result.json, track.json or their folder"
+    add("results", nargs="*", metavar="RESULT", help=results)
+    add("--html", metavar="FILE", help="page to write; default: replay.html")
+    add("--ghost", metavar="LOG", help="second motion, shown as a ghost")
+    _add_serve(parser, "track the log again, in true time, and show it as it goes")
+    group = parser.add_argument_group("the log, unless a RESULT says it")
+    _add_settings(group, _ONLINE)
 
 
 def _add_preview(parser: argparse.ArgumentParser) -> None:
@@ -231,6 +239,74 @@ def _simulation_words(key: str) -> str:
     from robotid.simulation.settings import Simulation
 
     return Simulation.paths()[key].words
+
+
+def _add_excite(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("source", metavar="JOB.toml | URDF")
+    words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
+    add("--out", metavar="FILE", required=True, help=words)
+    add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
+    words = "sweeps show friction, stands gravity, the others all; default: fourier"
+    add("--kind", choices=("fourier", "bspline", "sweeps", "stands"), help=words)
+    add("--duration", metavar="S", type=float, help="default: 10")
+    add("--harmonics", metavar="N", type=int, help="of the series; default: 5")
+    words = "of the information: D (volume), A (mean), E (weakest) or condition; default: D"
+    add("--criterion", choices=("D", "A", "E", "condition"), help=words)
+    add("--share", metavar="X", type=float, help="of the URDF's limits; default: 0.9")
+    for name, unit in (
+        ("acceleration", "rad/s^2 or m/s^2"), ("jerk", "rad/s^3 or m/s^3"), ("power", "W"),
+    ):  # fmt: skip
+        words = f"largest {name} of a joint [{unit}]; may be given again"
+        add(f"--max-{name}", metavar="JOINT=X", action="append", default=[], help=words)
+    words = "distance kept from collisions [m], or none to leave them unlooked at; default: 0.02"
+    add("--clearance", metavar="M", help=words)
+    add("--floor", metavar="M", type=float, help="height of the floor in the root link's frame [m]")
+    words = "a box beside the robot, NAME=x0,y0,z0,x1,y1,z1 [m]; may be given again"
+    add("--box", metavar="BOX", action="append", default=[], help=words)
+    words = "standard deviation of a joint's torque [N m or N]; may be given again"
+    add("--noise", metavar="JOINT=N_M", action="append", default=[], help=words)
+    add("--seed", metavar="N", type=int, help="of the random starts; default: 0")
+    add("--starts", metavar="N", type=int, help="that are followed to the end; default: 3")
+    add("--seconds", metavar="S", type=float, help="after which the best so far is taken")
+    words = "rows per second that are written; default: 100"
+    add("--points", metavar="HZ", type=float, help=words)
+    _add_json(parser)
+    _add_progress(parser)
+    flags = parser.add_argument_group("the robot, instead of a job file")
+    _add_settings(flags, _ROBOT[:3])
+
+
+def motion_settings(options: argparse.Namespace) -> "MotionSettings":
+    """Return what motion is wanted.
+
+    Args:
+        options: The flags of the command "excite".
+
+    Raises:
+        SettingsError: If a flag is not usable.
+    """
+    from robotid.commands.excite import MotionSettings, stated_boxes
+
+    plain = ("kind", "duration", "harmonics", "criterion", "share", "floor", "seed", "starts",
+             "seconds", "points")  # fmt: skip
+    stated = {name: getattr(options, name) for name in plain}
+    stated = {name: value for name, value in stated.items() if value is not None}
+    stated["noise"] = _pairs(options.noise, "--noise")
+    for name in ("acceleration", "jerk", "power"):
+        stated[name] = _pairs(getattr(options, f"max_{name}"), f"--max-{name}")
+    if options.clearance is not None:
+        stated["clearance"] = _clearance(options.clearance)
+    return MotionSettings(**stated, boxes=stated_boxes(options.box))
+
+
+def _clearance(word: str) -> float | None:
+    if word == "none":
+        return None
+    try:
+        return float(word)
+    except ValueError as error:
+        raise SettingsError(f"--clearance {word!r}: wanted metres, or none") from error
 
 
 def _add_payload(parser: argparse.ArgumentParser) -> None:
@@ -365,11 +441,12 @@ def source_settings(options: argparse.Namespace) -> dict[str, Any]:
     return dict(_stated(options, _SOURCE).get("log", {}))
 
 
-def job_from_flags(options: argparse.Namespace) -> "Job":
+def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "Job":
     """Return the job that a command line names or describes.
 
     Args:
         options: The flags of the command.
+        needs_logs: Whether it is of no use without a log.
 
     Raises:
         SettingsError: If a job file is given with flags, or a flag is not usable.
@@ -384,7 +461,7 @@ def job_from_flags(options: argparse.Namespace) -> "Job":
                 f"leave out {listed(options.logs or given)}"
             )
         return read_job(options.source)
-    if not options.logs:
+    if not options.logs and needs_logs:
         raise SettingsError("no log was given: robotid identify URDF LOG [LOG ...], or JOB.toml")
     kept = getattr(options, "validate", None) or ()
     table = {

@@ -12,12 +12,15 @@ from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.locked_joints import check_locked
 from robotid.exceptions import DataError
-from robotid.export.result import load_result
+from robotid.export.result import load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
+from robotid.identification.previews import Run
+from robotid.identification.recordings import Recordings
 from robotid.identification.survey import SurveyedLog, survey_log
 from robotid.identification.verdict import check_ignored
 from robotid.logs.read import LogLayout
 from robotid.logs.table import Table
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.versions import code_versions
 
@@ -151,6 +154,30 @@ def job_of_result(job: Job, path: str | Path, advice: str) -> tuple[Job, list[Lo
             )
     wanted = replace(stated, urdf=job.urdf, identification=job.identification)
     return wanted, list(stated.identification)
+
+
+def result_run(job: Job, path: str | Path) -> tuple[Job, list[LogEntry], RobotModel, Run]:
+    """Return what the logs of a result have said.
+
+    Args:
+        job: The robot and logs of their own.
+        path: A result.json, or its folder.
+
+    Returns:
+        The job with the settings of the result, the logs that this one fitted, the robot with the
+        friction that it found, and what the logs have said.
+
+    Raises:
+        DataError: If a log that was fitted is gone or was changed.
+        SettingsError: If the settings in the result are not usable.
+    """
+    job, fitted = job_of_result(job, path, "give a result whose logs are there")
+    result = load_result(path).content
+    model = stated_model(result, job.model())
+    (logs,) = survey_logs(job, model, fitted)
+    recordings = Recordings(model, structural_mapping(model), logs)
+    details = result["consistency"].get("fit", {})
+    return job, fitted, model, Run.of(recordings, stated_parameters(result, model), details)
 
 
 def checkpoint_inputs(job: Job) -> dict[str, Any]:

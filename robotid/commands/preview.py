@@ -7,13 +7,11 @@ import numpy as np
 
 from robotid._files import file_sha256
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import job_of_result, survey_logs
+from robotid.commands.logs import result_run
 from robotid.exceptions import DataError
-from robotid.export.result import build_preview, load_result, stated_model, stated_parameters
-from robotid.identification.previews import Run, preview_logs
-from robotid.identification.recordings import Recordings
+from robotid.export.result import build_preview, load_result
+from robotid.identification.previews import preview_logs
 from robotid.identification.survey import SurveyedLog, survey_log
-from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 
 __all__ = ["preview_job"]
@@ -52,13 +50,8 @@ def preview_job(
         model = job.model()
         motions = _motions(job, model, job.identification)
         return build_preview(preview_logs(model, motions, job.estimator, **stated))
-    job, fitted = job_of_result(job, given, "give a result whose logs are there")
+    job, fitted, model, run = result_run(job, given)
     result = load_result(given).content
-    model = stated_model(result, job.model())
-    (logs,) = survey_logs(job, model, fitted)
-    details = result["consistency"].get("fit", {})
-    recordings = Recordings(model, structural_mapping(model), logs)
-    run = Run.of(recordings, stated_parameters(result, model), details)
     hashes = {entry["sha256"] for entry in result["inputs"] if entry["role"] == "identification"}
     if not any(file_sha256(entry.path) in hashes for entry in job.identification):
         motions = _motions(job, model, job.identification)

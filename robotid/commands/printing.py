@@ -53,6 +53,7 @@ def print_content(
         "payload": _print_payload,
         "report": lambda done: print(f"written: {done['report']}"),
         "compare": _print_comparison,
+        "excite": _print_motion,
         "export": _print_export,
         "convert": _print_conversion,
         "simulate": _print_simulation,
@@ -250,6 +251,37 @@ def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> s
     return worst if any(ranks.get(worst, ())[:2]) else ""
 
 
+def _print_motion(content: dict[str, Any]) -> None:
+    done = f"in {content['seconds']:.1f} s"
+    if content["starts"]:
+        settled = "" if content["converged"] else "not "
+        done = f"{content['starts']} starts {done}, {settled}settled"
+    condition = content["condition_number"]
+    say(
+        f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
+        f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
+        f" {done}"
+    )
+    print("\nwhat it leaves of each limit, least where")
+    for name, margin in content["limits"].items():
+        say(f"  {name:13} {_margin(name, margin)}", 16 * " ")
+
+
+def _margin(name: str, margin: Mapping[str, Any]) -> str:
+    """Return in words what a motion leaves of a limit."""
+    if name != "collision":
+        return f"{100 * margin['margin']:5.1f} %  {margin['where']}"
+    said = "no links or obstacles come near each other"
+    if margin["margin"] is not None:
+        apart, time = 1e3 * margin["margin"], margin["time"]
+        said = f"{apart:5.1f} mm beyond the clearance, {margin['where']} at {time:.2f} s"
+    if margin["unread"]:
+        said += f"; not looked at, since no shape can be read: {listed(margin['unread'])}"
+    if margin["left_alone"]:
+        said += f"; always nearer than that: {listed(margin['left_alone'])}"
+    return said
+
+
 def _print_comparison(content: dict[str, Any]) -> None:
     from robotid.identification.summary import cell
 
@@ -300,7 +332,7 @@ def _print_base_parameters(content: Mapping[str, Any], labels: Sequence[str]) ->
 
 
 def _print_preview(content: dict[str, Any], *, is_verbose: bool) -> None:
-    motions = [_recording(entry) for entry in content["motions"]]
+    motions = _recordings(content["motions"], "motion")
     count = f"{content['structure']['base']} base parameters, by {content['estimator']}"
     say(f"{content['robot']}: {', '.join(motions)}; {count}", "  ")
     say("\nbase parameters: standard errors to be expected, and the share of the plausible spread")

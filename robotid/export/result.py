@@ -181,7 +181,9 @@ def build_preview(preview: Preview) -> dict[str, Any]:
         "robot": found.model.name,
         "joints": list(found.model.joints),
         "estimator": found.estimator.name,
-        "motions": [_source(e.recording.log.path) | _extent(e) for e in found.fitted],
+        "motions": [
+            {"role": "motion", **_source(e.recording.log.path), **_extent(e)} for e in found.fitted
+        ],
         "noise": {
             joint: {"std": float(std), "unit": units[joint], "correlation": float(time), "is": of}
             for joint, std, time, of in zip(

@@ -50,6 +50,8 @@ __all__ = [
     "Run",
     "TorqueNoise",
     "assumed_noise",
+    "assumed_parameters",
+    "largest_torques",
     "preview",
     "preview_logs",
 ]
@@ -314,9 +316,10 @@ def preview_logs(
     if not motions:
         raise DataError("no motion was given; at least one is needed to preview anything")
     mapping = structural_mapping(model)
-    size = _largest_torques(model, motions)
+    peak, fastest = _seen(model, motions)
+    size = largest_torques(model, peak)
     known = run or like
-    pi = _assumed_parameters(model, motions, size) if known is None else known.standard
+    pi = assumed_parameters(model, size, fastest) if known is None else known.standard
     for motion in motions:
         _expect(motion, pi)
     if not isinstance(noise, TorqueNoise):
@@ -466,20 +469,36 @@ def _band(log: SurveyedLog) -> float:
     return float(rate * np.sum(low_pass(impulse, rate, log.signals) ** 2))
 
 
-def _largest_torques(model: RobotModel, motions: Sequence[SurveyedLog]) -> Array:
-    """Return the largest torque of each joint, (n,): the URDF's limit, or that of its bodies."""
+def _seen(model: RobotModel, motions: Sequence[SurveyedLog]) -> tuple[Array, Array]:
+    """Return the largest torque and speed of each joint in motions, by the URDF's bodies, (n,)."""
     bodies = model.standard_parameters()
     moved = [np.abs(predict(model, [bodies], log.whole.trajectory)[0]) for log in motions]
     peak = np.max([torque.max(axis=0) for torque in moved], axis=0)
+    return peak, np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
+
+
+def largest_torques(model: RobotModel, peak: Array) -> Array:
+    """Return the largest torque of each joint, shape (n,): the URDF's limit, or one that was seen.
+
+    Args:
+        model: The robot.
+        peak: What stands for the limit where the URDF states none, shape (n,) [N m or N].
+    """
     peak = np.maximum(peak, _FAINTEST * max(float(peak.max()), 1e-300))
     limit = np.array([joint.effort for joint in model.limits])
     return np.where(np.isfinite(limit) & (limit > 0), limit, peak)
 
 
-def _assumed_parameters(model: RobotModel, motions: Sequence[SurveyedLog], size: Array) -> Array:
-    """Return the URDF's bodies with friction of a usual size, shape (p,)."""
+def assumed_parameters(model: RobotModel, size: Array, fastest: Array) -> Array:
+    """Return the URDF's bodies with friction of a usual size, shape (p,).
+
+    Args:
+        model: The robot.
+        size: Largest torque of each joint, shape (n,) [N m or N].
+        fastest: What stands for the largest speed where the URDF states none, shape (n,)
+            [rad/s or m/s].
+    """
     pi = model.standard_parameters()
-    fastest = np.max([np.abs(log.whole.trajectory.v).max(axis=0) for log in motions], axis=0)
     for j, limits in enumerate(model.limits):
         speed = limits.velocity if 0 < limits.velocity < np.inf else max(float(fastest[j]), 1e-3)
         for term, value in (("coulomb", 1.0), ("viscous", 1.0 / speed)):

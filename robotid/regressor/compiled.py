@@ -20,7 +20,15 @@ from robotid.regressor.columns import RowPlan
 if TYPE_CHECKING:
     from robotid.robot.model import RobotModel
 
-__all__ = ["LONG_ENOUGH", "Tree", "flatten", "is_installed", "why_not", "work_per_sample"]
+__all__ = [
+    "LONG_ENOUGH",
+    "Tree",
+    "flatten",
+    "is_installed",
+    "joint_axis",
+    "why_not",
+    "work_per_sample",
+]
 
 #: Work, samples times ``work_per_sample``, from which the compiled path pays its start of about
 #: half a second in every process (importing Numba, reading the compiled code). For seven joints in
@@ -53,7 +61,7 @@ def why_not(model: "RobotModel") -> str | None:
     """
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
-        if joint.nv != 1 or not _is_simple(_axis(model.pin_model, joint.id)):
+        if joint.nv != 1 or not _is_simple(joint_axis(model.pin_model, joint.id)):
             return f"joint {name!r} is a {joint.shortname()}, which is not compiled"
     if np.any(np.sum(model.velocity_map != 0, axis=1) > 1):
         return "a joint follows several others, which is not compiled"
@@ -191,7 +199,7 @@ def _prepare(state: Array, model: "RobotModel", tree: Tree) -> None:
 
 def _constants(pin_model: pin.Model, body: int) -> Array:
     """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,)."""
-    slide, turn = _axis(pin_model, body).reshape(2, 3)
+    slide, turn = joint_axis(pin_model, body).reshape(2, 3)
     P, p0 = pin_model.jointPlacements[body].rotation, pin_model.jointPlacements[body].translation
     along = np.outer(turn, turn)
     about = np.eye(3) - along if turn.any() else np.zeros((3, 3))
@@ -200,8 +208,13 @@ def _constants(pin_model: pin.Model, body: int) -> Array:
     return np.concatenate([A.T.reshape(-1), *rotation, p0, P @ slide, slide, turn])
 
 
-def _axis(pin_model: pin.Model, body: int) -> Array:
-    """Return the axis (v, w) of a joint in its own frame, at its neutral position."""
+def joint_axis(pin_model: pin.Model, body: int) -> Array:
+    """Return the axis (v, w) of a joint in its own frame, at its neutral position, shape (6,).
+
+    Args:
+        pin_model: The robot.
+        body: Number of the joint.
+    """
     data, q = pin_model.createData(), pin.neutral(pin_model)
     joint = pin_model.joints[body]
     axis: Array = pin.computeJointJacobian(pin_model, data, q, body)[:, joint.idx_v]

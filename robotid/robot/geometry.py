@@ -19,6 +19,7 @@ __all__ = [
     "box_half_spaces",
     "geometry_half_spaces",
     "hull_half_spaces",
+    "link_clouds",
 ]
 
 _SIDES = 16  # of the prism around a cylinder
@@ -84,6 +85,33 @@ def body_points(model: RobotModel) -> dict[str, Array]:
     return {
         body: np.vstack(parts) for body, parts in found.items() if parts and body not in open_bodies
     }
+
+
+def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[str]]:
+    """Return points whose convex hulls hold each shape of each link, in the frame of its body.
+
+    A link's collision geometry counts, or its visual one if it has none.
+
+    Args:
+        model: The robot.
+
+    Returns:
+        Name of the link, its body (-1: it is fixed to the world) and the points, shape (k, 3) [m],
+        of each shape; and the links of which a shape cannot be read.
+    """
+    robot, urdf = model.tree.robot, Path(model.tree.path)
+    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
+    clouds, unread = [], []
+    for link in model.tree.links:
+        frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
+        for shape in shapes.get(link, ()):
+            points = _shape_points(shape, urdf)
+            if points is None:
+                unread.append(link)
+                continue
+            points = _moved(_moved(points, shape.placement), frame.placement.homogeneous)
+            clouds.append((link, frame.parentJoint - 1, points))
+    return clouds, list(dict.fromkeys(unread))
 
 
 def body_boxes(model: RobotModel) -> dict[str, Array]:

@@ -183,3 +183,4 @@ def test_the_flags_of_identify_say_where_the_signals_are(tmp_path, ur5, rng, cap
     assert main([*words, "--topic", "/arm", "--effort", "current"]) == 1
     said = capsys.readouterr().err
     assert f"joints {', '.join(ur5.joints)} have currents but no gain" in said
+    assert "--gain shoulder_pan_joint=... --gain shoulder_lift_joint=..." in said

@@ -30,8 +30,8 @@ def test_the_head_says_what_was_identified_and_how(result, identified):
     assert result["settings"] == {"estimator": {"name": "consistent"}}
     assert result["outputs"] == {"report": "report.html"}
     assert result["warnings"] == [
-        {"code": "late", "message": "late by 4 ms", "where": "a.csv"},
-        {"code": "b", "message": "d", "where": "c"},
+        {"code": "late", "severity": "warning", "message": "late by 4 ms", "where": "a.csv"},
+        {"code": "b", "severity": "note", "message": "d", "where": "c"},
     ]
     assert result["uncertainty"] == {
         "method": identified.errors.method,
@@ -254,5 +254,5 @@ def test_results_that_are_not_whole_are_refused(result, identified, tmp_path):
     with pytest.raises(DataError, match=r"^result\.json has no entry 'inputs': it is not whole"):
         read_result(path)
     short = {**result, "drive_parameters": result["drive_parameters"][1:]}
-    with pytest.raises(ModelError, match=r"^the result has no value of \['shoulder_pan_joint\.arm"):
+    with pytest.raises(ModelError, match=r"^the result has no value of shoulder_pan_joint\.arm"):
         stated_parameters(short, identified.model)

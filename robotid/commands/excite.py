@@ -1,0 +1,215 @@
+"""A motion to record: designed for a robot within its limits, and written."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robotid._files import check_file
+from robotid.commands.job import Job
+from robotid.commands.logs import result_run
+from robotid.exceptions import SettingsError
+from robotid.excitation.basis import Basis, BSplineBasis, FourierBasis
+from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.design import Design, Designer
+from robotid.excitation.files import write_motion
+from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.excitation.routes import design_stands, design_sweeps
+from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from robotid._typing import ProgressCallback
+
+__all__ = ["MotionSettings", "design_motion", "stated_boxes"]
+
+_KINDS = ("fourier", "bspline", "sweeps", "stands")
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """What motion is wanted.
+
+    Attributes:
+        kind: "fourier" or "bspline"; "sweeps", slow ones of joint after joint, which show friction;
+            "stands", which show gravity.
+        duration: Its length [s]; that of sweeps and stands is what they take.
+        harmonics: Harmonics of a Fourier series; pieces of B-splines are twice as many.
+        criterion: "D", "A", "E" or "condition", as of ``criterion``.
+        share: How much of the URDF's limits is used, more than 0 and at most 1.
+        acceleration: Largest accelerations by joint [rad/s^2 or m/s^2].
+        jerk: Largest jerks by joint [rad/s^3 or m/s^3].
+        power: Largest mechanical powers by joint [W].
+        clearance: Distance that is kept from collisions [m]; None: they are not looked at.
+        floor: Height of the floor in the frame of the root link [m]; None: there is none.
+        boxes: What stands around the robot.
+        noise: Standard deviation of the torque's noise by joint [N m or N].
+        seed: Of the random starts.
+        starts: How many are followed to the end.
+        seconds: Time after which the best motion so far is taken [s].
+        points: Rows per second that are written [Hz].
+    """
+
+    kind: str = "fourier"
+    duration: float = 10.0
+    harmonics: int = 5
+    criterion: str = "D"
+    share: float = 0.9
+    acceleration: Mapping[str, float] = field(default_factory=dict)
+    jerk: Mapping[str, float] = field(default_factory=dict)
+    power: Mapping[str, float] = field(default_factory=dict)
+    clearance: float | None = 0.02
+    floor: float | None = None
+    boxes: Sequence[Box] = ()
+    noise: Mapping[str, float] = field(default_factory=dict)
+    seed: int = 0
+    starts: int = 3
+    seconds: float = np.inf
+    points: float = 100.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in _KINDS:
+            raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_KINDS)}")
+        for name in ("duration", "starts", "seconds", "points"):
+            value = getattr(self, name)
+            if not value > 0:
+                raise SettingsError(f"{name} is {value:g}, wanted more than 0")
+
+    def basis(self) -> Basis:
+        """Return the functions that the motion is a sum of.
+
+        Raises:
+            SettingsError: If there are too few.
+        """
+        if self.kind == "bspline":
+            return BSplineBasis(self.duration, 2 * self.harmonics)
+        return FourierBasis(self.duration, self.harmonics)
+
+
+def stated_boxes(words: Sequence[str]) -> tuple[Box, ...]:
+    """Return boxes that are stated as NAME=x0,y0,z0,x1,y1,z1, two corners [m].
+
+    Args:
+        words: What follows --box.
+
+    Raises:
+        SettingsError: If a word is another one.
+    """
+    boxes = []
+    for word in words:
+        name, _, numbers = word.partition("=")
+        try:
+            x = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            x = []
+        if len(x) != 6 or not np.isfinite(x).all():
+            raise SettingsError(
+                f"--box {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner [m]"
+            )
+        boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
+    return tuple(boxes)
+
+
+def design_motion(
+    job: Job,
+    settings: MotionSettings,
+    target: str | Path,
+    *,
+    given: str | None = None,
+    progress: "ProgressCallback | None" = None,
+) -> dict[str, Any]:
+    """Design a motion for a robot and write it.
+
+    Args:
+        job: The robot.
+        settings: What motion is wanted.
+        target: The file, as of ``write_motion``.
+        given: A result.json, or its folder: the motion tells what its logs did not.
+        progress: Told which start is followed.
+
+    Returns:
+        What ``robotid excite --json`` prints.
+
+    Raises:
+        DataError: If collisions cannot be looked at, or the result's logs are gone.
+        ModelError: If the URDF cannot be used.
+        SettingsError: If a setting does not fit, or nothing keeps the limits.
+    """
+    check_file(Path(target))
+    model, run = job.model(), None
+    if given is not None:
+        _, _, model, run = result_run(job, given)
+    limits = MotionLimits.of_model(
+        model,
+        share=settings.share,
+        acceleration=settings.acceleration,
+        jerk=settings.jerk,
+        power=settings.power,
+    )
+    clearance = None
+    if settings.clearance is not None:
+        clearance = Clearance(
+            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
+        )
+    basis = settings.basis()
+    designer = Designer.of_model(
+        model, basis, limits, name=settings.criterion, clearance=clearance, noise=settings.noise,
+        run=run,
+    )  # fmt: skip
+
+    def told(start: int, _: float) -> None:
+        if progress is not None:
+            progress("designing", start, settings.starts, "starts")
+
+    rng = np.random.default_rng(settings.seed)
+    if settings.kind == "sweeps":
+        design = design_sweeps(designer, rng)
+    elif settings.kind == "stands":
+        design = design_stands(designer, rng)
+    else:
+        design = designer.design(
+            rng, starts=settings.starts, seconds=settings.seconds, progress=told
+        )
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
+    return _content(model, design, limits, clearance, settings)
+
+
+def _content(
+    model: RobotModel,
+    design: Design,
+    limits: MotionLimits,
+    clearance: Clearance | None,
+    settings: MotionSettings,
+) -> dict[str, Any]:
+    """Return what was designed, for people and programs."""
+    margins: dict[str, Any] = {}
+    for name, used, sizes in zip(LIMITS, design.used, limits.sizes, strict=True):
+        if np.isfinite(sizes).any():
+            joint = int(np.argmax(used))
+            margins[name] = {"margin": 1.0 - float(used[joint]), "where": model.joints[joint]}
+    if clearance is not None:
+        contact = design.contact
+        margins["collision"] = {
+            "margin": None if contact is None else contact.distance - clearance.least,
+            "where": None if contact is None else f"{contact.first} and {contact.second}",
+            "time": None if contact is None else contact.time,
+            "unread": clearance.unread,
+            "left_alone": clearance.made_to,
+        }
+    return {
+        "robot": model.name,
+        "joints": list(model.joints),
+        "criterion": settings.criterion,
+        "objective": design.objective,
+        "condition_number": design.condition if np.isfinite(design.condition) else None,
+        "seconds": design.seconds,
+        "starts": design.starts,
+        "converged": bool(design.is_converged),
+        "feasible": True,
+        "kind": settings.kind,
+        "duration": design.duration,
+        "points": settings.points,
+        "limits": margins,
+        "history": [list(entry) for entry in design.history],
+    }

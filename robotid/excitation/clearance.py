@@ -1,0 +1,379 @@
+"""How far the links of a moving robot keep from each other, from the floor and from boxes.
+
+Every shape is replaced by its convex hull, which holds it. Distances between hulls come from coal;
+a hull that a joint turns moves with the joint's screw, so that a distance has an exact gradient.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
+from robotid.regressor.adjoint import MotionRegressor, Poses
+from robotid.robot.geometry import link_clouds
+from robotid.robot.model import RobotModel
+from robotid.simulation.motions import Motion
+
+__all__ = ["Box", "Clearance", "Contact", "Nearness"]
+
+_TRIED = 400  # random poses that say which links may meet at all
+_APART = 0.05  # [m] links that stay so far apart at all of them are looked at in the end alone
+_MADE_TO = 0.95  # share of the poses: links that are too near in so many are made to
+_THINNEST = 1e-3  # [m] a flat shape is as thick
+_FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
+_SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
+_SURE = 5e-4  # [m] by which a lower bound may be too low
+_WIDE = 100.0  # [m] extent of the floor
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box that stands still beside the robot, in the frame of the root link.
+
+    Attributes:
+        name: What it is called.
+        low: Its lower corner [m].
+        high: Its upper corner [m].
+    """
+
+    name: str
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Where two things come nearest.
+
+    Attributes:
+        first: Name of one.
+        second: Name of the other.
+        distance: Between their hulls, below 0 if they overlap [m].
+        time: When [s].
+    """
+
+    first: str
+    second: str
+    distance: float
+    time: float
+
+    def __str__(self) -> str:
+        said = f"come to {1e3 * self.distance:.0f} mm" if self.distance > 0 else "overlap"
+        return f"{self.first} and {self.second} {said} at {self.time:.2f} s"
+
+
+@dataclass(frozen=True, eq=False)
+class Nearness:
+    """Distances of pairs that are near each other along a motion.
+
+    Attributes:
+        distance: Shape (pairs, N) [m]; of what is farther than asked for, a lower bound.
+        pairs: Pair of each of k distances that have a gradient, shape (k,).
+        samples: Instant of each, shape (k,).
+        gradient: Of each by the n joints, shape (k, n) [m/rad or 1].
+    """
+
+    distance: Array
+    pairs: Array
+    samples: Array
+    gradient: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Hull:
+    """A convex piece of a link, or of what stands still (body -1), in the frame of its body."""
+
+    name: str
+    body: int
+    centre: Array
+    radius: float
+    half: Array  # of the box around it, in that frame, shape (3,)
+    shape: Any  # of coal, about the centre
+
+
+class Clearance:
+    """What keeps a robot from hitting itself and what stands around it.
+
+    Args:
+        model: The robot, with a fixed base.
+        least: Distance that is to be kept [m].
+        floor: Height below which nothing that moves may go, in the frame of the root link [m].
+        boxes: What stands around the robot.
+        seed: Of the random poses that say which links may meet.
+
+    Attributes:
+        pairs: Numbers of the two hulls of each pair.
+        likely: Which pairs may meet within the limits, shape (pairs,), bool.
+        unread: Links of which a shape cannot be read: nothing keeps them from hitting anything.
+        made_to: Links that are nearer in almost every pose, by two, and are left to it.
+
+    Raises:
+        DataError: If no link has a shape that can be read.
+        SettingsError: If a number is not usable.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        *,
+        least: float = 0.02,
+        floor: float | None = None,
+        boxes: Sequence[Box] = (),
+        seed: int = 0,
+    ) -> None:
+        import coal
+
+        if not least >= 0:
+            raise SettingsError(f"clearance is {least}, wanted 0 m or more")
+        self.least, self._model, self._regressor = least, model, MotionRegressor(model)
+        self._ratios = model.velocity_map[self._regressor.places]  # of joints by body, (m, n)
+        clouds, self.unread = link_clouds(model)
+        if not clouds:
+            raise DataError(
+                f"{model.tree.path} has no shape that can be read, so nothing is known of "
+                "collisions; give it collision geometry, or design without clearance"
+            )
+        self._hulls = [_hull(name, body, points) for name, body, points in clouds]
+        self._hulls += [_hull(box.name, -1, _corners(box)) for box in boxes]
+        if floor is not None:
+            below = Box("the floor", (-_WIDE, -_WIDE, floor - _WIDE), (_WIDE, _WIDE, floor))
+            self._hulls.append(_hull(below.name, -1, _corners(below)))
+        self._request = coal.DistanceRequest(True, True)
+        self.pairs = self._possible_pairs()
+        self.likely = self._likely(np.random.default_rng(seed))
+
+    def _possible_pairs(self) -> Array:
+        """Return pairs that can move against each other: not links that a joint joins."""
+        tree, hulls = self._model.pin_model, self._hulls
+        joined = {(int(tree.parents[i]) - 1, i - 1) for i in range(1, tree.njoints)}
+        found = []
+        for i, j in combinations(range(len(hulls)), 2):
+            a, b = sorted((hulls[i].body, hulls[j].body))
+            is_link = hulls[j].name in self._model.tree.links
+            if a != b and not (is_link and (a, b) in joined):
+                found.append((i, j))
+        return np.array(found, dtype=int).reshape(-1, 2)
+
+    def _likely(self, rng: np.random.Generator) -> Array:
+        """Return which pairs may meet, by random poses; those that always do are taken out."""
+        low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
+        high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
+        q = rng.uniform(low, high, (_TRIED, len(low)))
+        near = self.near(self.poses(q), self.least + _APART, self.everything)
+        distance = near.distance
+        is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
+        always: Array = (distance < self.least).mean(axis=1) > _MADE_TO
+        always &= is_link[self.pairs].all(axis=1)
+        names = self.named
+        self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
+        likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
+        self.pairs = self.pairs[~always]
+        kept: Array = likely[~always]
+        return kept
+
+    @cached_property
+    def _supports(self) -> Array:
+        """Which joints move which body, shape (m + 1, m), bool; the last row stands still."""
+        tree = self._model.pin_model
+        moved = np.zeros((tree.njoints, tree.njoints - 1), dtype=bool)
+        for i in range(1, tree.njoints):
+            moved[i - 1, [j - 1 for j in list(tree.supports[i])[1:]]] = True
+        return moved
+
+    @property
+    def everything(self) -> Array:
+        """All pairs, as ``near`` takes them, shape (pairs,), bool."""
+        return np.ones(len(self.pairs), dtype=bool)
+
+    @property
+    def named(self) -> list[tuple[str, str]]:
+        """The names of each pair."""
+        return [(self._hulls[i].name, self._hulls[j].name) for i, j in self.pairs.tolist()]
+
+    def poses(self, q: Array) -> Poses:
+        """Return where the bodies are.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad or m].
+        """
+        G, shift = self._model.velocity_map, self._model.position_offset
+        return self._regressor.poses(q @ G.T + shift)
+
+    def near(self, poses: Poses, within: float | Array, chosen: Array | None = None) -> Nearness:
+        """Return the distances of pairs along a motion, exact where they are near.
+
+        Args:
+            poses: Where the bodies are at N instants.
+            within: Distance from which a lower bound will do, one or one per instant [m].
+            chosen: Which pairs to look at, shape (pairs,), bool; those that may meet if None.
+        """
+        import coal
+
+        chosen = self.likely if chosen is None else chosen
+        centres, turns = self._placed(poses)  # (hulls, N, 3), (hulls, N, 3, 3)
+        radii = np.array([hull.radius for hull in self._hulls])
+        i, j = self.pairs.T
+        bound = np.full((len(self.pairs), centres.shape[1]), np.inf)
+        gap = np.linalg.norm(centres[i[chosen]] - centres[j[chosen]], axis=2)
+        bound[chosen] = gap - (radii[i] + radii[j])[chosen, None]
+        pairs, samples = np.nonzero(bound < within)
+        limit = np.broadcast_to(within, len(gap[0]))[samples]
+        bound[pairs, samples] = self._box_bound(centres, turns, self.pairs[pairs], samples)
+        is_near = bound[pairs, samples] < limit
+        pairs, samples = pairs[is_near], samples[is_near]
+        witness = np.empty((2, len(pairs), 3))
+        normals, result = np.empty((len(pairs), 3)), coal.DistanceResult()
+        placed = {}
+        for k, (pair, sample) in enumerate(zip(pairs.tolist(), samples.tolist(), strict=True)):
+            two = []
+            for hull in self.pairs[pair].tolist():
+                at = hull, sample
+                if at not in placed:
+                    placed[at] = coal.Transform3s(turns[at], centres[at])
+                two += [self._hulls[hull].shape, placed[at]]
+            result.clear()
+            bound[pair, sample] = coal.distance(*two, self._request, result)
+            witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
+            normals[k] = result.normal
+        gradient = self._gradient(poses, pairs, samples, witness, normals)
+        return Nearness(bound, pairs, samples, gradient)
+
+    def nearest(self, motion: Motion, duration: float) -> Contact | None:
+        """Return where a motion comes nearest to a collision, between any samples, too.
+
+        An interval of time is halved until no two hulls can come nearer within it, by what the
+        joints between them can still move them, than by 1 mm what has been seen elsewhere.
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+
+        Returns:
+            The nearest pair with a lower bound of its distance; None if nothing comes nearer than
+            5 cm beyond the clearance.
+
+        References:
+            Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
+        """
+        seen = self.least + _APART
+        lowest: Contact | None = None
+        h = duration / max(2, round(duration / _FIRST)) / 2
+        middles = np.arange(h, duration, 2 * h)
+        a = motion.evaluate(np.linspace(0.0, duration, 40 * len(middles)))[2]
+        fastest = 1.05 * np.abs(a @ self._ratios.T).max(axis=0)
+        while len(middles):
+            q, v, _ = motion.evaluate(middles)
+            way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
+            moved = self._levers @ way.T  # (pairs, N)
+            near = self.near(self.poses(q), seen + moved.max(axis=0), self.everything)
+            exact = near.distance[near.pairs, near.samples]
+            seen = min(seen, exact.min(initial=np.inf))
+            bound = near.distance - moved
+            is_open = (bound < seen - _SURE).any(axis=0) & (2 * h > _SHORTEST)
+            closed = np.where(is_open, np.inf, bound)
+            pair, sample = np.unravel_index(np.argmin(closed), closed.shape)
+            found = float(closed[pair, sample])
+            if found < (seen if lowest is None else lowest.distance):
+                lowest = Contact(*self.named[pair], found, float(middles[sample]))
+            h /= 2
+            middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
+        return lowest
+
+    @cached_property
+    def _levers(self) -> Array:
+        """How far each joint moves the hulls of a pair against each other at most, (pairs, m)."""
+        tree, slides = self._model.pin_model, self._regressor.slides
+        lengths = np.linalg.norm([M.translation for M in tree.jointPlacements], axis=1)[1:]
+        travel = {joint.name: max(-joint.lower, joint.upper) for joint in self._model.limits}
+        for i in np.flatnonzero(slides).tolist():
+            lengths[i] += min(travel.get(tree.names[i + 1], _WIDE), _WIDE)
+        out = np.zeros((len(self.pairs), len(slides)))
+        for k, (one, other) in enumerate(self.pairs.tolist()):
+            two = self._hulls[one], self._hulls[other]
+            apart = self._supports[two[0].body] ^ self._supports[two[1].body]
+            for hull in two:
+                reach, body = float(np.linalg.norm(hull.centre)) + hull.radius, hull.body
+                while body >= 0 and apart[body]:
+                    out[k, body] += 1.0 if slides[body] else reach
+                    reach += lengths[body]
+                    body = int(tree.parents[body + 1]) - 1
+        return out
+
+    def _box_bound(self, centres: Array, turns: Array, pairs: Array, samples: Array) -> Array:
+        """Return lower bounds of distances by the boxes around hulls, shape (k,) [m].
+
+        Their shadows on an axis are as far apart, for any axis: the line of centres and the sides.
+        """
+        i, j = pairs.T
+        way = centres[j, samples] - centres[i, samples]
+        R_i, R_j = turns[i, samples], turns[j, samples]
+        line = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+        axes = np.concatenate([line[:, None], R_i.swapaxes(1, 2), R_j.swapaxes(1, 2)], axis=1)
+        half = np.array([hull.half for hull in self._hulls])
+        shadow = (np.abs(axes @ R_i) @ half[i][:, :, None])[..., 0]
+        shadow += (np.abs(axes @ R_j) @ half[j][:, :, None])[..., 0]
+        apart: Array = (np.abs(axes @ way[:, :, None])[..., 0] - shadow).max(axis=1)
+        return apart
+
+    def _placed(self, poses: Poses) -> tuple[Array, Array]:
+        """Return where the centres of hulls are, and how they are turned."""
+        N = poses.p.shape[2]
+        centres, turns = np.empty((len(self._hulls), N, 3)), np.empty((len(self._hulls), N, 3, 3))
+        for k, hull in enumerate(self._hulls):
+            if hull.body < 0:
+                centres[k], turns[k] = hull.centre, np.eye(3)
+                continue
+            R = np.moveaxis(poses.R[:, :, hull.body], -1, 0)
+            centres[k], turns[k] = poses.p[:, hull.body].T + R @ hull.centre, R
+        return centres, turns
+
+    def _gradient(
+        self, poses: Poses, pairs: Array, samples: Array, witness: Array, normals: Array
+    ) -> Array:
+        """Return what distances change by with each joint: normal . (velocity of the points)."""
+        linear, angular = (x[:, :, samples] for x in poses.screw)  # (3, m, k)
+        bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
+        out = np.zeros((len(pairs), linear.shape[1]))
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            x = witness[side]  # (k, 3)
+            velocity = linear + np.cross(angular, x.T[:, None], axis=0)
+            along = np.einsum("cjk,kc->kj", velocity, normals)
+            out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
+        by_joint: Array = out @ self._ratios
+        return by_joint
+
+
+def _hull(name: str, body: int, points: Array) -> _Hull:
+    """Return the convex hull of points; a flat one as the box around it."""
+    import coal
+
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    about = points - centre
+    radius = float(np.linalg.norm(about, axis=1).max())
+    extent = np.ptp(about, axis=0)  # the centre is the middle of it
+    if np.linalg.matrix_rank(about, tol=_THINNEST) < 3:
+        extent = np.maximum(extent, _THINNEST)
+        return _Hull(name, body, centre, radius + _THINNEST, extent / 2, coal.Box(*extent))
+    if len(points) == 8 and np.allclose(np.abs(about), extent / 2):
+        return _Hull(name, body, centre, radius, extent / 2, coal.Box(*extent))
+    corners = coal.StdVec_Vec3s()
+    for corner in np.unique(np.round(about, 6), axis=0):
+        corners.append(corner)
+    shape = coal.ConvexBase.convexHull(corners, False, "Qt")
+    return _Hull(name, body, centre, radius, extent / 2, shape)
+
+
+def _corners(box: Box) -> Array:
+    low, high = np.array(box.low), np.array(box.high)
+    if not (low < high).all():
+        raise SettingsError(
+            f"box {box.name!r} reaches from {listed(map(str, box.low))} to "
+            f"{listed(map(str, box.high))}, wanted a low corner below the high one in x, y and z"
+        )
+    return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T

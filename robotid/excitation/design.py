@@ -1,0 +1,553 @@
+"""The motion that tells the most of a robot within its limits, found by its gradient.
+
+The information about the base parameters of a motion q = Phi C is the sum of W^T W / sigma^2 over
+its instants, in units of what the URDF leaves open, plus 1, or plus what earlier runs told. An
+augmented Lagrangian keeps the limits: at each instant, (used share)^2 - 1 <= 0 of each limit, and
+distances at least the clearance.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators.determination import base_spread
+from robotid.exceptions import NotConvergedError, SettingsError
+from robotid.excitation.basis import Basis, DesignedMotion
+from robotid.excitation.clearance import Clearance, Contact
+from robotid.excitation.information import MotionInformation, MotionRows, criterion
+from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.identification.previews import (
+    CORRELATION,
+    Run,
+    assumed_noise,
+    assumed_parameters,
+    largest_torques,
+)
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+from robotid.simulation.motions import Motion
+
+__all__ = ["Design", "Designer"]
+
+_PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
+_POLISHED = 3  # times as many that its last rounds look at ...
+_FINER = 10  # ... and at which its limits are checked in the end
+_ROUNDS = 14  # of the augmented Lagrangian ...
+_LAST_ROUNDS = 4  # ... and on the finer grid
+_STEPS = 20  # of L-BFGS in each
+_WEIGHT = 0.3  # of what is violated at all instants together, at first
+_GROWTH = 3.0  # of that from one round to the next
+_SETTLED = 1e-3  # change of the criterion below which a design has converged
+_OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
+_HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
+_SPARE = 0.003  # of limits that a design leaves for what lies between its instants
+_SPARE_WAY = 0.002  # [m] the same of distances
+_NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part in the design
+_SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
+_USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
+_TRIED = 200  # random postures until one is found that the robot can rest in
+_STARTED = 10  # random motions of which the best is a start
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A motion and what it is good for.
+
+    Attributes:
+        motion: The motion.
+        duration: Its length [s].
+        objective: Its criterion, the smaller the better.
+        condition: Condition number of the base problem, columns in units of what the URDF leaves
+            open.
+        used: Largest share that is used of each limit, by joint, shape (6, n); 0 where there is
+            none.
+        contact: Where it comes nearest to a collision; None if nowhere near.
+        seconds: How long it took [s].
+        starts: Starts that were followed to the end.
+        is_converged: Whether the best of them had settled.
+        history: Time since the beginning [s] and criterion of each better motion.
+    """
+
+    motion: Motion
+    duration: float
+    objective: float
+    condition: float
+    used: Array
+    contact: Contact | None = None
+    seconds: float = 0.0
+    starts: int = 0
+    is_converged: bool = False
+    history: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Designer:
+    """Looks for the motion that tells the most.
+
+    Attributes:
+        information: The rows of the base problem, and their gradient.
+        limits: What the robot may do.
+        basis: Functions that motions are sums of.
+        noise: Density of each joint's noise, variance times the time over which it is correlated,
+            shape (n,) [(N m)^2 s or N^2 s].
+        spread: How far base parameters may be from what is known, shape (b,).
+        given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
+        name: The criterion, as of ``criterion``.
+        clearance: What keeps it from collisions; None: they are not looked at.
+        finer: How many times finer than usual the grid of instants is.
+    """
+
+    information: MotionInformation
+    limits: MotionLimits
+    basis: Basis
+    noise: Array
+    spread: Array
+    given: Array | None = None
+    name: str = "D"
+    clearance: Clearance | None = None
+    finer: int = 1
+
+    @classmethod
+    def of_model(
+        cls,
+        model: RobotModel,
+        basis: Basis,
+        limits: MotionLimits,
+        *,
+        name: str = "D",
+        clearance: Clearance | None = None,
+        noise: Mapping[str, float] | None = None,
+        correlation: float = CORRELATION,
+        run: Run | None = None,
+    ) -> "Designer":
+        """Return a designer that assumes of friction and noise what a preview does.
+
+        Args:
+            model: The robot; with the friction of a run before, if there is one.
+            basis: Functions that motions are sums of.
+            limits: What the robot may do.
+            name: The criterion.
+            clearance: What keeps it from collisions.
+            noise: Standard deviation of the torque's noise by joint [N m or N].
+            correlation: Time over which it is correlated [s].
+            run: What was recorded before: the motion then tells what it did not.
+
+        Raises:
+            SettingsError: If a setting is unusable.
+        """
+        criterion(name, np.eye(1))
+        mapping = structural_mapping(model)
+        size, speed = largest_torques(model, _gravity(model)), limits.sizes[1]
+        pi = assumed_parameters(model, size, speed) if run is None else run.standard
+        found = None if run is None else run.noise(mapping.K)
+        density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
+        usual = _USUAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
+        spread = base_spread(mapping.K, prior_spread(model, usual**2, 1))
+        given = None
+        if run is not None:
+            told = run.factors.information(run.step / density)
+            given = np.eye(len(spread)) + spread[:, None] * told * spread
+        information = MotionInformation(model, mapping, mapping.to_base(pi))
+        return cls(information, limits, basis, density, spread, given, name, clearance)
+
+    @cached_property
+    def _functions(self) -> Array:
+        """The basis functions and three derivatives on the grid, shape (4, N, h)."""
+        count = self.finer * round(_PER_PERIOD * self.basis.duration / self.basis.shortest)
+        return self.basis.derivatives(np.linspace(0.0, self.basis.duration, count + 1), 3)
+
+    def design(
+        self,
+        rng: np.random.Generator,
+        *,
+        starts: int = 3,
+        seconds: float = np.inf,
+        progress: Callable[[int, float], None] | None = None,
+    ) -> Design:
+        """Return the best motion that was found, checked on a ten times finer grid.
+
+        Args:
+            rng: Source of the starts.
+            starts: How many starts are followed to the end.
+            seconds: Time after which the best motion so far is returned [s].
+            progress: Called with the number of the start and the best criterion.
+
+        Raises:
+            SettingsError: If the robot cannot even rest within its limits.
+        """
+        begun = time.monotonic()
+        history: list[tuple[float, float]] = []
+        best = _Best()
+
+        def is_over() -> bool:
+            return best.coefficients is not None and time.monotonic() - begun > seconds
+
+        def follow(designer: Designer, C: Array, rounds: int) -> bool:
+            """Follow a start; return whether it settled."""
+            is_settled = False
+            for kept, objective, is_settled in designer._search(C, rounds, is_over):  # noqa: B007
+                if objective < best.objective:
+                    best.coefficients, best.objective = kept, objective
+                    history.append((time.monotonic() - begun, objective))
+                if progress is not None:
+                    progress(done, best.objective)
+            return is_settled
+
+        done = 0
+        while done < starts and not is_over():
+            random = [self.random(rng) for _ in range(_STARTED)]
+            follow(self, min(random, key=lambda C: self._looked_at(C)[0]), _ROUNDS)
+            done += 1
+        chosen, best = best, _Best()
+        fine = replace(self, finer=_POLISHED * self.finer)
+        is_settled = follow(fine, fine._feasible(chosen.of(), 1.0 - _SPARE), _LAST_ROUNDS)
+        found = replace(self, finer=_FINER * self.finer).checked(best.of())
+        return replace(
+            found,
+            seconds=time.monotonic() - begun,
+            starts=done,
+            is_converged=is_settled,
+            history=tuple(history),
+        )
+
+    def checked(self, C: Array) -> Design:
+        """Return a motion, scaled down until it keeps all limits, and clear between instants, too.
+
+        Args:
+            C: Coefficients of a motion, shape (h, n).
+        """
+        C, contact = self._clear(self._feasible(C, 1.0))
+        _, used, _, rows = self._looked_at(C)
+        motion = DesignedMotion(self.basis, C)
+        information = self.matrix(rows)
+        return self._weighed(motion, self.basis.duration, information, used, contact)
+
+    def examined(self, motion: Motion, duration: float, rate: float) -> Design:
+        """Return what any motion tells, and what it uses of limits other than jerk.
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+            rate: Instants per second at which it is looked at [Hz].
+        """
+        t = np.arange(round(duration * rate) + 1) / rate
+        q, v, a = motion.evaluate(t)
+        rows = self.information.rows(q, v, a)
+        used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
+        scale = np.sqrt(1.0 / rate / self.noise)[:, None, None] * self.spread[:, None]
+        flat = (scale * rows.W).swapaxes(0, 1).reshape(len(self.spread), -1)
+        contact = None
+        if self.clearance is not None:
+            contact = self.clearance.nearest(motion, duration)
+        return self._weighed(motion, duration, flat @ flat.T + self.known, used, contact)
+
+    def _weighed(
+        self,
+        motion: Motion,
+        duration: float,
+        information: Array,
+        used: Array,
+        contact: Contact | None,
+    ) -> Design:
+        low, *_, high = np.linalg.eigvalsh(information - self.known)
+        return Design(
+            motion=motion,
+            duration=duration,
+            objective=criterion(self.name, information)[0],
+            condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
+            used=np.abs(used).max(axis=1),
+            contact=contact,
+        )
+
+    def _clear(self, C: Array) -> tuple[Array, Contact | None]:
+        """Return a motion scaled down until it is clear between its instants, too, and how far.
+
+        Raises:
+            NotConvergedError: If it is not clear at nine tenths of its size.
+        """
+        if self.clearance is None:
+            return C, None
+        for _ in range(_HALVINGS):
+            contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
+            if contact is None or contact.distance >= self.clearance.least:
+                return C, contact
+            C = _scaled(C, 0.99)
+        raise NotConvergedError(
+            f"between the instants that were looked at {contact}, nearer than "
+            f"{1e3 * self.clearance.least:.0f} mm; raise the clearance or try another seed",
+            "max_iterations",
+        )
+
+    @property
+    def known(self) -> Array:
+        """Information that is there already, in units of the spread, shape (b, b)."""
+        known: Array = np.eye(len(self.spread)) if self.given is None else self.given
+        return known
+
+    @cached_property
+    def _scale(self) -> Array:
+        """What rows are multiplied by, so that their squares are information, (n, b, 1)."""
+        step = self.basis.duration / (self._functions.shape[1] - 1)
+        scale: Array = np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
+        return scale
+
+    def matrix(self, rows: MotionRows) -> Array:
+        """Return the information of a motion and what was known, in units of the spread, (b, b).
+
+        Args:
+            rows: Its rows.
+        """
+        n, b, N = rows.W.shape
+        scaled = rows.W * self._scale
+        flat = scaled.swapaxes(0, 1).reshape(b, n * N)
+        F: Array = flat @ flat.T + self.known
+        return F
+
+    def _looked_at(self, C: Array) -> tuple[float, Array, float, MotionRows]:
+        """Return criterion, shares of limits used (6, N, n), least distance and rows."""
+        q, v, a, jerk = self._functions @ C
+        rows = self.information.rows(q, v, a)
+        used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
+        distance = np.inf
+        if self.clearance is not None:
+            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+            distance = float(near.distance.min(initial=np.inf))
+        return criterion(self.name, self.matrix(rows))[0], used, distance, rows
+
+    def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
+        """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
+
+        References:
+            Nocedal, Wright (2006), Numerical Optimization, section 17.4.
+        """
+        D = self._functions
+        q, v, a, jerk = D @ C
+        rows = self.information.rows(q, v, a)
+        torque = self.information.torque(rows)
+        value, by_F = criterion(self.name, self.matrix(rows))
+        used = self.limits.used(q, v, a, jerk, torque)
+        cost, pushed = multipliers.of_limits(used)
+        by_value = pushed * 2.0 * used / (1.0 - _SPARE) ** 2 / self.limits.sizes[:, None]
+        by_q, by_v, by_a, by_jerk, by_torque, by_power = by_value
+        by_v = by_v + by_power * torque
+        by_torque = by_torque + by_power * v
+        value += cost
+        if self.clearance is not None:
+            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+            cost, pushed = multipliers.of_distances(near.distance, self.clearance.least)
+            value += cost
+            along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
+            np.add.at(by_q, near.samples, along)
+        by_W = 2.0 * self._scale * (by_F @ (self._scale * rows.W))
+        by_W += self.information.beta[:, None] * by_torque.T[:, None]
+        along_q, along_v, along_a = self.information.pull(rows, by_W)
+        by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
+        gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
+        return value, gradient
+
+    def random(self, rng: np.random.Generator) -> Array:
+        """Return the coefficients of a random motion that keeps the limits, shape (h, n).
+
+        Args:
+            rng: Source of the motion.
+
+        Raises:
+            SettingsError: If no posture that the robot can rest in is found.
+        """
+        n = len(self.limits.middle)
+        C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
+        C[0] = self.postures(rng)[0]
+        return self._feasible(C, 1.0 - _SPARE)
+
+    def postures(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
+        """Return those of random postures that keep limits and distances at rest, shape (k, n).
+
+        Args:
+            rng: Source of the postures.
+            tried: How many are tried.
+
+        Raises:
+            SettingsError: If none of them does.
+        """
+        reach = rng.uniform(-0.8, 0.8, (tried, len(self.limits.middle)))
+        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
+        q = self.limits.middle + reach * self.limits.sizes[0]
+        kept: Array = q[self.can_rest(q)]
+        if not len(kept):
+            raise SettingsError(self._why_not(*self._at_rest(q)))
+        return kept
+
+    def can_rest(self, q: Array) -> Array:
+        """Return whether postures keep limits and distances at rest, shape (N,), bool.
+
+        Args:
+            q: Postures, shape (N, n) [rad or m].
+        """
+        used, distance = self._at_rest(q)
+        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
+        can: Array = (used.max(axis=(0, 2)) <= 1.0) & (distance >= least)
+        return can
+
+    def _at_rest(self, q: Array) -> tuple[Array, Array]:
+        """Return the shares of limits that postures use, (6, N, n), and least distances, (N,)."""
+        still = np.zeros_like(q)
+        rows = self.information.rows(q, still, still)
+        used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
+        distance = np.full(len(q), np.inf)
+        if self.clearance is not None:
+            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+            distance = near.distance.min(axis=0, initial=np.inf)
+        return used, distance
+
+    def _why_not(self, used: Array, distance: Array) -> str:
+        """Return which limit leaves no posture, and by how much."""
+        least = used.min(axis=1)  # (6, n)
+        kind, joint = np.unravel_index(int(np.argmax(least)), least.shape)
+        names = self.information.model.joints
+        tried = f"of {used.shape[1]} random postures none can be held at rest"
+        if least[kind, joint] > 1.0:
+            return (
+                f"{tried}: {names[joint]} needs {100 * least[kind, joint]:.0f} % of its "
+                f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
+                "load that it carries"
+            )
+        return (
+            f"{tried}: the nearest links or obstacles are at most "
+            f"{1e3 * float(distance.max()):.0f} mm apart, wanted "
+            f"{1e3 * (self.clearance.least if self.clearance else 0.0):.0f} mm; lower the "
+            "clearance, or move the floor and the boxes"
+        )
+
+    def _feasible(self, C: Array, most: float) -> Array:
+        """Return the largest share of a motion about its middle that keeps the limits, (h, n).
+
+        Each joint first keeps its own positions and speeds; then all are scaled as one.
+        """
+        room = most * self.limits.sizes[0] - np.abs(C[0] - self.limits.middle)
+        moving = np.abs(self._functions[:, :, 1:] @ C[1:]).max(axis=1)  # (4, n)
+        over = np.vstack(
+            [moving[:1] / np.maximum(room, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
+        )
+        C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
+        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
+        low, high = 0.0, 1.0
+        for k in range(_HALVINGS):
+            share = 1.0 if k == 0 else (low + high) / 2
+            _, used, distance, _ = self._looked_at(_scaled(C, share))
+            is_kept = np.abs(used).max() <= most and distance >= least
+            low, high = (share, high) if is_kept else (low, share)
+            if low == 1.0:
+                break
+        return _scaled(C, low)
+
+    def _search(
+        self, start: Array, rounds: int, is_over: Callable[[], bool]
+    ) -> Iterator[tuple[Array, float, bool]]:
+        """Yield motions that keep the limits, their criterion, and whether the search settled."""
+        from scipy.optimize import minimize
+
+        unit = self.limits.sizes[0]
+        multipliers = _Multipliers(_WEIGHT / self._functions.shape[1])
+        C, before = start, np.inf
+
+        def scaled(x: Array) -> tuple[float, Array]:
+            if is_over():
+                raise _OutOfTime
+            value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
+            return value, (gradient * unit).reshape(-1)
+
+        yield start, self._looked_at(start)[0], False
+        for _ in range(rounds):
+            try:
+                found = minimize(
+                    scaled,
+                    (C / unit).reshape(-1),
+                    jac=True,
+                    method="L-BFGS-B",
+                    options={"maxiter": _STEPS, "maxcor": 20},
+                )
+            except _OutOfTime:
+                return
+            C = found.x.reshape(C.shape) * unit
+            _, used, _, rows = self._looked_at(C)
+            multipliers.raise_by(used)
+            if self.clearance is not None:
+                near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
+                multipliers.raise_by_distances(near.distance, self.clearance.least)
+            kept = self._feasible(C, 1.0 - _SPARE)
+            objective = self._looked_at(kept)[0]
+            is_settled = abs(before - objective) < _SETTLED and np.abs(used).max() < _OVER
+            yield kept, objective, is_settled
+            if is_settled:
+                return
+            before = objective
+            multipliers.weight *= _GROWTH
+
+
+def _gravity(model: RobotModel) -> Array:
+    """Return the largest torque that gravity asks of each joint over random poses, shape (n,)."""
+    reach = [(j.lower, j.upper) if j.has_limits else (-np.pi, np.pi) for j in model.limits]
+    low, high = np.array(reach).T
+    q = np.random.default_rng(0).uniform(low, high, (_TRIED, len(reach)))
+    torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
+    return torque
+
+
+class _OutOfTime(Exception):
+    """The time of a design is over."""
+
+
+class _Best:
+    """The best motion so far."""
+
+    coefficients: Array | None = None
+    objective: float = np.inf
+
+    def of(self) -> Array:
+        """Return its coefficients."""
+        if self.coefficients is None:
+            raise NotConvergedError("no motion was looked at", "max_iterations")
+        return self.coefficients
+
+
+class _Multipliers:
+    """Multipliers of the limits at each instant, and of distances."""
+
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+        self._limits: Array | float = 0.0
+        self._distances: Array | float = 0.0
+
+    def of_limits(self, used: Array) -> tuple[float, Array]:
+        """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
+        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self._limits)
+
+    def of_distances(self, distance: Array, least: float) -> tuple[float, Array]:
+        """Return the cost of distances and its slope by what they are short, shape (pairs, N)."""
+        return self._cost((least + 2 * _SPARE_WAY - distance) / _SOFT, self._distances)
+
+    def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
+        pushed = np.maximum(0.0, multipliers + self.weight * over)
+        cost = float(np.sum(pushed**2 - np.square(multipliers))) / (2 * self.weight)
+        return cost, pushed
+
+    def raise_by(self, used: Array) -> None:
+        """Take the slopes as the new multipliers."""
+        self._limits = self.of_limits(used)[1]
+
+    def raise_by_distances(self, distance: Array, least: float) -> None:
+        """Take the slopes as the new multipliers."""
+        self._distances = self.of_distances(distance, least)[1]
+
+
+def _scaled(C: Array, share: float | Array) -> Array:
+    """Return a motion with its way about the middle scaled, shape (h, n)."""
+    scaled = C * share
+    scaled[0] = C[0]
+    return scaled

@@ -1,0 +1,201 @@
+"""What a motion will tell: the information of its torques about base parameters, by gradient."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError, SettingsError
+from robotid.regressor.adjoint import MotionRegressor, RegressorState
+from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.columns import drive_motion
+from robotid.robot.drives import DriveMotion
+from robotid.robot.model import RobotModel
+
+__all__ = ["CRITERIA", "MotionInformation", "MotionRows", "criterion"]
+
+#: Which property of the information is made large, or small.
+CRITERIA = ("D", "A", "E", "condition")
+_STEP = 1e-6  # of the differences by which drive columns are derived, in their argument's scale
+_TURN = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRows:
+    """The regressor's kept columns along a motion, and what is needed for their gradient.
+
+    Attributes:
+        W: Row r, base column c at each of N instants, shape (n, b, N).
+    """
+
+    W: Array
+    state: RegressorState
+    motion: tuple[Array, Array, Array]  # q, v, a, shape (N, n) each
+    load: Array  # torque of the bodies, (N, n)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionInformation:
+    """The rows W of the base problem along a motion, W beta = tau, and their gradient.
+
+    Drive terms are of an instant: what remembers has slid for long. The sign of friction is
+    tanh(w / 0.01 rad/s), so that it has a gradient.
+
+    Attributes:
+        model: The robot, with a fixed base.
+        mapping: Its base parameters.
+        beta: Base parameters that torques are reckoned by, shape (b,).
+    """
+
+    model: RobotModel
+    mapping: BaseMapping
+    beta: Array
+    _regressor: MotionRegressor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        wanted = (len(self.mapping.independent),)
+        if self.beta.shape != wanted:
+            raise DataError(f"beta has shape {self.beta.shape}, wanted {wanted}")
+        object.__setattr__(self, "_regressor", MotionRegressor(self.model))
+
+    @cached_property
+    def _entries(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Which entry of which pair stands in which row and column, and times what."""
+        size = self.model.layout.n_inertial
+        places, bodies = self._regressor.pairs
+        kept = self.mapping.independent
+        found = []
+        for column in np.flatnonzero(kept < size):
+            body, entry = divmod(int(kept[column]), 10)
+            for pair in np.flatnonzero(bodies == body):
+                for row in np.flatnonzero(self.model.velocity_map[places[pair]]):
+                    factor = self.model.velocity_map[places[pair], row]
+                    found.append((row, column, pair, entry, factor))
+        rows, columns, pairs, entries, factors = map(np.array, zip(*found, strict=True))
+        return rows, columns, pairs, entries, factors
+
+    @cached_property
+    def _drives(self) -> tuple[Array, Array]:
+        """The columns of drive terms, and which drive parameter each is, shape (k,) each."""
+        size = self.model.layout.n_inertial
+        columns = np.flatnonzero(self.mapping.independent >= size)
+        return columns, self.mapping.independent[columns] - size
+
+    def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
+        """Return the rows along a motion of N instants.
+
+        Args:
+            q: Joint coordinates, shape (N, n) [rad or m].
+            v: Velocities, shape (N, n) [rad/s or m/s].
+            a: Accelerations, shape (N, n) [rad/s^2 or m/s^2].
+        """
+        G = self.model.velocity_map
+        state = self._regressor(q @ G.T + self.model.position_offset, v @ G.T, a @ G.T)
+        W = np.zeros((len(self.model.joints), len(self.mapping.independent), len(q)))
+        rows, columns, pairs, entries, factors = self._entries
+        np.add.at(W, (rows, columns), factors[:, None] * state.rows[pairs, entries])
+        load = np.einsum("rcn,c->nr", W, self.beta)  # drive columns are still 0
+        columns, parameters = self._drives
+        values = self._drive_values(self._drive_motion(q, v, a, load))
+        W[:, columns] = self.model.layout.drive_loads[:, parameters, None] * values
+        return MotionRows(W, state, (q, v, a), load)
+
+    def _drive_motion(self, q: Array, v: Array, a: Array, load: Array) -> DriveMotion:
+        """Return how the drives move, with smooth signs, arrays of shape (d, N)."""
+        layout = self.model.layout
+        motion = drive_motion(layout, q, v, a, v @ layout.drive_ratios.T, load)
+        return self._turning(motion)
+
+    def _turning(self, motion: DriveMotion) -> DriveMotion:
+        """Return the motion of drives with the signs that its speeds have."""
+        speeds = motion.v / self.model.layout.drive_speeds[:, None]
+        return replace(motion, direction=np.tanh(speeds / _TURN))
+
+    def _drive_values(self, motion: DriveMotion) -> Array:
+        """Return what the kept drive parameters multiply, shape (k, N)."""
+        own = [self.model.layout.drive_parameters[k] for k in self._drives[1]]
+        values = [term.column(motion.of(d)) for d, term in own]
+        return np.array(values).reshape(len(own), motion.v.shape[1])
+
+    def torque(self, rows: MotionRows) -> Array:
+        """Return the torque along the motion, shape (N, n) [N m or N].
+
+        Args:
+            rows: The rows.
+        """
+        torque: Array = np.einsum("rcn,c->nr", rows.W, self.beta)
+        return torque
+
+    def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
+        """Return the gradient of sum(weights * W) by q, v and a, shape (N, n) each.
+
+        Args:
+            rows: The rows.
+            weights: What each entry counts, shape (n, b, N).
+        """
+        columns, parameters = self._drives
+        loads = self.model.layout.drive_loads[:, parameters]
+        by_value = np.einsum("rk,rkn->kn", loads, weights[:, columns])
+        *direct, by_load = self._pull_drives(rows, by_value)
+        entries = weights + by_load.T[:, None] * self.beta[:, None]
+        r, c, pairs, k, factors = self._entries
+        own = np.zeros_like(rows.state.rows)
+        np.add.at(own, (pairs, k), factors[:, None] * entries[r, c])
+        G = self.model.velocity_map
+        bodies = self._regressor.pull(rows.state, own)
+        q, v, a = (x @ G + y for x, y in zip(bodies, direct, strict=True))
+        return q, v, a
+
+    def _pull_drives(self, rows: MotionRows, weights: Array) -> list[Array]:
+        """Return the gradient of sum(weights * values) by q, v, a and load, by differences."""
+        layout, motion = self.model.layout, self._drive_motion(*rows.motion, rows.load)
+        own = [layout.drive_parameters[k][0] for k in self._drives[1]]
+        by_drive = np.zeros((len(layout.drives), len(own)))
+        by_drive[own, np.arange(len(own))] = 1.0
+        R = layout.drive_ratios
+        gradients = []
+        for name in ("q", "v", "a", "load"):
+            x = getattr(motion, name)
+            step = _STEP * np.maximum(1.0, np.abs(x))
+            up, down = (
+                self._drive_values(self._turning(replace(motion, **{name: x + sign * step})))
+                for sign in (1, -1)
+            )
+            slope = by_drive @ (weights * (up - down)) / (2 * step)
+            share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)
+            gradients.append(slope.T @ (share if name == "load" else R))
+        return gradients
+
+
+def criterion(name: str, F: Array) -> tuple[float, Array]:
+    """Return what is to be made small of an information matrix, and its gradient.
+
+    Args:
+        name: "D": -log det F / b; "A": log(trace F^-1 / b); "E": -log of the smallest eigenvalue;
+            "condition": log of the condition number.
+        F: Information about b parameters in units of like size, shape (b, b), positive definite.
+
+    Raises:
+        SettingsError: If there is no such criterion.
+
+    References:
+        Pukelsheim (2006), Optimal Design of Experiments, chapter 6.
+    """
+    if name not in CRITERIA:
+        raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
+    values, vectors = np.linalg.eigh(F)
+    values = np.maximum(values, values[-1] * np.finfo(float).eps)
+    size = len(values)
+    if name == "D":
+        by_value = -1.0 / values / size
+        return -float(np.log(values).mean()), (vectors * by_value) @ vectors.T
+    if name == "A":
+        total = float(np.sum(1.0 / values))
+        by_value = -1.0 / values**2 / total
+        return float(np.log(total / size)), (vectors * by_value) @ vectors.T
+    low, high = vectors[:, 0], vectors[:, -1]
+    by_low = -np.outer(low, low) / values[0]
+    if name == "E":
+        return -float(np.log(values[0])), by_low
+    return float(np.log(values[-1] / values[0])), np.outer(high, high) / values[-1] + by_low

@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+
+from robotid.exceptions import DataError, SettingsError
+from robotid.excitation.clearance import Box, Clearance
+from robotid.robot.model import RobotModel
+from robotid.simulation.motions import ProgramMotion, random_fourier
+
+# a slider that carries a ball past a post: distances are known by hand
+SLIDER = """
+<robot name="slider">
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="car"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="ball"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><origin xyz="0 0.5 0"/><geometry><box size="0.1 0.1 0.1"/></geometry></collision>
+  </link>
+  <joint name="slide" type="prismatic"><parent link="base"/><child link="car"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
+  <joint name="turn" type="revolute"><parent link="car"/><child link="ball"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2" effort="100"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def slider(tmp_path):
+    (tmp_path / "slider.urdf").write_text(SLIDER)
+    return RobotModel.from_urdf(tmp_path / "slider.urdf")
+
+
+def distances(clearance, q):
+    return clearance.near(clearance.poses(np.atleast_2d(q)), 10.0, clearance.everything)
+
+
+def test_distances_are_those_of_the_boxes(slider):
+    post = Box("post", (0.3, 0.4, -0.2), (0.4, 0.6, 0.2))
+    clearance = Clearance(slider, boxes=[post])
+    near = distances(clearance, [[0.0, 0.0], [-0.2, 0.0], [0.33, 0.0]])
+    # from the ball's face at x + 0.05 to the post's at 0.3; the base is 0.4 from the ball
+    (ball_post,) = (k for k, p in enumerate(clearance.named) if p == ("ball", "post"))
+    np.testing.assert_allclose(near.distance[ball_post, :2], [0.25, 0.45], atol=1e-6)
+    assert near.distance[ball_post, 2] < 0
+    (base_ball,) = (k for k, p in enumerate(clearance.named) if p == ("base", "ball"))
+    assert near.distance[base_ball, 0] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_gradients_of_distances_are_those_of_differences(panda):
+    clearance, rng = Clearance(panda, floor=-0.05), np.random.default_rng(5)
+    low, high = np.array([(j.lower, j.upper) for j in panda.limits]).T
+    q, d, h = rng.uniform(low, high, (20, 7)), rng.standard_normal(7), 1e-6
+    near = clearance.near(clearance.poses(q), 0.2)
+    up, down = (clearance.near(clearance.poses(q + s * h * d), 0.3).distance for s in (1, -1))
+    at = near.pairs, near.samples
+    slope = (up[at] - down[at]) / (2 * h)
+    assert len(slope) > 50
+    np.testing.assert_allclose(near.gradient @ d, slope, atol=1e-4)
+
+
+def test_what_lies_between_samples_is_found(slider):
+    # the ball passes a thin post in 30 ms, between samples that are all clear of it
+    post = Box("post", (0.0, 0.4, -0.2), (0.001, 0.6, 0.2))
+    clearance = Clearance(slider, boxes=[post])
+    motion = ProgramMotion(np.array([1.8, 0.0]), 0.3, np.array([-0.9, 0.0]))
+    coarse = clearance.near(
+        clearance.poses(motion.evaluate(np.linspace(0.0, 0.3, 6))[0]), 0.0, clearance.everything
+    )
+    assert coarse.distance.min() > 0.0
+    contact = clearance.nearest(motion, 0.3)
+    assert {contact.first, contact.second} == {"ball", "post"}
+    assert contact.distance < 0
+    assert contact.time == pytest.approx(0.15, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nearest_place_is_a_lower_bound_within_a_millimetre(panda, seed):
+    clearance = Clearance(panda, floor=-0.05)
+    motion = random_fourier(panda, np.random.default_rng(seed))
+    contact = clearance.nearest(motion, 3.0)
+    q = motion.evaluate(np.linspace(0.0, 3.0, 3001))[0]
+    dense = clearance.near(clearance.poses(q), 0.07, clearance.everything).distance.min()
+    assert dense - 2e-3 < contact.distance <= dense
+
+
+def test_bad_surroundings_are_refused(slider, tmp_path):
+    with pytest.raises(SettingsError, match="clearance is -1, wanted 0 m or more"):
+        Clearance(slider, least=-1)
+    with pytest.raises(SettingsError, match="box 'post' reaches from 1, 0, 0 to 0, 1, 1"):
+        Clearance(slider, boxes=[Box("post", (1, 0, 0), (0, 1, 1))])
+    bare = SLIDER.replace("collision", "nothing")
+    (tmp_path / "bare.urdf").write_text(bare)
+    with pytest.raises(DataError, match="has no shape that can be read"):
+        Clearance(RobotModel.from_urdf(tmp_path / "bare.urdf"))

@@ -1,0 +1,132 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotid.exceptions import SettingsError
+from robotid.excitation.basis import BSplineBasis, FourierBasis
+from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.design import Designer, _Multipliers
+from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.prior import prior_spread
+
+WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    """The last three joints of a UR10: small, and its links may meet."""
+    return RobotModel.from_urdf(example_urdf("ur10_robot.urdf"), joints=WRIST)
+
+
+@pytest.fixture(scope="module")
+def designer(wrist):
+    limits = MotionLimits.of_model(wrist, acceleration=8.0, jerk={"wrist_1_joint": 60.0}, power=40)
+    return Designer.of_model(wrist, FourierBasis(4.0, 3), limits, noise={"wrist_2_joint": 0.7})
+
+
+@pytest.fixture(scope="module")
+def design(designer):
+    return designer.design(np.random.default_rng(0), starts=1)
+
+
+def test_the_information_is_that_of_the_regressor(wrist, designer, rng):
+    C = designer.random(rng)
+    step = 4.0 / 60  # twenty instants within a third of 4 s
+    t = step * np.arange(61)
+    q, v, a, _ = designer.basis.derivatives(t, 3) @ C
+    signs = np.tanh(v / 0.01)
+    W = joint_torque_regressor(wrist, q, v, a, signs)[:, designer.information.mapping.independent]
+    density = 0.1 * (np.array([0.01 * 54.0, 0.7, 0.01 * 54.0])) ** 2  # 1 % of 54 N m, for 0.1 s
+    weights = np.tile(step / density, 61)[:, None]
+    S = designer.spread
+    expected = S[:, None] * (W.T @ (weights * W)) * S + np.eye(len(S))
+    rows = designer.information.rows(q, v, a)
+    np.testing.assert_allclose(designer.matrix(rows), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["D", "A", "E"])
+def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, rng, name):
+    around = Clearance(wrist, least=0.05, boxes=[Box("post", (0.9, 0.2, -0.5), (1.0, 0.4, 0.5))])
+    designer = replace(designer, name=name, clearance=around)
+    C, D = 1.5 * designer.random(rng), rng.standard_normal((5, 3))
+    shape = (len(LIMITS), 61, 3)
+    multipliers = _Multipliers(0.2)
+    multipliers._limits = rng.uniform(0.0, 0.05, shape)
+    h = 1e-6
+    up, down = (designer._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
+    slope = np.sum(designer._lagrangian(C, multipliers)[1] * D)
+    assert slope == pytest.approx((up - down) / (2 * h), rel=1e-4)
+
+
+def test_a_design_tells_more_than_random_motions_within_the_same_limits(designer, design):
+    rng = np.random.default_rng(1)
+    random = [designer._looked_at(designer.random(rng))[0] for _ in range(100)]
+    assert design.objective < min(random) - 0.2
+    assert design.used.max() <= 1.0
+    assert (design.used.max(axis=1) > 0.9).sum() >= 2  # it goes to its limits
+    times, objectives = zip(*design.history, strict=True)
+    assert list(times) == sorted(times)
+    assert min(objectives) < objectives[0]
+
+
+def test_a_design_keeps_its_limits_between_its_instants(wrist, designer, design):
+    t = np.linspace(0.0, 4.0, 20_001)
+    q, v, a, jerk = design.motion.basis.derivatives(t, 3) @ design.motion.coefficients
+    information = designer.information
+    torque = information.torque(information.rows(q, v, a))
+    used = np.abs(designer.limits.used(q, v, a, jerk, torque))
+    assert used.max() < 1.001
+    np.testing.assert_allclose(used.max(axis=1), design.used, atol=2e-3)
+    assert np.abs(v[[0, -1]]).max() < 1e-9
+    assert np.abs(a[[0, -1]]).max() < 1e-9
+
+
+def test_designs_are_the_same_under_a_seed_and_stop_when_told(designer):
+    short = replace(designer, basis=BSplineBasis(4.0, 5))
+    one, other = (short.design(np.random.default_rng(3), starts=1, seconds=0.0) for _ in range(2))
+    np.testing.assert_array_equal(one.motion.coefficients, other.motion.coefficients)
+    assert not one.is_converged
+    assert one.used.max() <= 1.0
+
+
+def test_what_is_known_already_is_not_asked_for_again(designer, design):
+    rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
+    told = designer.matrix(rows)
+    next_one = replace(designer, given=told)
+    again = next_one._looked_at(design.motion.coefficients)[0]
+    fresh = next_one.design(np.random.default_rng(4), starts=1)
+    assert fresh.objective < again - 0.02
+
+
+def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
+    # a wall 3 cm beside the tool at rest
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    around = Clearance(wrist, least=0.01, boxes=[wall])
+    found = replace(designer, clearance=around).design(np.random.default_rng(5), starts=1)
+    assert found.contact is None or found.contact.distance >= 0.01
+    t = np.linspace(0.0, 4.0, 4001)
+    near = around.near(around.poses(found.motion.evaluate(t)[0]), 0.05, around.everything)
+    assert near.distance.min() >= 0.01
+
+
+def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
+    weak = designer.limits.sizes.copy()
+    weak[4, 0] = 1e-3
+    limits = replace(designer.limits, sizes=weak)
+    with pytest.raises(SettingsError, match=r"wrist_1_joint needs \d+ % of its torque limit"):
+        replace(designer, limits=limits).design(np.random.default_rng(0), starts=1)
+    inside = Clearance(wrist, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
+    with pytest.raises(SettingsError, match="the nearest links or obstacles are at most"):
+        replace(designer, clearance=inside).design(np.random.default_rng(0), starts=1)
+
+
+def test_spread_and_noise_are_those_of_a_preview(wrist, designer):
+    speed = designer.limits.sizes[1]
+    usual = 0.3 * np.array([[54.0] * 3, speed, speed * 2 * np.pi / (4.0 / 3)])
+    K = designer.information.mapping.K
+    expected = np.linalg.norm(K * prior_spread(wrist, usual**2, 1), axis=1)
+    np.testing.assert_allclose(designer.spread, expected)

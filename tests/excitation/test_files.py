@@ -1,0 +1,59 @@
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from robotid.exceptions import SettingsError
+from robotid.excitation.basis import DesignedMotion, FourierBasis
+from robotid.excitation.files import write_motion
+from robotid.logs.formats import open_table
+from robotid.logs.settings import LogSource
+
+JOINTS = tuple(f"joint_{k}" for k in range(6))
+
+
+@pytest.fixture
+def motion(rng):
+    return DesignedMotion(FourierBasis(2.0, 3), rng.standard_normal((5, 6)))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_table_has_positions_velocities_and_accelerations(motion, tmp_path, suffix):
+    path = write_motion(motion, JOINTS, 2.0, 50.0, tmp_path / f"m{suffix}")
+    table = open_table(path, LogSource()).read(["time", "q_joint_2", "dq_joint_2", "ddq_joint_5"])
+    np.testing.assert_array_equal(table["time"], np.arange(101) / 50)
+    q, v, a = motion.evaluate(table["time"])
+    np.testing.assert_array_equal(table["q_joint_2"], q[:, 2])
+    np.testing.assert_array_equal(table["dq_joint_2"], v[:, 2])
+    np.testing.assert_array_equal(table["ddq_joint_5"], a[:, 5])
+
+
+def test_ros_reads_it_as_a_joint_trajectory(motion, tmp_path):
+    path = write_motion(motion, JOINTS, 2.0, 10.0, tmp_path / "m.yaml")
+    content = yaml.safe_load(path.read_text())
+    assert content["joint_names"] == list(JOINTS)
+    assert len(content["points"]) == 21
+    point = content["points"][7]
+    assert point["time_from_start"] == {"sec": 0, "nanosec": 700_000_000}
+    q, v, a = motion.evaluate(np.array([0.7]))
+    for name, values in (("positions", q), ("velocities", v), ("accelerations", a)):
+        np.testing.assert_allclose(point[name], values[0], atol=1e-6)
+
+
+def test_a_ur_is_told_every_8_ms(motion, tmp_path):
+    lines = write_motion(motion, JOINTS, 2.0, 10.0, tmp_path / "m.script").read_text().splitlines()
+    moves = [line for line in lines if "servoj" in line]
+    assert len(moves) == 251
+    numbers = re.search(r"\[(.*)\], t=0.008", moves[125]).group(1)
+    q = motion.evaluate(np.array([1.0]))[0][0]
+    np.testing.assert_allclose(np.array(numbers.split(","), dtype=float), q, atol=1e-6)
+    assert lines[1].startswith(f"  movej([{motion.evaluate(np.zeros(1))[0][0, 0]:.6f}, ")
+
+
+def test_what_cannot_be_written_is_refused(motion, tmp_path):
+    with pytest.raises(SettingsError, match="6 joints; this robot has 2"):
+        write_motion(motion, JOINTS[:2], 2.0, 10.0, tmp_path / "m.script")
+    with pytest.raises(SettingsError, match="rate is 0, wanted a positive number"):
+        write_motion(motion, JOINTS, 2.0, 0.0, tmp_path / "m.csv")
+    assert not list(tmp_path.iterdir())

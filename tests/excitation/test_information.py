@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+from helpers.robots import ROBOTS
+
+from robotid.exceptions import SettingsError
+from robotid.excitation.information import CRITERIA, MotionInformation, criterion
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.columns import friction_speeds
+from robotid.regressor.torque import joint_torque_regressor
+from robotid.robot.drives import LoadFriction, Stribeck
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+OWN = {"own_terms": {"elbow_joint": [Stribeck(speed=0.3), LoadFriction()]}}
+CASES = {
+    "six turning joints": ROBOTS["six turning joints"],
+    "coupled drives": ROBOTS["coupled drives"],
+    "terms of their own": ("ur5_robot.urdf", OWN),
+    "mimic joint coupled": ROBOTS["mimic joint coupled"],
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request):
+    """A robot with random drive parameters, and the rows of its base problem."""
+    rng = np.random.default_rng(3)
+    file, options = CASES[request.param]
+    model = RobotModel.from_urdf(example_urdf(file), **options)
+    mapping, pi = structural_mapping(model), model.standard_parameters()
+    size = model.layout.n_inertial
+    pi[size:] = rng.uniform(0.1, 0.3, len(pi) - size)
+    motion = rng.uniform(-2, 2, (3, 6, len(model.joints)))
+    motion[1, 0] *= 0.005  # where signs change
+    return model.with_reference(pi), mapping, pi, motion
+
+
+def test_its_rows_and_torques_are_those_of_the_regressor(case):
+    model, mapping, pi, (q, v, a) = case
+    direction = np.tanh(v @ friction_speeds(model.layout).T / 0.01)
+    Y = joint_torque_regressor(model, q, v, a, direction)
+    information = MotionInformation(model, mapping, mapping.to_base(pi))
+    rows = information.rows(q, v, a)
+    expected = Y[:, mapping.independent].reshape(len(q), len(model.joints), -1)
+    np.testing.assert_allclose(rows.W.transpose(2, 0, 1), expected, atol=1e-10)
+    torque = (Y @ pi).reshape(len(q), -1)
+    np.testing.assert_allclose(information.torque(rows), torque, rtol=1e-9, atol=1e-9)
+
+
+def test_its_gradient_is_that_of_differences(case):
+    model, mapping, pi, motion = case
+    rng = np.random.default_rng(4)
+    information = MotionInformation(model, mapping, mapping.to_base(pi))
+    rows = information.rows(*motion)
+    weights, d = rng.standard_normal(rows.W.shape), rng.standard_normal(motion.shape)
+
+    def value(x):
+        return np.sum(weights * information.rows(*x).W)
+
+    h = 1e-7
+    expected = (value(motion + h * d) - value(motion - h * d)) / (2 * h)
+    found = sum(np.sum(g * y) for g, y in zip(information.pull(rows, weights), d, strict=True))
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_criteria_have_their_values_and_gradients(name, rng):
+    A, D = rng.standard_normal((2, 7, 7))
+    F, D = A @ A.T, D + D.T
+    eigenvalues = np.linalg.eigvalsh(F)
+    expected = {
+        "D": -np.linalg.slogdet(F)[1] / 7,
+        "A": np.log(np.trace(np.linalg.inv(F)) / 7),
+        "E": -np.log(eigenvalues[0]),
+        "condition": np.log(np.linalg.cond(F)),
+    }[name]
+    value, gradient = criterion(name, F)
+    assert value == pytest.approx(expected, rel=1e-9)
+    h = 1e-6
+    slope = (criterion(name, F + h * D)[0] - criterion(name, F - h * D)[0]) / (2 * h)
+    assert np.sum(gradient * D) == pytest.approx(slope, rel=1e-6)
+
+
+def test_a_criterion_that_there_is_not_is_refused():
+    with pytest.raises(SettingsError, match="criterion is 'F', wanted one of D, A, E, condition"):
+        criterion("F", np.eye(2))

@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+
+from robotid.exceptions import SettingsError
+from robotid.excitation.limits import MotionLimits
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+def test_limits_are_those_of_the_urdf_and_those_stated(panda):
+    limits = MotionLimits.of_model(panda, share=0.5, jerk=7.0, acceleration={"panda_joint2": 3.0})
+    joint = panda.limits[1]
+    assert limits.middle[1] == pytest.approx((joint.lower + joint.upper) / 2)
+    np.testing.assert_allclose(
+        limits.sizes[:, 1],
+        [(joint.upper - joint.lower) / 4, joint.velocity / 2, 3.0, 7.0, joint.effort / 2, np.inf],
+    )
+    assert limits.sizes[2, 0] == np.inf
+
+
+def test_shares_are_signed_and_power_is_torque_times_speed(panda):
+    limits = MotionLimits.of_model(panda, power=10.0)
+    x = np.full((1, 7), 2.0)
+    used = limits.used((limits.middle - limits.sizes[0])[None], x, x, x, -3.0 * x)
+    np.testing.assert_allclose(used[0], -1.0)
+    np.testing.assert_allclose(used[1], x / limits.sizes[1])
+    np.testing.assert_array_equal(used[2:4], 0.0)
+    np.testing.assert_allclose(used[4], -6.0 / limits.sizes[4][None])
+    np.testing.assert_allclose(used[5], -1.2)
+
+
+def test_robots_without_limits_are_told_what_to_state(tmp_path):
+    text = example_urdf("ur5_robot.urdf").read_text()
+    (tmp_path / "bare.urdf").write_text(text.replace('velocity="3.15"', 'velocity="0"'))
+    with pytest.raises(SettingsError, match=r"no limit of .*\(velocity\).*add <limit"):
+        MotionLimits.of_model(RobotModel.from_urdf(tmp_path / "bare.urdf"))
+
+
+def test_bad_numbers_are_refused(panda):
+    with pytest.raises(SettingsError, match=r"share is 1\.2, wanted more than 0 and at most 1"):
+        MotionLimits.of_model(panda, share=1.2)
+    with pytest.raises(SettingsError, match="jerk of panda_joint1 is -1, wanted a positive number"):
+        MotionLimits.of_model(panda, jerk={"panda_joint1": -1})
+    with pytest.raises(SettingsError, match="power is stated of 'x', which is no joint that moves"):
+        MotionLimits.of_model(panda, power={"x": 1})

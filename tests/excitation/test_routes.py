@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from robotid.excitation.basis import FourierBasis
+from robotid.excitation.clearance import Clearance
+from robotid.excitation.design import Designer
+from robotid.excitation.limits import MotionLimits
+from robotid.excitation.routes import Route, design_stands, design_sweeps
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+
+@pytest.fixture(scope="module")
+def designer():
+    joints = ["shoulder_lift_joint", "elbow_joint", "wrist_1_joint"]
+    model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"), joints=joints)
+    limits = MotionLimits.of_model(model, share=0.8)
+    return Designer.of_model(
+        model, FourierBasis(10.0, 5), limits, clearance=Clearance(model, least=0.01, floor=-0.1)
+    )
+
+
+def test_a_route_rests_cruises_and_its_derivatives_are_true():
+    places = np.array([[0.0, 1.0], [1.0, 1.0], [0.5, -1.0]])
+    route = Route(places, np.array([2.0, 1.0]), np.array([0.1, 0.5]), np.array([0.5, 0.3, 0.2]))
+    assert route.duration == pytest.approx(4.0)
+    t = np.linspace(0.0, 4.0, 40_001)
+    q, v, a = route.evaluate(t)
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], v[1:-1], atol=2e-4)
+    np.testing.assert_allclose(np.gradient(v, t, axis=0)[1:-1], a[1:-1], atol=4e-2)
+    for time, place in ((0.4, 0), (2.6, 1), (3.9, 2)):
+        k = np.searchsorted(t, time)
+        np.testing.assert_allclose(q[k], places[place], atol=1e-12)
+        assert np.abs(v[k]).max() == 0.0
+    cruise = (t > 0.71) & (t < 2.29)  # 0.5 + 0.2 to 2.5 - 0.2
+    np.testing.assert_allclose(v[cruise, 0], 1.0 / (2.0 * 0.9), rtol=1e-12)
+
+
+def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
+    design = design_sweeps(designer, rng, speeds=(0.1, 0.4))
+    assert design.used.max() <= 1.0
+    assert design.contact is None or design.contact.distance >= 0.01
+    t = np.arange(0.0, design.motion.duration, 0.01)
+    _, v, a = design.motion.evaluate(t)
+    for j, fastest in enumerate(designer.limits.sizes[1]):
+        steady = v[(np.abs(a).max(axis=1) < 1e-9) & (np.abs(v[:, j]) > 1e-6)]
+        assert set(np.round(steady[:, j] / fastest, 6)) == {-0.4, -0.1, 0.1, 0.4}
+        assert np.abs(np.delete(steady, j, axis=1)).max() == 0.0
+
+
+def test_stands_tell_more_of_gravity_than_random_ones(designer):
+    design = design_stands(designer, np.random.default_rng(0), count=6)
+    assert design.used.max() <= 1.0
+    assert design.contact is None or design.contact.distance >= 0.01
+    places = design.motion.places
+    assert len(places) >= 4
+
+    def told(q):
+        rows = designer.information.rows(q, 0.0 * q, 0.0 * q)
+        scale = designer.spread * np.sqrt(2.0 / designer.noise)[:, None]
+        A = (scale[..., None] * rows.W).swapaxes(0, 1).reshape(len(designer.spread), -1)
+        return np.linalg.slogdet(A @ A.T + np.eye(len(A)))[1]
+
+    rng = np.random.default_rng(1)
+    some = designer.postures(rng)
+    random = [told(rng.choice(some, len(places), replace=False)) for _ in range(50)]
+    assert told(places) > max(random)
