@@ -68,8 +68,7 @@ def body_points(model: RobotModel) -> dict[str, Array]:
     Returns:
         Points by name of the body, shape (k, 3) [m].
     """
-    robot = model.tree.robot
-    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
+    shapes = _shapes(model)
     found: dict[str, list[Array]] = {body: [] for body in model.layout.bodies}
     open_bodies = set()
     for place in link_places(model):
@@ -99,8 +98,7 @@ def link_clouds(model: RobotModel) -> tuple[list[tuple[str, int, Array]], list[s
         Name of the link, its body (-1: it is fixed to the world) and the points, shape (k, 3) [m],
         of each shape; and the links of which a shape cannot be read.
     """
-    robot, urdf = model.tree.robot, Path(model.tree.path)
-    shapes = _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
+    shapes, urdf = _shapes(model), Path(model.tree.path)
     clouds, unread = [], []
     for link in model.tree.links:
         frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
@@ -189,6 +187,12 @@ def hull_half_spaces(points: Array) -> tuple[Array, Array]:
     polar, turn = np.arccos(1 - 2 * k / _MOST_FACES), np.pi * (1 + 5**0.5) * k
     A = np.column_stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
     return A, (A @ points.T).max(axis=1)
+
+
+def _shapes(model: RobotModel) -> dict[str, list[Shape]]:
+    """Return the collision shapes of each link, or its visual ones if it has none."""
+    robot = model.tree.robot
+    return _by_link(read_shapes(robot, "visual")) | _by_link(read_shapes(robot, "collision"))
 
 
 def _by_link(shapes: Iterable[Shape]) -> dict[str, list[Shape]]:
