@@ -43,6 +43,8 @@ def thin(solids: Sequence[Sequence[Surface]], most: int) -> list[list[Surface]]:
     cell = _WELD * (float(np.ptp(whole.vertices, axis=0).max()) or 1.0)
     which, V = _cells(whole.vertices, of_vertex, cell)
     F, patch = _proper(which[whole.faces], patch)
+    if not len(F):  # all triangles are flat
+        return [[] for _ in solids]
     F = _oriented(V, F)
     of_vertex = np.rint(np.bincount(which, of_vertex) / np.bincount(which)).astype(int)
     Q = _quadrics(V, F, patch)
@@ -123,7 +125,7 @@ def _oriented(V: Array, F: Array) -> Array:
     rows, columns = np.r_[f, f + n], np.r_[g + n * odd, g + n * ~odd]
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * n, 2 * n))
     _, part = connected_components(graph, directed=False)
-    corners = V[F] - V[F].mean(axis=(0, 1))
+    corners = V[F] - V.mean(axis=0)
     volume = np.linalg.det(corners) / 6  # of the tetrahedron to the middle
     sums = np.bincount(part, np.r_[volume, -volume])
     reverse = (part[:n] != part[n:]) & (sums[part[:n]] < sums[part[n:]])

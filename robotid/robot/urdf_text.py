@@ -52,7 +52,7 @@ def parse_urdf(path: str | Path) -> ET.Element:
         raise ModelError(f"{path.name} is xacro, not URDF; expand it first: xacro {path.name}")
     try:
         if not path.is_file():  # folders, pipes and devices are not read
-            raise ModelError(f"there is no URDF file {_shown(str(path))}")
+            raise ModelError(f"there is no URDF file {str(path)!r}")
         size, content = path.stat().st_size, b""
         if size <= _MOST_BYTES:
             content = path.read_bytes()

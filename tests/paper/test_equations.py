@@ -169,7 +169,7 @@ def test_one_shot_finds_the_truth_from_any_guess(rng):
 def test_one_shot_names_what_the_motion_leaves_open(rng):
     G = rng.normal(size=(40, 4))
     G[:, 3] = 2 * G[:, 1]
-    with pytest.raises(RankDeficientError, match=r"excite 3 of 4 .* undetermined: \['b', 'd'\]"):
+    with pytest.raises(RankDeficientError, match=r"excite 3 of 4 .* undetermined: b, d\."):
         one_shot(G, G, np.ones(4), "abcd")
 
 

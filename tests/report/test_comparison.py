@@ -197,6 +197,8 @@ def test_the_page_shows_the_figures_of_the_two_results(folder, tmp_path):
             value, error = (float(x.replace("−", "-")) for x in (value, error))
             assert error == pytest.approx(entry["std_error"], rel=0.051)
             assert value == pytest.approx(entry["value"], abs=0.051 * entry["std_error"])
+    far = sum(abs(float(row[1].replace("−", "-"))) > 3.0 for row in table.rows)
+    assert f"{far} of {len(table.rows)} differ from A by more than 3 combined" in html
     assert html.count(f"<strong>{table.rows[0][1]}</strong>") == 1
     settings = dict((row[0], row[1:]) for row in shown["Settings that differ"].rows)
     assert settings["estimator.name"] == ["consistent", "wls"]

@@ -217,12 +217,16 @@ def test_identification_recovers_it_and_the_table_shows_it(model, term, rng):
     drives = drive_part(model)
     if not (term.is_inertia or term.name.startswith("sin")):  # those may come in a group
         np.testing.assert_allclose(found.standard[drives], pi[drives], atol=1e-6)
-    html = tables(found)["drives"].replace("<wbr>", "")
-    lines = [re.sub(r"<[^>]*>", " ", row) for row in html.split("</tr>")[1:]]
-    for name, value in zip(model.layout.drive_names, found.standard[drives], strict=True):
-        (line,) = [line for line in lines if f" {name} " in line]
-        assert float(line.split()[1]) == pytest.approx(value, rel=1e-2)
-        assert term.units[0] in line
+    html = tables(found)["parameters"].replace("<wbr>", "").replace("−", "-")
+    lines = [re.sub(r"<[^>]*>", " ", row).split() for row in html.split("</tr>")[1:]]
+    known = zip(
+        model.layout.drive_names, found.standard[drives], found.standard_error[drives], strict=True
+    )
+    for name, value, error in known:
+        owner, own = name.rsplit(".", 1)
+        (line,) = [line for line in lines if line[:2] == [owner, own]]
+        assert float(line[3]) == pytest.approx(value, rel=1e-2, abs=0.051 * error + 1e-3)
+        assert " ".join(line).endswith(term.units[0])
 
 
 @pytest.mark.parametrize("term", TERMS.values(), ids=lambda term: term.name)
