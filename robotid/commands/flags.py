@@ -238,7 +238,7 @@ def _add_simulation(parser: argparse.ArgumentParser) -> None:
 def _simulation_words(key: str) -> str:
     from robotid.simulation.settings import Simulation
 
-    return Simulation.paths()[key].words
+    return Simulation.paths()[key].words.replace("%", "%%")
 
 
 def _add_excite(parser: argparse.ArgumentParser) -> None:

@@ -36,14 +36,15 @@ from robotid.simulation.motions import Motion
 __all__ = ["Design", "Designer"]
 
 _PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
-_POLISHED = 3  # times as many that its last rounds look at ...
+_POLISHED = 2  # times as many that its last rounds look at ...
 _FINER = 10  # ... and at which its limits are checked in the end
 _ROUNDS = 14  # of the augmented Lagrangian ...
 _LAST_ROUNDS = 4  # ... and on the finer grid
 _STEPS = 20  # of L-BFGS in each
-_WEIGHT = 0.3  # of what is violated at all instants together, at first
+_WEIGHT = 3.0  # of what is violated at all instants together, at first
 _GROWTH = 3.0  # of that from one round to the next
 _SETTLED = 1e-3  # change of the criterion below which a design has converged
+_LOST = 0.02  # of the criterion that may be lost where a motion is made to keep its limits
 _OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
 _HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
 _SPARE = 0.003  # of limits that a design leaves for what lies between its instants
@@ -188,12 +189,13 @@ class Designer:
         def is_over() -> bool:
             return best.coefficients is not None and time.monotonic() - begun > seconds
 
-        def follow(designer: Designer, C: Array, rounds: int) -> bool:
+        def follow(designer: Designer, C: Array, rounds: int, held: _Multipliers) -> bool:
             """Follow a start; return whether it settled."""
             is_settled = False
-            for kept, objective, is_settled in designer._search(C, rounds, is_over):  # noqa: B007
+            search = designer._search(C, rounds, is_over, held)
+            for kept, objective, is_settled in search:  # noqa: B007
                 if objective < best.objective:
-                    best.coefficients, best.objective = kept, objective
+                    best.coefficients, best.objective, best.multipliers = kept, objective, held
                     history.append((time.monotonic() - begun, objective))
                 if progress is not None:
                     progress(done, best.objective)
@@ -202,11 +204,13 @@ class Designer:
         done = 0
         while done < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
-            follow(self, min(random, key=lambda C: self._looked_at(C)[0]), _ROUNDS)
+            begin = min(random, key=lambda C: self._looked_at(C)[0])
+            follow(self, begin, _ROUNDS, _Multipliers(_WEIGHT / self._functions.shape[1]))
             done += 1
         chosen, best = best, _Best()
         fine = replace(self, finer=_POLISHED * self.finer)
-        is_settled = follow(fine, fine._feasible(chosen.of(), 1.0 - _SPARE), _LAST_ROUNDS)
+        begin = fine._feasible(chosen.of(), 1.0 - _SPARE)
+        is_settled = follow(fine, begin, _LAST_ROUNDS, chosen.multipliers.finer(_POLISHED))
         found = replace(self, finer=_FINER * self.finer).checked(best.of())
         return replace(
             found,
@@ -435,26 +439,40 @@ class Designer:
             [moving[:1] / np.maximum(room, 1e-9), moving[1:] / self.limits.sizes[1:4] / most]
         )
         C = _scaled(C, 1.0 / np.maximum(1.0, over.max(axis=0)))
+        return self._towards(_scaled(C, 0.0), C, most)
+
+    def _towards(self, kept: Array, C: Array, most: float) -> Array:
+        """Return the farthest motion that keeps the limits on the way to another, shape (h, n).
+
+        Args:
+            kept: Where the way begins; it is returned if nothing else keeps the limits.
+            C: Where it ends.
+            most: Share of the limits that may be used.
+        """
         least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
         low, high = 0.0, 1.0
         for k in range(_HALVINGS):
             share = 1.0 if k == 0 else (low + high) / 2
-            _, used, distance, _ = self._looked_at(_scaled(C, share))
+            _, used, distance, _ = self._looked_at(kept + share * (C - kept))
             is_kept = np.abs(used).max() <= most and distance >= least
             low, high = (share, high) if is_kept else (low, share)
             if low == 1.0:
                 break
-        return _scaled(C, low)
+        return kept + low * (C - kept)
 
     def _search(
-        self, start: Array, rounds: int, is_over: Callable[[], bool]
+        self,
+        start: Array,
+        rounds: int,
+        is_over: Callable[[], bool],
+        multipliers: "_Multipliers",
     ) -> Iterator[tuple[Array, float, bool]]:
         """Yield motions that keep the limits, their criterion, and whether the search settled."""
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
-        multipliers = _Multipliers(_WEIGHT / self._functions.shape[1])
-        C, before = start, np.inf
+        least = -np.inf if self.clearance is None else self.clearance.least
+        C = kept = start
 
         def scaled(x: Array) -> tuple[float, Array]:
             if is_over():
@@ -462,7 +480,8 @@ class Designer:
             value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
             return value, (gradient * unit).reshape(-1)
 
-        yield start, self._looked_at(start)[0], False
+        before = self._looked_at(start)[0]
+        yield start, before, False
         for _ in range(rounds):
             try:
                 found = minimize(
@@ -475,14 +494,21 @@ class Designer:
             except _OutOfTime:
                 return
             C = found.x.reshape(C.shape) * unit
-            _, used, _, rows = self._looked_at(C)
+            own, used, distance, rows = self._looked_at(C)
             multipliers.raise_by(used)
             if self.clearance is not None:
                 near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
                 multipliers.raise_by_distances(near.distance, self.clearance.least)
-            kept = self._feasible(C, 1.0 - _SPARE)
+            is_near = np.abs(used).max() < _OVER and distance >= least
+            best, kept = kept, self._feasible(C, 1.0 - _SPARE)
             objective = self._looked_at(kept)[0]
-            is_settled = abs(before - objective) < _SETTLED and np.abs(used).max() < _OVER
+            if objective > before - _SETTLED:
+                kept = self._towards(best, C, 1.0 - _SPARE)
+                objective = self._looked_at(kept)[0]
+            is_near &= objective - own < _LOST
+            is_settled = abs(before - objective) < _SETTLED and is_near
+            if not is_near and objective > before - _LOST:
+                C = kept  # the way from there leads farther
             yield kept, objective, is_settled
             if is_settled:
                 return
@@ -508,6 +534,7 @@ class _Best:
 
     coefficients: Array | None = None
     objective: float = np.inf
+    multipliers: "_Multipliers"
 
     def of(self) -> Array:
         """Return its coefficients."""
@@ -523,6 +550,13 @@ class _Multipliers:
         self.weight = weight
         self._limits: Array | float = 0.0
         self._distances: Array | float = 0.0
+
+    def finer(self, times: int) -> "_Multipliers":
+        """Return the same on a grid of as many times the instants."""
+        fine = _Multipliers(self.weight / times)
+        fine._limits = _between(self._limits, times)
+        fine._distances = _between(self._distances, times)
+        return fine
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
         """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
@@ -551,3 +585,14 @@ def _scaled(C: Array, share: float | Array) -> Array:
     scaled = C * share
     scaled[0] = C[0]
     return scaled
+
+
+def _between(values: Array | float, times: int) -> Array | float:
+    """Return multipliers of instants, axis 1, spread over as many times the intervals."""
+    if isinstance(values, float):
+        return values
+    share = np.arange(times).reshape(-1, *[1] * (values.ndim - 2)) / times
+    steps = np.diff(values, axis=1)[:, :, None]
+    between = (values[:, :-1, None] + share * steps).reshape(len(values), -1, *values.shape[2:])
+    fine: Array = np.concatenate([between, values[:, -1:]], axis=1) / times
+    return fine

@@ -130,3 +130,30 @@ def test_spread_and_noise_are_those_of_a_preview(wrist, designer):
     K = designer.information.mapping.K
     expected = np.linalg.norm(K * prior_spread(wrist, usual**2, 1), axis=1)
     np.testing.assert_allclose(designer.spread, expected)
+
+
+def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(wrist, designer):
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    near = replace(designer, clearance=Clearance(wrist, least=0.01, boxes=[wall]))
+    kept = near.random(np.random.default_rng(5))
+    C = kept.copy()
+    C[0] += np.pi / 2 * np.array([1.0, 1.0, 0.0])  # the middle, about which it would be scaled
+    assert not near.can_rest(C[:1])[0]
+    mixed = near._towards(kept, C, 0.997)
+    _, used, distance, _ = near._looked_at(mixed)
+    share = np.linalg.norm(mixed - kept) / np.linalg.norm(C - kept)
+    assert 0.0 < share < 1.0
+    assert np.abs(used).max() <= 0.997
+    assert distance >= 0.01
+
+
+def test_multipliers_push_as_hard_on_a_finer_grid():
+    coarse = _Multipliers(0.2)
+    coarse._limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
+    coarse._distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))
+    fine = coarse.finer(3)
+    assert fine._limits.shape == (6, 181, 3)
+    np.testing.assert_allclose(fine._limits[:, ::3], coarse._limits / 3)
+    between = (2 * coarse._distances[:, :-1] + coarse._distances[:, 1:]) / 9
+    np.testing.assert_allclose(fine._distances[:, 1::3], between)
+    assert fine.weight == pytest.approx(0.2 / 3)

@@ -1,0 +1,320 @@
+"""Designing a motion: how good after how long, beside random motions and a plain optimiser.
+
+    python benchmarks/bench_excitation.py [--robots] [--next] [--quick]
+
+Panda (arm) and UR10, 10 s, 5 harmonics, position, velocity and torque limits of the URDF times
+0.9, self-collision and the floor at 2 cm. The criterion is D: minus the mean logarithm of the
+eigenvalues of the base problem's information, the smaller the better; 0.1 less are intervals 5 %
+narrower. Every motion that is counted keeps all limits on the grid of its design; those of
+"design" are scaled until they keep them on a grid ten times finer. SLSQP has the same start,
+objective and grid, gradients by differences, and the limits at every fifth instant; each of its
+iterates is then scaled until it keeps the limits, as a random motion is, and the best counts.
+
+``--robots``: twelve robots through excite, simulate with noise, and identify. ``--next``: what a
+second motion adds that is designed for what the first has left open: the second ones by criterion
+A, the mean variance over what is plausible.
+"""
+
+import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
+
+import argparse
+import contextlib
+import io
+import json
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import scipy.optimize
+
+from robotid.cli import main as robotid
+from robotid.excitation.basis import FourierBasis
+from robotid.excitation.clearance import Clearance
+from robotid.excitation.design import Designer, _Multipliers
+from robotid.excitation.information import criterion
+from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.logs.data import Trajectory
+from robotid.robot.examples import example_urdf
+
+CASES = ("panda", "UR10")
+DURATION, HARMONICS = 10.0, 5
+EVERY = 5  # instants at which SLSQP is held to the limits
+ARM = [f"arm_{i}_joint" for i in range(1, 8)]
+ROBOTS = {  # the joints that move, if not all
+    "finger_edu": (),
+    "so101": (),
+    "kinova": (),
+    "ur3_robot": (),
+    "ur5_gripper": (),
+    "xarm7": (),
+    "z1": (),
+    "panda": (),
+    "talos_left_arm": (),
+    "tiago_no_hand": ("torso_lift_joint", *ARM),
+    "talos_reduced": ("torso_1_joint", "torso_2_joint", *(f"arm_left_{i}_joint" for i in (1, 2))),
+    "anymal": ("LF_HAA", "LF_HFE", "LF_KFE"),
+    "double_pendulum_continuous": (),  # states no speeds
+}
+
+
+def designer(name):
+    model = setting.robot(name)
+    limits = MotionLimits.of_model(model)
+    clearance = Clearance(model, floor=0.0)
+    basis = FourierBasis(DURATION, HARMONICS)
+    return Designer.of_model(model, basis, limits, clearance=clearance)
+
+
+def run(*words):
+    """Run a command; return its code and what it said."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = robotid([str(word) for word in words])
+    return code, said.getvalue()
+
+
+def must(*words):
+    code, said = run(*words)
+    if code:
+        raise SystemExit(f"robotid {' '.join(map(str, words))}: {said}")
+    return said
+
+
+def record(folder, robot, name, motion, seed):
+    """Simulate a motion with noise of 2 % in the torque; return the log, the truth beside it."""
+    log = folder / f"{name}.parquet"
+    plant = ("--seed", seed, "--rate", 200, "--torque-noise", 0.02, "--controller", "perfect")
+    must("simulate", *robot, motion, "--out", log, *plant)
+    return log
+
+
+def identified(folder, robot, log):
+    """Identify a log; return its result's folder and the errors in standard errors."""
+    out = folder / f"{log.stem}-result"
+    must("identify", robot[0], log, *robot[1:], "--out", out, "--friction", "viscous+coulomb")
+    truth = json.loads(log.with_suffix(".truth.json").read_text())["base_parameters"]
+    found = json.loads((out / "result.json").read_text())["base_parameters"]
+    true = {entry["name"]: entry["value"] for entry in truth}
+    pairs = [(e["value"] - true[e["name"]], e["std_error"]) for e in found if e["std_error"]]
+    error, std = np.array(pairs).T
+    return out, np.abs(error / std)
+
+
+def robot_row(folder, name, joints, seconds):
+    robot = (example_urdf(f"{name}.urdf"), *(("--joints", ",".join(joints)) if joints else ()))
+    motion, begun = folder / f"{name}-motion.parquet", time.monotonic()
+    code, said = run(
+        "excite", *robot, "--out", motion, "--json", "--starts", 1, "--seconds", seconds
+    )
+    if code and "states no limit" in said:
+        return f"| {name} | told which limits its URDF lacks |" + " -- |" * 5
+    if code:
+        raise SystemExit(f"{name}: {said}")
+    design = json.loads(said)
+    taken = time.monotonic() - begun
+    errors = identified(folder, robot, record(folder, robot, name, motion, 1))[1]
+    condition = design["condition_number"]
+    return (
+        f"| {name} | {len(design['joints'])} | {len(errors)} | "
+        f"{'--' if condition is None else f'{condition:.3g}'} | {np.median(errors):.2f} | "
+        f"{100 * np.mean(errors < 1.96):.0f} % | {taken:.0f} + {time.monotonic() - begun - taken:.0f} |"
+    )
+
+
+def all_robots(seconds, names):
+    print("| robot | joints | base parameters | condition | median error, standard errors | "
+          "within 1.96 | excite + rest, s |")  # fmt: skip
+    print("|---" * 7 + "|")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            print(robot_row(Path(folder), name, ROBOTS[name], seconds), flush=True)
+
+
+def second_motion(file, seconds):
+    """Print what each second motion would leave of the standard errors."""
+    robot = (example_urdf(file),)
+    design = ("--json", "--starts", 1, "--seconds", seconds)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        motions = {"the first again": folder / "first.parquet"}
+        must("excite", *robot, "--out", motions["the first again"], "--seed", 0, *design)
+        log = record(folder, robot, "log", motions["the first again"], 1)
+        result, _ = identified(folder, robot, log)
+        motions["a fresh one, another seed"] = folder / "fresh.parquet"
+        design += ("--criterion", "A")
+        must("excite", *robot, "--out", motions["a fresh one, another seed"], "--seed", 1, *design)
+        motions["designed with --given"] = folder / "given.parquet"
+        must("excite", *robot, "--out", motions["designed with --given"], "--seed", 1,
+             "--given", result, *design)  # fmt: skip
+        print("| second motion | standard errors over what is plausible: median | 90 % | largest | "
+              "the widest quarter is cut by |")  # fmt: skip
+        print("|---" * 5 + "|")
+        for words, motion in motions.items():
+            said = json.loads(must("preview", *robot, motion, "--given", result, "--json"))
+            rows = [
+                [entry[key] or np.inf for key in ("std_error", "std_error_before", "plausible")]
+                for entry in said["base_parameters"]
+                if entry["plausible"]
+            ]
+            after, before, plausible = np.array(rows).T
+            if motion == motions["the first again"]:
+                print(cut_row("none", before, before, plausible))
+            print(cut_row(words, after, before, plausible), flush=True)
+
+
+def cut_row(words, after, before, plausible):
+    share, wide = after / plausible, before / plausible
+    widest = np.argsort(wide)[-max(1, round(len(wide) / 4)) :]
+    cut = 100 * (1 - np.exp(np.mean(np.log(share[widest] / wide[widest]))))
+    cells = " | ".join(f"{x:.3f}" for x in np.quantile(share, [0.5, 0.9, 1.0]))
+    return f"| {words} | {cells} | {cut:.0f} % |"
+
+
+class TimeIsOver(Exception):
+    pass
+
+
+def slsqp(task, start, seconds):
+    """Return the history of SLSQP by differences: time and criterion of each better motion."""
+    unit, least = task.limits.sizes[0], task.clearance.least
+    begun, history, known = time.monotonic(), [], {}
+
+    def looked_at(x):
+        key = x.tobytes()
+        if key not in known:
+            if time.monotonic() - begun > seconds:
+                raise TimeIsOver
+            if len(known) > 2 * start.size:  # the differences of value and limits are the same
+                known.clear()
+            objective, used, _, rows = free._looked_at(x.reshape(start.shape) * unit)
+            near = task.clearance.near(rows.state, least + 0.03).distance[:, ::EVERY]
+            finite = used[np.isfinite(task.limits.sizes).any(axis=1), ::EVERY]
+            distance = np.minimum(near.min(axis=0), least + 0.03)
+            known[key] = objective, np.r_[1.0 - finite.ravel() ** 2, (distance - least) / 0.05]
+        return known[key]
+
+    def keep(x):
+        C = task._feasible(x.reshape(start.shape) * unit, 1.0)
+        objective = task._looked_at(C)[0]
+        if not history or objective < history[-1][1]:
+            history.append((time.monotonic() - begun, objective))
+
+    free = replace(task, clearance=None)
+    x = (start / unit).ravel()
+    keep(x)
+    with contextlib.suppress(TimeIsOver):
+        scipy.optimize.minimize(
+            lambda x: looked_at(x)[0],
+            x,
+            method="SLSQP",
+            callback=keep,
+            constraints={"type": "ineq", "fun": lambda x: looked_at(x)[1]},
+            options={"maxiter": 10_000},
+        )
+    return history
+
+
+def at(history, seconds):
+    """Return the best criterion of a history after some time."""
+    return min((value for when, value in history if when <= seconds), default=np.nan)
+
+
+def against_time(name, task, budgets, count):
+    """Print the criterion against time; return the design that took as long as it wanted."""
+    rng = np.random.default_rng(1)
+    begun = time.monotonic()
+    random = [(task.random(rng), time.monotonic() - begun) for _ in range(count)]
+    values = [(when, task._looked_at(C)[0]) for C, when in random]
+    best = at(values, np.inf)
+    starts = np.random.default_rng(0)  # those that a design begins with
+    start = min((task.random(starts) for _ in range(10)), key=lambda C: task._looked_at(C)[0])
+    plain = slsqp(task, start, budgets[-1])
+    for seconds in budgets:
+        found = task.design(np.random.default_rng(0), starts=1000, seconds=seconds)
+        cells = f"{found.objective:.3f} ({found.seconds:.1f} s) | {at(plain, seconds):.3f}"
+        print(f"| {name} | {seconds:g} s | {cells} | {at(values, seconds):.3f} |", flush=True)
+    usual = task.design(np.random.default_rng(0), starts=1)
+    passed = next((when for when, value in usual.history if value < best), np.nan)
+    cells = f"{usual.objective:.3f} | -- | {best:.3f}"
+    print(f"| {name} | one start: {usual.seconds:.1f} s; {count} random: {random[-1][1]:.0f} s | "
+          f"{cells} |", flush=True)  # fmt: skip
+    return usual, passed
+
+
+def margin_row(name, task, found, passed):
+    used = dict(zip(LIMITS, found.used.max(axis=1), strict=True))
+    shown = [f"{100 * (1 - used[kind]):.2f} %" for kind in ("position", "velocity", "torque")]
+    contact = found.contact
+    way = f"{1e3 * (contact.distance - task.clearance.least):.1f} mm" if contact else "> 50 mm"
+    settled = f"{found.seconds:.1f} s" if found.is_converged else f"no ({found.seconds:.1f} s)"
+    return (
+        f"| {name} | {len(task.spread)} | {found.condition:.0f} | {passed:.1f} s | {settled} | "
+        f"{' | '.join(shown)} | {way} |"
+    )
+
+
+def gradient_row(name, task, repeats):
+    """Return the times of value, value with gradient, and Pinocchio's regressors."""
+    count = 500
+    whole = replace(task, clearance=None, finer=count // (task._functions.shape[1] - 1))
+    C, multipliers = task.random(np.random.default_rng(3)), _Multipliers(0.1)
+    model, t = task.information.model, np.linspace(0.0, DURATION, whole._functions.shape[1])
+    q, v, a, jerk = whole._functions @ C
+    segment = np.zeros(len(t), dtype=int)
+    trajectory = Trajectory(
+        t=t, q=q, v=v, a=a, tau=0 * q, joints=model.joints, rate=50.0, segment=segment
+    )
+    W = np.empty((len(t), v.shape[1], model.layout.n_inertial))
+
+    def value():
+        rows = whole.information.rows(*(whole._functions @ C)[:3])
+        multipliers.of_limits(whole.limits.used(q, v, a, jerk, whole.information.torque(rows)))
+        criterion(whole.name, whole.matrix(rows))
+
+    functions = [
+        value,
+        lambda: whole._lagrangian(C, multipliers),
+        lambda: setting.bare_loop(model, trajectory, W),
+    ]
+    times = 1e3 * np.array(setting.side_by_side(functions, repeats))
+    return (
+        f"| {name} | {v.shape[1]} x {count} | {times[0]:.1f} | {times[1]:.1f} | "
+        f"{times[1] / times[0]:.1f} | {times[2]:.1f} |"
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", action="store_true", help="twelve robots to the end, alone")
+    parser.add_argument("--next", action="store_true", help="a second motion, alone")
+    parser.add_argument("--quick", action="store_true", help="little time and one robot: a try-out")
+    options = parser.parse_args()
+    if options.robots or options.next:
+        if options.robots:
+            all_robots(1 if options.quick else 10, list(ROBOTS)[-2:] if options.quick else ROBOTS)
+        if options.next:
+            second_motion("ur10_robot.urdf", 1 if options.quick else 10)
+        print(f"\n{setting.machine()}")
+        return
+    cases = CASES[1:] if options.quick else CASES
+    budgets, count = ((1,), 10) if options.quick else ((1, 10, 60), 500)
+    tasks = {name: designer(name) for name in cases}
+    print("| robot | after | design (taken) | SLSQP | best random |")
+    print("|---" * 5 + "|")
+    found = {name: against_time(name, task, budgets, count) for name, task in tasks.items()}
+    print("\n| robot | base parameters | condition | better than random after | settled | "
+          "margin: position | velocity | torque | clearance |")  # fmt: skip
+    print("|---" * 9 + "|")
+    for name, task in tasks.items():
+        print(margin_row(name, task, *found[name]))
+    print("\n| robot | joints x instants | value, ms | with gradient | ratio | Pinocchio |")
+    print("|---" * 6 + "|")
+    for name, task in tasks.items():
+        print(gradient_row(name, task, 3 if options.quick else 20))
+    print(f"\n{setting.machine()}")
+
+
+if __name__ == "__main__":
+    main()
