@@ -11,8 +11,8 @@ objective and grid, gradients by differences, and the limits at every fifth inst
 iterates is then scaled until it keeps the limits, as a random motion is, and the best counts.
 
 ``--robots``: twelve robots through excite, simulate with noise, and identify. ``--next``: what a
-second motion adds that is designed for what the first has left open: the second ones by criterion
-A, the mean variance over what is plausible.
+second motion adds that is designed for what the first has left open, beside a repetition of the
+first and beside one designed with another seed as if nothing were known.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -115,11 +115,11 @@ def robot_row(folder, name, joints, seconds):
     design = json.loads(said)
     taken = time.monotonic() - begun
     errors = identified(folder, robot, record(folder, robot, name, motion, 1))[1]
-    condition = design["condition_number"]
+    condition, rest = design["condition_number"], time.monotonic() - begun - taken
     return (
         f"| {name} | {len(design['joints'])} | {len(errors)} | "
         f"{'--' if condition is None else f'{condition:.3g}'} | {np.median(errors):.2f} | "
-        f"{100 * np.mean(errors < 1.96):.0f} % | {taken:.0f} + {time.monotonic() - begun - taken:.0f} |"
+        f"{100 * np.mean(errors < 1.96):.0f} % | {taken:.0f} + {rest:.0f} |"
     )
 
 
@@ -135,19 +135,19 @@ def all_robots(seconds, names):
 def second_motion(file, seconds):
     """Print what each second motion would leave of the standard errors."""
     robot = (example_urdf(file),)
-    design = ("--json", "--starts", 1, "--seconds", seconds)
+    design = ("--json", "--starts", 4, "--seconds", seconds)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         motions = {"the first again": folder / "first.parquet"}
         must("excite", *robot, "--out", motions["the first again"], "--seed", 0, *design)
         log = record(folder, robot, "log", motions["the first again"], 1)
         result, _ = identified(folder, robot, log)
-        motions["a fresh one, another seed"] = folder / "fresh.parquet"
-        design += ("--criterion", "A")
-        must("excite", *robot, "--out", motions["a fresh one, another seed"], "--seed", 1, *design)
-        motions["designed with --given"] = folder / "given.parquet"
-        must("excite", *robot, "--out", motions["designed with --given"], "--seed", 1,
-             "--given", result, *design)  # fmt: skip
+        for criterion in ("D", "A"):
+            for words, given in (("a fresh one", ()), ("--given the first", ("--given", result))):
+                key = f"{words}, criterion {criterion}"
+                motions[key] = folder / f"{len(motions)}.parquet"
+                must("excite", *robot, "--out", motions[key], "--seed", 1, *design,
+                     "--criterion", criterion, *given)  # fmt: skip
         print("| second motion | standard errors over what is plausible: median | 90 % | largest | "
               "the widest quarter is cut by |")  # fmt: skip
         print("|---" * 5 + "|")
@@ -287,17 +287,10 @@ def gradient_row(name, task, repeats):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", action="store_true", help="twelve robots to the end, alone")
-    parser.add_argument("--next", action="store_true", help="a second motion, alone")
+    parser.add_argument("--robots", action="store_true", help="twelve robots to the end, too")
+    parser.add_argument("--next", action="store_true", help="a second motion, too")
     parser.add_argument("--quick", action="store_true", help="little time and one robot: a try-out")
     options = parser.parse_args()
-    if options.robots or options.next:
-        if options.robots:
-            all_robots(1 if options.quick else 10, list(ROBOTS)[-2:] if options.quick else ROBOTS)
-        if options.next:
-            second_motion("ur10_robot.urdf", 1 if options.quick else 10)
-        print(f"\n{setting.machine()}")
-        return
     cases = CASES[1:] if options.quick else CASES
     budgets, count = ((1,), 10) if options.quick else ((1, 10, 60), 500)
     tasks = {name: designer(name) for name in cases}
@@ -313,6 +306,12 @@ def main():
     print("|---" * 6 + "|")
     for name, task in tasks.items():
         print(gradient_row(name, task, 3 if options.quick else 20))
+    if options.robots:
+        print()
+        all_robots(1 if options.quick else 10, list(ROBOTS)[-2:] if options.quick else ROBOTS)
+    if options.next:
+        print()
+        second_motion("ur10_robot.urdf", 1 if options.quick else 30)
     print(f"\n{setting.machine()}")
 
 

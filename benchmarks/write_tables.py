@@ -35,6 +35,7 @@ PAGES = {
     "replay": "replay.md",
     "verdict": "verdicts.md",
     "preview": "recording.md",
+    "excitation": "excitation.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

@@ -25,6 +25,7 @@ __all__ = ["Box", "Clearance", "Contact", "Nearness"]
 _TRIED = 400  # random poses that say which links may meet at all
 _APART = 0.05  # [m] links that stay so far apart at all of them are looked at in the end alone
 _MADE_TO = 0.95  # share of the poses: links that are too near in so many are made to
+_ROOM = 5e-3  # [m] beyond the clearance that links must have to move at all
 _THINNEST = 1e-3  # [m] a flat shape is as thick
 _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
@@ -111,7 +112,8 @@ class Clearance:
         pairs: Numbers of the two hulls of each pair.
         likely: Which pairs may meet within the limits, shape (pairs,), bool.
         unread: Links of which a shape cannot be read: nothing keeps them from hitting anything.
-        made_to: Links that are nearer in almost every pose, by two, and are left to it.
+        made_to: Links that are nearer, or within 5 mm of it, in almost every pose, by two, and are
+            left to it.
 
     Raises:
         DataError: If no link has a shape that can be read.
@@ -168,7 +170,7 @@ class Clearance:
         near = self.near(self.poses(q), self.least + _APART, self.everything)
         distance = near.distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
-        always: Array = (distance < self.least).mean(axis=1) > _MADE_TO
+        always: Array = (distance < self.least + _ROOM).mean(axis=1) > _MADE_TO
         always &= is_link[self.pairs].all(axis=1)
         names = self.named
         self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]

@@ -72,7 +72,12 @@ def robotid(*words, **where):
 
 @pytest.mark.parametrize(
     ("words", "code"),
-    [(["--help"], 0), (["inspect", UR5, "--json"], 0), (["doctor", URDF, "{zeros}"], 1)],
+    [
+        (["--help"], 0),
+        (["simulate", "--help"], 0),
+        (["inspect", UR5, "--json"], 0),
+        (["doctor", URDF, "{zeros}"], 1),
+    ],
     ids=["help", "json", "doctor"],
 )
 def test_a_reader_that_leaves_is_no_error_and_hides_none(log, tmp_path, words, code):

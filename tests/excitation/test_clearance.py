@@ -3,6 +3,7 @@ import pytest
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.clearance import Box, Clearance
+from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.motions import ProgramMotion, random_fourier
 
@@ -91,3 +92,16 @@ def test_bad_surroundings_are_refused(slider, tmp_path):
     (tmp_path / "bare.urdf").write_text(bare)
     with pytest.raises(DataError, match="has no shape that can be read"):
         Clearance(RobotModel.from_urdf(tmp_path / "bare.urdf"))
+
+
+def test_links_that_are_made_at_the_clearance_are_left_to_it():
+    # a pair of links of the SO-101 is 20 to 22 mm apart in almost every posture
+    model = RobotModel.from_urdf(example_urdf("so101.urdf"))
+    clearance = Clearance(model, least=0.02)
+    assert clearance.made_to
+    q = np.random.default_rng(0).uniform(
+        [j.lower for j in model.limits], [j.upper for j in model.limits], (100, 6)
+    )
+    distance = clearance.near(clearance.poses(q), 0.05, clearance.everything).distance
+    assert ((distance < 0.025).mean(axis=1) < 0.99).all()  # the others can do better
+    assert (distance.min(axis=0) > 0.024).any()  # and there are postures to be in
