@@ -78,7 +78,7 @@ def robotid(*words, **where):
         (["inspect", UR5, "--json"], 0),
         (["doctor", URDF, "{zeros}"], 1),
     ],
-    ids=["help", "json", "doctor"],
+    ids=["help", "simulate", "json", "doctor"],
 )
 def test_a_reader_that_leaves_is_no_error_and_hides_none(log, tmp_path, words, code):
     zeros = tmp_path / "zeros.csv"
