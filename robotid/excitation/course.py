@@ -125,10 +125,10 @@ class Course:
 
     @cached_property
     def nearest(self) -> Contact | None:
-        """Where the motion comes nearest to a collision; None if nothing can collide."""
+        """Where things that the motion moves come nearest to each other; None if there are none."""
         if self.clearance is None:
             return None
-        distance, pairs = self.nearness(self.clearance.everything)
+        distance, pairs = self.nearness(self.changes(self.clearance))
         k = int(np.argmin(distance))
         if np.isinf(distance[k]):
             return None
