@@ -245,7 +245,7 @@ def judge(
             sorted(worse, key=_rank),
             [*doubt, *_in_words([d for d in doubts if d.joint in ("", joint)])],
             errors,
-            is_still=joint not in moved,
+            why=_why_unseen(joint not in moved, bool(validation)),
         )
         for joint, (worse, doubt, errors) in found.items()
     }
@@ -436,13 +436,19 @@ def _unseen(
     return reasons
 
 
+def _why_unseen(is_still: bool, has_kept: bool) -> str:
+    """Return why a joint was evaluated on no kept recording."""
+    if is_still:
+        return "it does not move in any recording"
+    return "it does not move in any kept recording" if has_kept else "no recording was kept apart"
+
+
 def _joint_verdict(
-    poor: list[str], doubts: list[str], errors: list[float], *, is_still: bool
+    poor: list[str], doubts: list[str], errors: list[float], *, why: str
 ) -> JointVerdict:
-    """Return the verdict on a joint from what was found on each kept recording."""
+    """Return the verdict on a joint from what was found on each kept recording; why, if on none."""
     if not errors:  # never a pass
-        where = "recording" if is_still else "kept recording"
-        return JointVerdict("not evaluated", (f"it does not move in any {where}", *doubts))
+        return JointVerdict("not evaluated", (why, *doubts))
     if poor or doubts:
         return JointVerdict("poor" if poor else "usable", (*poor, *doubts))
     said = f"predicted within {max(errors):.1f} %, better than by a constant and than by the URDF"

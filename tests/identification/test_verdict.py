@@ -104,7 +104,8 @@ def test_the_worst_of_several_recordings_decides_on_a_joint():
 
 
 def test_without_a_kept_recording_no_joint_is_evaluated():
-    assert verdict(None).joints["a"].status == "not evaluated"
+    alone = verdict(None).joints["a"]
+    assert (alone.status, alone.reasons) == ("not evaluated", ("no recording was kept apart",))
 
 
 def test_a_joint_that_moves_nowhere_is_not_evaluated():
