@@ -1,7 +1,8 @@
 """A motion to record: designed for a robot within its limits, and written."""
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
-_KINDS = ("fourier", "bspline", "sweeps", "stands")
+_ROUTES = ("sweeps", "stands")
+_KINDS = ("fourier", "bspline", *_ROUTES)
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ def design_motion(
         if progress is not None:
             progress("designing", start, settings.starts, "starts")
 
-    rng = np.random.default_rng(settings.seed)
+    rng, begun = np.random.default_rng(settings.seed), time.monotonic()
     if settings.kind == "sweeps":
         design = design_sweeps(designer, rng)
     elif settings.kind == "stands":
@@ -179,14 +181,33 @@ def design_motion(
         design = designer.design(
             rng, starts=settings.starts, seconds=settings.seconds, progress=told
         )
-    write_motion(design.motion, model.joints, design.duration, settings.points, target)
+    design = replace(design, seconds=time.monotonic() - begun)
     course = Course.of_design(designer, design)
+    if settings.kind in _ROUTES:
+        _check_jerk(course, model.joints)
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
     content = _content(model, design, course, settings)
     if report is not None:
         expected = _expected(job, model, design, settings, run, str(target))
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
     return content
+
+
+def _check_jerk(course: Course, joints: Sequence[str]) -> None:
+    """Refuse a motion from place to place that is too jerky: it is not designed for jerk.
+
+    Raises:
+        SettingsError: If it is.
+    """
+    used = course.largest[LIMITS.index("jerk")]
+    joint = int(np.argmax(used))
+    if used[joint] > 1.0:
+        raise SettingsError(
+            f"{joints[joint]} needs {100 * used[joint]:.0f} % of its jerk limit at "
+            f"{course.peak('jerk', joint):.2f} s: sweeps and stands do not follow jerk; raise "
+            "--max-jerk or lower --share"
+        )
 
 
 def _expected(
@@ -211,7 +232,10 @@ def _content(
     """Return what was designed, for people and programs."""
     margins: dict[str, Any] = {}
     limits, clearance = course.limits, course.clearance
-    most = design.used if design.starts else course.largest  # of routes jerk is not checked
+    jerk = LIMITS.index("jerk")
+    most = design.used.copy()
+    if settings.kind in _ROUTES:
+        most[jerk] = course.largest[jerk]
     for name, used, sizes in zip(LIMITS, most, limits.sizes, strict=True):
         if np.isfinite(sizes).any():
             joint = int(np.argmax(used))

@@ -29,7 +29,6 @@ from robotid.viewer.unexplained import find_unexplained
 
 __all__ = ["Findings", "read_findings", "replay_files", "replay_identified", "stated_job"]
 
-_MARKED = 2000  # rows of a motion without torques at which limits are looked at
 
 #: Columns that say where a floating base was: position [m] and turn in the world.
 _BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
@@ -289,17 +288,15 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
 
     Beside them what cannot be marked, and why: the URDF may state no limits, or have no shapes.
     """
-    rows = slice(None, None, -(-len(motion.t) // _MARKED))
     v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
     a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
-    t, q, v, a = motion.t[rows], motion.q[rows], v[rows], a[rows]
-    torque = predict_instants(model, model.standard_parameters(), q, v, a)
+    torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
     marks, notes = [], ["It has no torques; the most that it uses of the URDF's limits is marked."]
     try:
         limits = MotionLimits.of_model(model, share=1.0)
     except SettingsError as error:
         return [], [f"It has no torques. Limits are not marked: {error}."]
-    course = Course.of_motion(t, (q, v, a, torque), limits)
+    course = Course.of_motion(motion.t, (motion.q, v, a, torque), limits)
     for kind, used in zip(LIMITS, course.largest, strict=True):
         joint = int(np.argmax(used))
         if used[joint] > 0:

@@ -1,6 +1,6 @@
 """How a motion uses a robot's limits over time, and how near it comes to a collision."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,8 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 __all__ = ["Course"]
 
 _RATE = 100.0  # [Hz] of the instants of a designed motion that are looked at ...
-_FEWEST, _MOST = 400, 2000  # ... of which there are so many
+_FEWEST = 400  # ... of which there are so many at least
+_MOST = 2000  # at which distances are looked at
 _LOOKED_AT = 20  # instants that say which distances change ...
 _STILL = 1e-3  # [m] ... by more than this
 _WITHIN = 0.1  # [m] distances that are looked at first; then twice as far, and so on
@@ -43,7 +44,7 @@ class Course:
             designer: What it was designed for.
             design: The motion.
         """
-        count = int(np.clip(_RATE * design.duration, _FEWEST, _MOST))
+        count = max(round(_RATE * design.duration), _FEWEST)
         t = np.linspace(0.0, design.duration, count + 1)
         q, v, a = design.motion.evaluate(t)
         torque = designer.information.torque(designer.information.rows(q, v, a))
@@ -89,6 +90,12 @@ class Course:
         """
         return float(self.t[np.argmax(np.abs(self.used[LIMITS.index(kind), :, joint]))])
 
+    @cached_property
+    def thinned(self) -> "Course":
+        """The same at no more than 2,000 instants, to look at distances."""
+        rows = slice(None, None, -(-len(self.t) // _MOST))
+        return replace(self, t=self.t[rows], values=self.values[:, rows])
+
     def nearness(self, chosen: Array) -> tuple[Array, Array]:
         """Return the least distance at each instant, and the pair that it is of, shape (N,) each.
 
@@ -128,9 +135,10 @@ class Course:
         """Where things that the motion moves come nearest to each other; None if there are none."""
         if self.clearance is None:
             return None
-        distance, pairs = self.nearness(self.changes(self.clearance))
+        few = self.thinned
+        distance, pairs = few.nearness(few.changes(self.clearance))
         k = int(np.argmin(distance))
         if np.isinf(distance[k]):
             return None
         names = self.clearance.named[int(pairs[k])]
-        return Contact(*names, float(distance[k]), float(self.t[k]))
+        return Contact(*names, float(distance[k]), float(few.t[k]))

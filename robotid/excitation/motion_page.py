@@ -201,6 +201,7 @@ def _lines(model: RobotModel, values: Array, joints: Array) -> list[Series]:
 
 def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> str:
     """Return the chart of distances between links, and to what stands around them."""
+    course = course.thinned
     own = np.array([b in model.tree.links and a in model.tree.links for a, b in clearance.named])
     series = [Series("clearance", np.full(len(course.t), 1e3 * clearance.least), "text")]
     changes = course.changes(clearance)

@@ -107,3 +107,20 @@ def test_a_page_that_cannot_be_written_is_refused_before_the_design(tmp_path, ca
     assert main([*WORDS, *words]) == 1
     assert f"{tmp_path / 'none'}" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_sweeps_say_what_they_use_of_jerk_and_refuse_what_is_too_little(tmp_path, capsys):
+    words = [*WORDS, "--kind", "sweeps", "--clearance", "none", "--json"]
+    words += ["--out", str(tmp_path / "m.csv"), "--points", "100", "--max-jerk"]
+    assert main([*words, "wrist_2_joint=1000"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    columns = open_table(tmp_path / "m.csv", LogSource()).read(["time", "ddq_wrist_2_joint"])
+    jerk = np.gradient(columns["ddq_wrist_2_joint"], columns["time"])
+    used = 1.0 - content["limits"]["jerk"]["margin"]
+    assert used == pytest.approx(np.abs(jerk).max() / 1000, rel=0.05)
+    assert content["seconds"] > 0.0
+    (tmp_path / "m.csv").unlink()
+    assert main([*words, "wrist_2_joint=20"]) == 2
+    assert "wrist_2_joint needs " in (said := capsys.readouterr().err)
+    assert f"{100 * used * 50:.0f} % of its jerk limit at " in said
+    assert not list(tmp_path.iterdir())
