@@ -16,7 +16,7 @@ _RATE = 100.0  # [Hz] of the instants of a designed motion that are looked at ..
 _FEWEST = 400  # ... of which there are so many at least
 _MOST = 2000  # at which distances are looked at
 _LOOKED_AT = 20  # instants that say which distances change ...
-_STILL = 1e-3  # [m] ... by more than this
+_STILL = 1e-4  # [m] ... by more than this
 _WITHIN = 0.1  # [m] distances that are looked at first; then twice as far, and so on
 
 

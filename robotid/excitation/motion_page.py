@@ -27,6 +27,8 @@ _TONES = 8  # of lines that can be told apart in one chart
 _NAMED = 5  # base parameters that stay open the most
 _SHARP = 0.1  # share of the plausible spread below which one is well known ...
 _OPEN = 0.5  # ... and above which it is open
+_VISIBLE = 1e-3  # change of a criterion that is worth a chart
+_WIDE = 10.0  # ratio of distances from which their axis is logarithmic
 _SOURCES = {
     "data": "by the motion",
     "mixed": "by motion and URDF together",
@@ -70,7 +72,8 @@ def write_motion_page(
         "time": Section("Over time", _over_time(model, content, course)),
         "expected": Section("What it will tell", _expected(preview)),
     }
-    if len(content["history"]) > 1:
+    best = [entry[1] for entry in content["history"]]
+    if best and max(best) - min(best) > _VISIBLE:
         sections["design"] = Section("How it was found", _history(content))
     return write_text(page(f"{model.name}: motion", _head(model, content), sections), target)
 
@@ -88,7 +91,7 @@ def _head(model: RobotModel, content: Mapping[str, Any]) -> str:
         "joints": f"{len(model.joints)}",
         "criterion": content["criterion"],
         "condition number": (
-            "infinite" if condition is None else f"{condition:.0f}, in units of the URDF's spread"
+            "infinite" if condition is None else f"{condition:,.0f}, in units of the URDF's spread"
         ),
         "designed in": how,
     }
@@ -208,9 +211,11 @@ def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> 
     for label, chosen, tone in (("links", own, "tone-1"), ("floor and boxes", ~own, "tone-2")):
         if (chosen & changes).any():
             series.append(Series(label, 1e3 * course.nearness(chosen & changes)[0], tone))
+    low, high = (float(f([f(x.y) for x in series])) for f in (np.min, np.max))
+    is_wide = low > 0 and high > _WIDE * low
     chart = Chart(
         "distance of the two hulls that are nearest", course.t, tuple(series), "time [s]",
-        "distance [mm]", link="time", logarithmic="y",
+        "distance [mm]", link="time", logarithmic="y" if is_wide else "",
     )  # fmt: skip
     return chart_html(
         chart, "Least distance between two links, and to floor and boxes, where it changes"

@@ -64,6 +64,9 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     k = int(np.argmin(distance))
     assert found.nearest.distance == pytest.approx(exact.min())
     assert found.nearest.time == found.t[k]
+    floor = np.array(["the floor" in pair for pair in around.named])
+    assert exact[floor].min() > 0.2  # farther than what is looked at first
+    np.testing.assert_allclose(found.nearness(floor)[0], exact[floor].min(axis=0), atol=1e-9)
     assert found.changes(around).all()
     turned = found.values.copy()
     turned[0, :, :2] = turned[0, 0, :2]  # the last joint moves alone
@@ -73,3 +76,13 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     assert not changes[~np.array(last)].any()
     nothing = np.zeros(len(around.pairs), dtype=bool)
     assert np.isinf(found.nearness(nothing)[0]).all()
+
+
+def test_distances_of_a_long_motion_are_looked_at_less_often(course):
+    *_, found = course
+    t = np.linspace(0.0, 60.0, 6001)
+    values = np.arange(6.0 * 6001 * 3).reshape(6, 6001, 3)
+    few = replace(found, t=t, values=values).thinned
+    np.testing.assert_array_equal(few.t, t[::4])
+    np.testing.assert_array_equal(few.values, values[:, ::4])
+    assert len(found.thinned.t) == len(found.t)
