@@ -309,8 +309,9 @@ def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], 
         return marks, [*notes, f"Collisions are not looked at: {error}."]
     if course.nearest is not None:
         near = course.nearest
-        label = f"{near.first} and {near.second} are nearest, {1e3 * near.distance:.0f} mm"
-        marks.append(Mark(near.time, label))
+        apart = f"are nearest, {1e3 * near.distance:.0f} mm"
+        said = apart if near.distance > 0 else "overlap, as convex hulls"
+        marks.append(Mark(near.time, f"{near.first} and {near.second} {said}"))
     return marks, notes
 
 

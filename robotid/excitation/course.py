@@ -14,10 +14,10 @@ __all__ = ["Course"]
 
 _RATE = 100.0  # [Hz] of the instants of a designed motion that are looked at ...
 _FEWEST = 400  # ... of which there are so many at least
-_MOST = 2000  # at which distances are looked at
+_MOST = 1000  # at which distances are looked at
 _LOOKED_AT = 20  # instants that say which distances change ...
 _STILL = 1e-4  # [m] ... by more than this
-_WITHIN = 0.1  # [m] distances that are looked at first; then twice as far, and so on
+_WITHIN = 0.02  # [m] distances that are looked at first; then twice as far, and so on
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Course:
 
     @cached_property
     def thinned(self) -> "Course":
-        """The same at no more than 2,000 instants, to look at distances."""
+        """The same at no more than 1,000 instants, to look at distances."""
         rows = slice(None, None, -(-len(self.t) // _MOST))
         return replace(self, t=self.t[rows], values=self.values[:, rows])
 
