@@ -258,8 +258,13 @@ def _excite(options: argparse.Namespace) -> None:
     job = job_from_flags(options, needs_logs=False)
     with terminal_progress(quiet=options.json, force=options.progress) as progress:
         settings = motion_settings(options)
-        found = design_motion(job, settings, options.out, given=options.given, progress=progress)
+        found = design_motion(
+            job, settings, options.out,
+            given=options.given, report=options.report, progress=progress,
+        )  # fmt: skip
     _show(found, options, "excite")
+    if options.report and not options.json:
+        print(f"\nwritten to {options.report}")
 
 
 def _preview(options: argparse.Namespace) -> None:

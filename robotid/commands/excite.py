@@ -1,7 +1,8 @@
 """A motion to record: designed for a robot within its limits, and written."""
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +14,15 @@ from robotid.commands.logs import result_run
 from robotid.exceptions import SettingsError
 from robotid.excitation.basis import Basis, BSplineBasis, FourierBasis
 from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.course import Course
 from robotid.excitation.design import Design, Designer
 from robotid.excitation.files import write_motion
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.excitation.motion_page import write_motion_page
 from robotid.excitation.routes import design_stands, design_sweeps
+from robotid.identification.previews import Preview, Run, preview_logs
+from robotid.identification.survey import hold_log
+from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -24,7 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
-_KINDS = ("fourier", "bspline", "sweeps", "stands")
+_ROUTES = ("sweeps", "stands")
+_KINDS = ("fourier", "bspline", *_ROUTES)
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,7 @@ def design_motion(
     target: str | Path,
     *,
     given: str | None = None,
+    report: str | Path | None = None,
     progress: "ProgressCallback | None" = None,
 ) -> dict[str, Any]:
     """Design a motion for a robot and write it.
@@ -126,6 +134,7 @@ def design_motion(
         settings: What motion is wanted.
         target: The file, as of ``write_motion``.
         given: A result.json, or its folder: the motion tells what its logs did not.
+        report: A page to write about it, if any.
         progress: Told which start is followed.
 
     Returns:
@@ -136,7 +145,8 @@ def design_motion(
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit, or nothing keeps the limits.
     """
-    check_file(Path(target))
+    for file in (target, *([] if report is None else [report])):
+        check_file(Path(file))
     model, run = job.model(), None
     if given is not None:
         _, _, model, run = result_run(job, given)
@@ -162,7 +172,7 @@ def design_motion(
         if progress is not None:
             progress("designing", start, settings.starts, "starts")
 
-    rng = np.random.default_rng(settings.seed)
+    rng, begun = np.random.default_rng(settings.seed), time.monotonic()
     if settings.kind == "sweeps":
         design = design_sweeps(designer, rng)
     elif settings.kind == "stands":
@@ -171,20 +181,62 @@ def design_motion(
         design = designer.design(
             rng, starts=settings.starts, seconds=settings.seconds, progress=told
         )
+    design = replace(design, seconds=time.monotonic() - begun)
+    course = Course.of_design(designer, design)
+    if settings.kind in _ROUTES:
+        _check_jerk(course, model.joints)
     write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    return _content(model, design, limits, clearance, settings)
+    content = _content(model, design, course, settings)
+    if report is not None:
+        expected = _expected(job, model, design, settings, run, str(target))
+        write_motion_page(report, model, content, course, expected)
+        content["report"] = str(report)
+    return content
+
+
+def _check_jerk(course: Course, joints: Sequence[str]) -> None:
+    """Refuse a motion from place to place that is too jerky: it is not designed for jerk.
+
+    Raises:
+        SettingsError: If it is.
+    """
+    used = course.largest[LIMITS.index("jerk")]
+    joint = int(np.argmax(used))
+    if used[joint] > 1.0:
+        raise SettingsError(
+            f"{joints[joint]} needs {100 * used[joint]:.0f} % of its jerk limit at "
+            f"{course.peak('jerk', joint):.2f} s: sweeps and stands do not follow jerk; raise "
+            "--max-jerk or lower --share"
+        )
+
+
+def _expected(
+    job: Job,
+    model: RobotModel,
+    design: Design,
+    settings: MotionSettings,
+    run: Run | None,
+    path: str,
+) -> Preview:
+    """Return what is to be expected of a log of the motion, beside what is known already."""
+    t = np.arange(round(design.duration * settings.points) + 1) / settings.points
+    q, v, a = design.motion.evaluate(np.minimum(t, design.duration))
+    log = Log(t, q, np.zeros_like(q), model.joints, v, a, path)
+    held = hold_log(model, log, job.signals)
+    return preview_logs(model, [held], job.estimator, noise=settings.noise, run=run)
 
 
 def _content(
-    model: RobotModel,
-    design: Design,
-    limits: MotionLimits,
-    clearance: Clearance | None,
-    settings: MotionSettings,
+    model: RobotModel, design: Design, course: Course, settings: MotionSettings
 ) -> dict[str, Any]:
     """Return what was designed, for people and programs."""
     margins: dict[str, Any] = {}
-    for name, used, sizes in zip(LIMITS, design.used, limits.sizes, strict=True):
+    limits, clearance = course.limits, course.clearance
+    jerk = LIMITS.index("jerk")
+    most = design.used.copy()
+    if settings.kind in _ROUTES:
+        most[jerk] = course.largest[jerk]
+    for name, used, sizes in zip(LIMITS, most, limits.sizes, strict=True):
         if np.isfinite(sizes).any():
             joint = int(np.argmax(used))
             margins[name] = {"margin": 1.0 - float(used[joint]), "where": model.joints[joint]}
@@ -208,6 +260,7 @@ def _content(
         "converged": bool(design.is_converged),
         "feasible": True,
         "kind": settings.kind,
+        "share": settings.share,
         "duration": design.duration,
         "points": settings.points,
         "limits": margins,

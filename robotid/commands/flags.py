@@ -247,6 +247,8 @@ def _add_excite(parser: argparse.ArgumentParser) -> None:
     words = "motion to write: .csv, .parquet, .yaml (ROS 2 JointTrajectory) or .script (UR)"
     add("--out", metavar="FILE", required=True, help=words)
     add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
+    words = "page to write about the motion: its limits over time, what it will tell"
+    add("--report", metavar="PAGE.html", help=words)
     words = "sweeps show friction, stands gravity, the others all; default: fourier"
     add("--kind", choices=("fourier", "bspline", "sweeps", "stands"), help=words)
     add("--duration", metavar="S", type=float, help="default: 10")

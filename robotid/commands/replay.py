@@ -11,6 +11,9 @@ from robotid._files import read_json
 from robotid._typing import Array
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
+from robotid.excitation.clearance import Clearance
+from robotid.excitation.course import Course
+from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.export.result import read_result, stated_model
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
 from robotid.identification.evaluation import predict
@@ -19,6 +22,7 @@ from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.viewer.replays import Bands, Mark, Replay, Torques, replay
 from robotid.viewer.unexplained import find_unexplained
@@ -119,14 +123,21 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     """
     model = job.model()
     (entry,) = job.identification
-    motion = job.read(entry, model)
+    is_motion = not job.lay_out(entry, model, is_motion=True)[0].has_torque
+    motion = job.read(entry, model, is_motion=is_motion)
     robots = {label: stated_model(r, model) for label, r in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
     second = None
     if ghost is not None:
         shadow = job.read(LogEntry(Path(ghost)), model, is_motion=True)
         second = (Path(ghost).name, shadow.t, shadow.q)
-    torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
+    torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
+    if is_motion:
+        used, said = _limits_used(job, motion, model)
+        marks, notes = [*marks, *used], [*notes, *said]
+    else:
+        torques = replace(_torques(job, motion, model, robots), noise=_noise(findings, model))
+        marks += _contacts(torques, model)
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     shown, q = model, motion.q
     base = None if second else _base_poses(job, entry, motion)
@@ -143,8 +154,8 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         masses=masses or None,
         ghost=second,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
-        marks=[*_payloads(findings.track), *_contacts(torques, model)],
-        notes=[f"Motion: {entry.path.name}."],
+        marks=marks,
+        notes=notes,
     )
 
 
@@ -270,6 +281,38 @@ def _payloads(track: Mapping[str, Any] | None) -> list[Mark]:
         label = f"payload {load['mass']:.2f} ± {load['std_error']:.2f} kg on {load['body']}"
         marks.append(Mark(change["onset"], label, "payload"))
     return marks
+
+
+def _limits_used(job: Job, motion: Log, model: RobotModel) -> tuple[list[Mark], list[str]]:
+    """Return marks where a motion uses the most of each limit and is nearest to a collision.
+
+    Beside them what cannot be marked, and why: the URDF may state no limits, or have no shapes.
+    """
+    v = np.gradient(motion.q, motion.t, axis=0) if motion.v is None else motion.v
+    a = np.gradient(v, motion.t, axis=0) if motion.a is None else motion.a
+    torque = predict_instants(model, model.standard_parameters(), motion.q, v, a)
+    marks, notes = [], ["It has no torques; the most that it uses of the URDF's limits is marked."]
+    try:
+        limits = MotionLimits.of_model(model, share=1.0)
+    except SettingsError as error:
+        return [], [f"It has no torques. Limits are not marked: {error}."]
+    course = Course.of_motion(motion.t, (motion.q, v, a, torque), limits)
+    for kind, used in zip(LIMITS, course.largest, strict=True):
+        joint = int(np.argmax(used))
+        if used[joint] > 0:
+            name = model.joints[joint]
+            label = f"{name} at {100 * used[joint]:.0f} % of its {kind} limit"
+            marks.append(Mark(course.peak(kind, joint), label, "note", name))
+    try:
+        course = replace(course, clearance=Clearance(model))
+    except DataError as error:
+        return marks, [*notes, f"Collisions are not looked at: {error}."]
+    if course.nearest is not None:
+        near = course.nearest
+        apart = f"are nearest, {1e3 * near.distance:.0f} mm"
+        said = apart if near.distance > 0 else "overlap, as convex hulls"
+        marks.append(Mark(near.time, f"{near.first} and {near.second} {said}"))
+    return marks, notes
 
 
 def _contacts(torques: Torques, model: RobotModel) -> list[Mark]:

@@ -146,6 +146,7 @@ class LogLayout:
     notes: tuple[str, ...]  # what the reader should know
     motors: Mapping[str, tuple[bool, ...]]  # by kind: which columns are a motor's
     gears: tuple[Transmission, ...]  # of the motors
+    has_torque: bool  # whether the file has a torque or a current of any of the joints
 
     @property
     def wanted(self) -> list[str]:
@@ -276,6 +277,7 @@ def lay_out(
         notes=tuple(finder.notes),
         motors={kind: finder.of_motors(kind) for kind in _NOUNS},
         gears=gears,
+        has_torque=any(finder.has_torque(joint) for joint in joints),
     )
     return layout, opened
 
@@ -549,8 +551,11 @@ class _Finder:
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has a position, and a torque or a current, of a joint."""
-        has_torque = self._has("tau", joint) or self._has("current", joint)
-        return self._has("q", joint) and (self.is_motion or has_torque)
+        return self._has("q", joint) and (self.is_motion or self.has_torque(joint))
+
+    def has_torque(self, joint: str) -> bool:
+        """Return whether the file has a torque or a current of a joint."""
+        return self._has("tau", joint) or self._has("current", joint)
 
     def _has(self, kind: str, joint: str) -> bool:
         """Return whether the file has a quantity of a joint."""

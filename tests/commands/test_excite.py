@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -61,4 +62,65 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):
     assert main([*WORDS, "--out", str(tmp_path / "m.csv"), *words]) == 2
     assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_says_what_is_used_of_each_limit_and_draws_it(tmp_path, capsys):
+    target, page = tmp_path / "motion.csv", tmp_path / "motion.html"
+    stated = ["--max-acceleration", "wrist_2_joint=3", "--floor", "-2", "--report", str(page)]
+    assert main([*WORDS, "--out", str(target), "--json", *stated]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["report"] == str(page)
+    html = page.read_text()
+    shown = {
+        cells[0]: cells[1:]
+        for row in re.findall(r"<tr>(.*?)</tr>", html)
+        if (cells := re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row))
+    }
+    table = open_table(target, LogSource())
+    columns = table.read(table.names)
+    for name, unit in (("velocity", "rad/s"), ("acceleration", "rad/s²")):
+        entry, cells = content["limits"][name], shown[name]
+        assert float(cells[0]) == pytest.approx(100 * (1 - entry["margin"]), abs=0.06)
+        assert cells[2].replace("<wbr>", "") == entry["where"]
+        assert cells[5] == unit
+        values = columns[{"velocity": "dq_", "acceleration": "ddq_"}[name] + entry["where"]]
+        at = columns["time"][int(np.argmax(np.abs(values)))]
+        assert float(cells[3]) == pytest.approx(at, abs=0.02)
+    charts = [
+        json.loads(text)
+        for text in re.findall(r'<script type="application/json">(.*?)</script>', html)
+    ]
+    drawn = {chart["title"]: [s["label"] for s in chart["series"]] for chart in charts}
+    assert drawn["acceleration of each joint as a share of its limit"][2:] == ["wrist_2_joint"]
+    assert drawn["acceleration of each joint"] == ["wrist_1_joint", "wrist_3_joint"]
+    assert "floor and boxes" in drawn["distance of the two hulls that are nearest"]
+    velocity = next(c for c in charts if c["title"].startswith("velocity"))
+    assert velocity["link"] == "time"
+    assert [velocity["series"][k]["y"]["low"] for k in (0, 1)] == [100.0, -100.0]
+    assert "motion.csv: the motion determines" in html
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["motion.csv", "motion.html"]
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_the_design(tmp_path, capsys):
+    words = ["--out", str(tmp_path / "m.csv"), "--report", str(tmp_path / "none" / "m.html")]
+    assert main([*WORDS, *words]) == 1
+    assert f"{tmp_path / 'none'}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_sweeps_say_what_they_use_of_jerk_and_refuse_what_is_too_little(tmp_path, capsys):
+    words = [*WORDS, "--kind", "sweeps", "--clearance", "none", "--json"]
+    words += ["--out", str(tmp_path / "m.csv"), "--points", "100", "--max-jerk"]
+    assert main([*words, "wrist_2_joint=1000"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    columns = open_table(tmp_path / "m.csv", LogSource()).read(["time", "ddq_wrist_2_joint"])
+    jerk = np.gradient(columns["ddq_wrist_2_joint"], columns["time"])
+    used = 1.0 - content["limits"]["jerk"]["margin"]
+    assert used == pytest.approx(np.abs(jerk).max() / 1000, rel=0.05)
+    assert content["seconds"] > 0.0
+    (tmp_path / "m.csv").unlink()
+    assert main([*words, "wrist_2_joint=20"]) == 2
+    assert "wrist_2_joint needs " in (said := capsys.readouterr().err)
+    assert f"{100 * used * 50:.0f} % of its jerk limit at " in said
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,7 @@
 """``robotid replay``: a log, results, a track and a ghost from files to one page."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.cli import main
 from robotid.commands.replay import read_findings
+from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -236,3 +238,48 @@ def test_a_base_is_where_the_log_says_or_said_to_be_held(tmp_path, capsys):
     base[:, 3:] *= 0.5
     assert play(np.column_stack([rows, base]), [*columns, *names]) is None
     assert "log.csv: base_qx to base_qw must be the four numbers" in capsys.readouterr().err
+
+
+def test_a_motion_without_torques_plays_and_marks_where_it_uses_the_most_of_limits(folder):
+    model = RobotModel.from_urdf(URDF)
+    t = np.arange(401) / 100.0
+    table = {"time": t}
+    for j, joint in enumerate(model.joints):
+        size = {"elbow_joint": 1.5, "wrist_1_joint": 0.4}.get(joint, 0.1)
+        table[f"q_{joint}"] = -0.5 * (j == 1) + size * np.sin(np.pi * t / 4 * (1 + j)) ** 2
+    write_columns(table, folder / "motion.csv")
+    code, data = run(folder, folder / "motion.csv")
+    assert code == 0
+    assert data["torques"] is None
+    marks = {mark["label"].split(" limit")[0].split()[-1]: mark for mark in data["marks"]}
+    q, elbow = table["q_elbow_joint"], model.limits[2]
+    share = 100 * q.max() / elbow.upper  # its range is even about 0
+    said = f"elbow_joint at {share:.0f} % of its position limit"
+    assert marks["position"]["label"] == said
+    assert q[round(100 * marks["position"]["t"])] == pytest.approx(q.max(), abs=1e-6)
+    speed = np.abs(np.gradient(q, t))
+    assert (
+        f"{100 * speed.max() / elbow.velocity:.0f} % of its velocity" in marks["velocity"]["label"]
+    )
+    assert marks["velocity"]["joint"] == "elbow_joint"
+    assert speed[round(100 * marks["velocity"]["t"])] == pytest.approx(speed.max(), abs=1e-6)
+    assert marks["torque"]["joint"] == "shoulder_lift_joint"  # which carries the arm
+    (nearest,) = (mark for mark in data["marks"] if "nearest" in mark["label"])
+    assert re.fullmatch(r"\w+ and \w+ are nearest, \d+ mm", nearest["label"])
+    assert data["notes"][1].startswith("It has no torques")
+
+
+def test_a_motion_of_a_robot_without_limits_plays_and_says_what_is_not_marked(folder, tmp_path):
+    text = re.sub(r'velocity="[^"]*"', 'velocity="0"', Path(URDF).read_text())
+    (tmp_path / "arm.urdf").write_text(text)
+    t = np.arange(50) / 100.0
+    write_columns(
+        {"time": t, **{f"q_{j}": 0.1 * t for j in RobotModel.from_urdf(URDF).joints}},
+        tmp_path / "motion.csv",
+    )
+    page = tmp_path / "page.html"
+    words = ["replay", str(tmp_path / "arm.urdf"), str(tmp_path / "motion.csv")]
+    assert main([*words, "--html", str(page)]) == 0
+    data = shown(page.read_text(encoding="utf-8"))
+    assert data["marks"] == []
+    assert "Limits are not marked: arm.urdf states no limit of" in data["notes"][1]

@@ -1,0 +1,88 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotid.excitation.basis import FourierBasis
+from robotid.excitation.clearance import Box, Clearance
+from robotid.excitation.course import Course
+from robotid.excitation.design import Designer
+from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.regressor.prediction import predict_instants
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+WRIST = ["wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+
+
+@pytest.fixture(scope="module")
+def course():
+    """A motion of the last three joints of a UR10, between a post and a floor."""
+    model = RobotModel.from_urdf(example_urdf("ur10_robot.urdf"), joints=WRIST)
+    limits = MotionLimits.of_model(model, acceleration={"wrist_2_joint": 4.0})
+    post = Box("post", (1.2, 0.1, -0.5), (1.3, 0.2, 0.5))
+    around = Clearance(model, least=0.03, floor=-0.5, boxes=[post])
+    designer = Designer.of_model(model, FourierBasis(4.0, 3), limits)
+    design = designer.checked(designer.random(np.random.default_rng(0)))
+    return model, designer, design, Course.of_design(replace(designer, clearance=around), design)
+
+
+def test_a_course_has_the_values_of_the_motion_and_shares_of_its_limits(course):
+    model, _, design, found = course
+    q, v, a, jerk = design.motion.basis.derivatives(found.t, 3) @ design.motion.coefficients
+    np.testing.assert_allclose(found.values[:3], [q, v, a], atol=1e-12)
+    np.testing.assert_allclose(found.values[3][1:-1], jerk[1:-1], atol=0.01)  # by differences
+    np.testing.assert_allclose(found.values[5], found.values[4] * v, atol=1e-12)
+    speeds = np.array([j.velocity for j in model.limits])
+    np.testing.assert_allclose(found.used[1], v / (0.9 * speeds), atol=1e-12)
+    assert np.abs(found.largest - design.used).max() < 0.01  # the same, on another grid
+    k = LIMITS.index("acceleration")
+    assert found.largest[k, 0] == 0.0  # it has no limit
+    at = found.peak("acceleration", 1)
+    peak = np.abs(design.motion.evaluate(np.array([at]))[2][0, 1])
+    assert peak == pytest.approx(4.0 * found.largest[k, 1], rel=1e-9)
+
+
+def test_torques_of_a_course_are_those_of_the_bodies_and_the_friction_assumed(course):
+    model, designer, _, found = course
+    q, v, a = found.values[:3]
+    still = found.values[4] - predict_instants(model, model.standard_parameters(), q, v, a)
+    size = np.abs(still).max(axis=0)
+    assert (size > 0.02 * 54.0).all()  # friction of 5 %, at each joint, for 54 N m
+    assert (size < 0.15 * 54.0).all()
+    assert designer.limits.sizes[4] == pytest.approx(0.9 * np.array([54.0, 54.0, 54.0]))
+
+
+def test_the_distance_of_a_course_is_that_of_all_pairs(course):
+    *_, found = course
+    around = found.clearance
+    poses = around.poses(found.values[0])
+    exact = around.near(poses, np.inf, around.everything).distance
+    distance, pairs = found.nearness(around.everything)
+    np.testing.assert_allclose(distance, exact.min(axis=0), atol=1e-9)
+    np.testing.assert_array_equal(exact[pairs, np.arange(len(distance))], exact.min(axis=0))
+    k = int(np.argmin(distance))
+    assert found.nearest.distance == pytest.approx(exact.min())
+    assert found.nearest.time == found.t[k]
+    floor = np.array(["the floor" in pair for pair in around.named])
+    assert exact[floor].min() > 0.2  # farther than what is looked at first
+    np.testing.assert_allclose(found.nearness(floor)[0], exact[floor].min(axis=0), atol=1e-9)
+    assert found.changes(around).all()
+    turned = found.values.copy()
+    turned[0, :, :2] = turned[0, 0, :2]  # the last joint moves alone
+    last = [any("wrist_3" in name or "ee_" in name for name in pair) for pair in around.named]
+    changes = replace(found, values=turned).changes(around)
+    assert changes.any()
+    assert not changes[~np.array(last)].any()
+    nothing = np.zeros(len(around.pairs), dtype=bool)
+    assert np.isinf(found.nearness(nothing)[0]).all()
+
+
+def test_distances_of_a_long_motion_are_looked_at_less_often(course):
+    *_, found = course
+    t = np.linspace(0.0, 60.0, 6001)
+    values = np.arange(6.0 * 6001 * 3).reshape(6, 6001, 3)
+    few = replace(found, t=t, values=values).thinned
+    np.testing.assert_array_equal(few.t, t[::7])
+    np.testing.assert_array_equal(few.values, values[:, ::7])
+    assert len(found.thinned.t) == len(found.t)
