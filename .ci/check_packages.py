@@ -6,9 +6,9 @@ import zipfile
 from pathlib import Path
 
 WHEEL = (
-    "robotid/viewer/assets/uPlot.LICENSE.txt",
-    "robotid/viewer/assets/uPlot.iife.min.js",
-    "robotid/viewer/assets/replay.js",
+    *(path.as_posix() for path in sorted(Path("robotid").glob("*/assets/*"))),
+    "robotid/pages/assets/uPlot.LICENSE.txt",
+    "robotid/pages/assets/charts.js",
     "robotid/py.typed",
     "dist-info/licenses/LICENSE",
 )
