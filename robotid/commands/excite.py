@@ -258,7 +258,7 @@ def _content(
         "seconds": design.seconds,
         "starts": design.starts,
         "converged": bool(design.is_converged),
-        "feasible": True,
+        "feasible": all((m["margin"] or 0.0) >= 0.0 for m in margins.values()),
         "kind": settings.kind,
         "share": settings.share,
         "duration": design.duration,

@@ -278,7 +278,7 @@ def _margin(name: str, margin: Mapping[str, Any]) -> str:
     if margin["unread"]:
         said += f"; not looked at, since no shape can be read: {listed(margin['unread'])}"
     if margin["left_alone"]:
-        said += f"; always nearer than that: {listed(margin['left_alone'])}"
+        said += f"; not looked at, for they hardly ever have room: {listed(margin['left_alone'])}"
     return said
 
 

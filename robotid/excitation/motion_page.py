@@ -152,7 +152,7 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     if entry["unread"]:
         said += f" Not looked at, since no shape can be read: {listed(entry['unread'])}."
     if entry["left_alone"]:
-        said += f" Always nearer than that, and left alone: {listed(entry['left_alone'])}."
+        said += f" Not looked at, for they hardly ever have room: {listed(entry['left_alone'])}."
     return f"<p>{escape(said)}</p>\n"
 
 

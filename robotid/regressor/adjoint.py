@@ -198,7 +198,7 @@ class MotionRegressor:
             state: The regressor.
             weights: What each entry counts, shape (pairs, 10, N).
         """
-        i, j = self._bodies, self._joints
+        i, j, size = self._bodies, self._joints, len(self._parents)
         to_u, to_e, to_d, to_dw, to_w = self._pull_rows(state, weights)
         # the acceleration of the origin is d = a + w x v
         vl, w = state.own_velocity
@@ -209,8 +209,8 @@ class MotionRegressor:
         s = state.screw
         turn = _add(_adjoint(state.velocity, g_V), _adjoint(state.acceleration, g_A))
         by_pair = _adjoint((s[0][:, j], s[1][:, j]), g_seen)
-        turn = _add(turn, (_by(i, by_pair[0], turn[0]), _by(i, by_pair[1], turn[1])))
-        g_s = (_by(j, g_seen[0], s[0]), _by(j, g_seen[1], s[1]))
+        turn = _add(turn, (_by(i, by_pair[0], size), _by(i, by_pair[1], size)))
+        g_s = (_by(j, g_seen[0], size), _by(j, g_seen[1], size))
         S_A = self._gathered(g_A)
         g_a = _pair(s, S_A)
         c = _motion_cross(state.velocity, s)
@@ -245,14 +245,12 @@ class MotionRegressor:
         to_d = m * u + _cross(e, h)
         to_dw = _cross(h, u) + Me
         to_w = wu * h + wh * u - 2.0 * w * _dot(h, u) + _cross(Mw, e) + f
-        by_body = np.zeros((size, len(i)))
-        by_body[i, np.arange(len(i))] = 1.0
-        return to_u, to_e, by_body @ to_d, by_body @ to_dw, by_body @ to_w
+        return to_u, to_e, *(_by(i, x, size) for x in (to_d, to_dw, to_w))
 
 
-def _by(index: Array, values: Array, like: Array) -> Array:
-    """Return sums of values over pairs of one index, shape as ``like``."""
-    chosen = np.zeros((like.shape[1], len(index)))
+def _by(index: Array, values: Array, size: int) -> Array:
+    """Return sums of values over the pairs of each index, shape (3, size, N)."""
+    chosen = np.zeros((size, len(index)))
     chosen[index, np.arange(len(index))] = 1.0
     summed: Array = chosen @ values
     return summed

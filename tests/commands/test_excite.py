@@ -1,10 +1,12 @@
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from robotid.cli import main
+from robotid.excitation.design import Designer
 from robotid.logs.formats import open_table
 from robotid.logs.settings import LogSource
 from robotid.robot.examples import example_urdf
@@ -36,7 +38,20 @@ def test_a_motion_is_designed_written_and_told(tmp_path, capsys):
         "position", "velocity", "acceleration", "torque", "collision"
     }  # fmt: skip
     assert content["criterion"] == "D"
-    assert content["feasible"]
+    assert content["feasible"] is True
+
+
+def test_a_motion_beyond_a_limit_is_not_called_feasible(tmp_path, capsys, monkeypatch):
+    design = Designer.design
+
+    def beyond(*given, **stated):
+        found = design(*given, **stated)
+        return replace(found, used=1.2 * found.used)
+
+    monkeypatch.setattr(Designer, "design", beyond)
+    words = [*WORDS, "--out", str(tmp_path / "motion.csv"), "--json", "--clearance", "none"]
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out)["feasible"] is False
 
 
 def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
