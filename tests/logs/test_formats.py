@@ -268,8 +268,9 @@ def test_a_bag_without_efforts_is_refused_as_any_log(tmp_path):
     with refused(
         "run.mcap has no column 'tau_shoulder'; torque or current columns found: none. Rename it, "
         "or "
-        "pass columns={'tau_shoulder': ...}; if 'shoulder' stood still, leave it out of joints and "
-        "lock it"
+        "pass columns={'tau_shoulder': ...}. Commanded positions, qref_<joint>, would be enough "
+        'for [estimator] name = "simulation" with a [controller] table; all other estimators need '
+        "tau_<joint> or current_<joint>"
     ):
         read_log(path, JOINTS)
 
@@ -425,8 +426,9 @@ def test_one_joint_needs_no_second_axis(tmp_path):
             {"tau": np.array([None] * 60)},
             "run.npz has no column 'tau_shoulder'; torque or current columns found: none. Rename "
             "it, "
-            "or pass columns={'tau_shoulder': ...}; if 'shoulder' stood still, leave it out of "
-            "joints and lock it",
+            "or pass columns={'tau_shoulder': ...}. Commanded positions, qref_<joint>, would be "
+            'enough for [estimator] name = "simulation" with a [controller] table; all other '
+            "estimators need tau_<joint> or current_<joint>",
         ),
     ],
 )
