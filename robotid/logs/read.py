@@ -535,7 +535,8 @@ class _Finder:
             raise DataError(
                 f"{self.where} has no commanded position, as 'qref_{self.joints[0]}', of any joint "
                 f"read; columns of commanded positions found: {listed(known)}. Record what the "
-                "controller was told, rename the columns, or pass columns={'qref_<joint>': ...}",
+                "controller was told, rename the columns, or pass columns={'qref_<joint>': ...}"
+                + "".join(f"; {note}" for note in self.notes),
                 code="missing_column",
             )
         raise DataError(

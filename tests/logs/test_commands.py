@@ -1,18 +1,19 @@
 """Logs of what was commanded: read of every format, with torque or without, or refused by name."""
 
+import sqlite3
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from helpers.recorders import wide
+from helpers.recorders import StoragePlugin, messages_of, wide, write_bag2, write_controller
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.survey import survey_log
 from robotid.logs.data import COLUMNS, Log
 from robotid.logs.formats import write_columns
 from robotid.logs.read import lay_out, read_log, read_logs, write_log
-from robotid.logs.settings import LogUnits, SignalSettings
+from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import prefixes, quantity_of
 from robotid.logs.transmission import Transmission
 
@@ -276,3 +277,97 @@ def test_a_long_log_is_read_in_pieces_with_its_commands(ur5, tmp_path):
     np.testing.assert_array_equal(
         piece.header.read(*piece.span, piece.near).q_ref, log.q_ref[slice(*piece.span)]
     )
+
+
+# --- bags -----------------------------------------------------------------------------------------
+
+
+def driven(count=60, **changes):
+    return make_log(count, v=np.ones((count, 2)), **changes)
+
+
+@pytest.mark.parametrize("era", ["old", "new"])
+@pytest.mark.parametrize("suffix", ["", ".bag"])
+@pytest.mark.parametrize("has_torque", [True, False])
+def test_the_state_of_a_trajectory_controller_is_read(tmp_path, era, suffix, has_torque):
+    log = driven(has_torque=has_torque)
+    log = replace(log, tau=log.q * 3) if has_torque else log
+    path = write_controller(tmp_path / f"run{suffix}", log, era)
+    back = read_log(path, JOINTS, needs="commands")
+    assert_same(back, log)
+    assert back.notes == ()
+
+
+def test_what_a_controller_put_out_is_the_command(tmp_path):
+    log = driven()
+    path = write_controller(tmp_path / "run", log, "new", output=log.q_ref + 1)
+    np.testing.assert_array_equal(read_log(path, JOINTS, needs="commands").q_ref, log.q_ref + 1)
+
+
+def test_a_controller_beside_joint_states_is_named(tmp_path):
+    log = driven(has_torque=True, tau=np.ones((60, 2)))
+    path = write_controller(tmp_path / "run", log, "new", states=list(messages_of(log)))
+    note = (
+        "commands are in topics that are not read: /arm_controller/state; topic = "
+        '"/arm_controller/state" reads them and what was measured with them'
+    )
+    assert read_log(path, JOINTS).notes == (note,)
+    with pytest.raises(DataError, match=r"no commanded position.* commands are in topics that"):
+        read_log(path, JOINTS, needs="commands")
+    source = LogSource(topic="/arm_controller/state")
+    assert_same(read_log(path, JOINTS, needs="commands", source=source), log)
+
+
+def test_a_bag_without_the_controllers_definition_says_what_to_do(tmp_path):
+    path = write_controller(tmp_path / "run", driven(), "new", plugin=StoragePlugin.SQLITE3)
+    assert len(read_log(path, JOINTS, needs="commands").t) == 60
+    with sqlite3.connect(next(path.glob("*.db3"))) as file:
+        file.execute("DELETE FROM message_definitions")
+    file.close()
+    with pytest.raises(DataError, match=r"^run does not hold the definition of control_msgs/msg/"):
+        read_log(path, JOINTS, needs="commands")
+
+
+COMMANDS = LogSource(topic="/joint_states", command="/joint_commands")
+
+
+def paired(log, *, late=0.0035, every=1, first=0):
+    """Messages of a log, and of its commands at other times, each to be held until the next."""
+    told = replace(log, t=log.t + late, q=log.q_ref, v=None, tau=0 * log.q)
+    commands = [(*message[:4], []) for message in messages_of(told)][first::every]
+    states = [(*message[:4], []) for message in messages_of(log)]
+    return {"/joint_states": states, "/joint_commands": commands}
+
+
+def test_two_topics_of_joint_states_are_joined_by_holding_the_last_command(tmp_path):
+    log = driven(v_ref=None, tau_ref=None)
+    path = write_bag2(tmp_path / "bag", paired(log, every=2, first=4))
+    back = read_log(path, JOINTS, needs="commands", source=COMMANDS)
+    # commands 4, 6, ... come 3.5 ms after rows 4, 6, ...: row 5 is the first with one
+    np.testing.assert_array_equal(back.t, log.t[5:])
+    held = (np.arange(5, 60) - 1) // 2 * 2
+    np.testing.assert_array_equal(back.q_ref, log.q_ref[held])
+    np.testing.assert_array_equal(back.q, log.q[5:])
+    np.testing.assert_array_equal(back.v, log.v[5:])
+    assert (back.v_ref, back.has_torque) == (None, False)
+    assert back.notes == (
+        "commands of topic '/joint_commands' are held until the next one, 20 ms later in the "
+        "median; 5 messages before the first one are left out; 1 messages come after the last one",
+    )
+    only = LogSource(command="/joint_commands")
+    assert_same(read_log(path, JOINTS, needs="commands", source=only), back)
+    assert len(read_log(path, JOINTS, needs="motion", source=COMMANDS).t) == 55
+
+
+def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
+    path = write_bag2(tmp_path / "bag", paired(driven()), others=["/chatter"])
+    for source, text in (
+        (LogSource(command="/joint_comands"), "bag has no topic '/joint_comands'; topics: "),
+        (LogSource(command="/chatter"), "bag: topic '/chatter' holds std_msgs/msg/String, wanted"),
+        (replace(COMMANDS, topic="/joint_commands"), "bag: topic and command are both '/joint_co"),
+    ):
+        with pytest.raises(DataError, match=text):
+            read_log(path, JOINTS, needs="commands", source=source)
+    write_log(make_log(), tmp_path / "run.csv")
+    with pytest.raises(SettingsError, match=r"the topic of a bag, but run\.csv is none"):
+        read_log(tmp_path / "run.csv", JOINTS, needs="commands", source=COMMANDS)

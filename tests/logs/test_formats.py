@@ -220,7 +220,8 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/arm")), log)
     with refused(f"bag has no topic '/arn'; {listing}. Did you mean '/arm'?"):
         read_log(path, JOINTS, source=LogSource(topic="/arn"))
-    with refused(f"bag: topic '/chatter' holds std_msgs/msg/String, wanted {STATE}; {listing}"):
+    kinds = f"{STATE} or control_msgs/msg/JointTrajectoryControllerState"
+    with refused(f"bag: topic '/chatter' holds std_msgs/msg/String, wanted {kinds}; {listing}"):
         read_log(path, JOINTS, source=LogSource(topic="/chatter"))
 
 
