@@ -3,6 +3,7 @@
 import hdf5storage
 import numpy as np
 import scipy.io
+from mcap.writer import Writer as McapLibraryWriter
 from mcap_ros2.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -167,4 +168,29 @@ def write_controller(path, log, era, *, states=(), output=None, plugin=StoragePl
             for message in states:
                 state = joint_state(types, to_ns(message[0]), *message[1:])
                 bag.write(other, to_ns(message[0]), serialize(state, JOINT_STATE))
+    return path
+
+
+def write_idl_controller(path, log):
+    """Write a controller's states as an MCAP whose types are defined in IDL."""
+    types = controller_types("new", Stores.ROS2_HUMBLE)
+    points = "".join(
+        f"      trajectory_msgs::msg::JointTrajectoryPoint {x};\n" for x in POINTS["new"]
+    )
+    idl = (
+        f"{'=' * 80}\nIDL: {CONTROLLER}\n"
+        "module control_msgs {\n  module msg {\n    struct JointTrajectoryControllerState {\n"
+        "      std_msgs::msg::Header header;\n      sequence<string> joint_names;\n"
+        f"{points}      trajectory_msgs::msg::JointTrajectoryPoint error;\n"
+        "    };\n  };\n};\n"
+    )
+    with path.open("wb") as file:
+        writer = McapLibraryWriter(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(CONTROLLER, "ros2idl", idl.encode())
+        channel = writer.register_channel("/controller_state", "cdr", schema)
+        for k, t in enumerate(log.t):
+            raw = types.serialize_cdr(controller_state(types, "new", log, k), CONTROLLER)
+            writer.add_message(channel, to_ns(t), bytes(raw), to_ns(t))
+        writer.finish()
     return path

@@ -6,7 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from helpers.recorders import StoragePlugin, messages_of, wide, write_bag2, write_controller
+from helpers.recorders import (
+    StoragePlugin,
+    messages_of,
+    wide,
+    write_bag2,
+    write_controller,
+    write_idl_controller,
+)
 
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.survey import survey_log
@@ -296,6 +303,11 @@ def test_the_state_of_a_trajectory_controller_is_read(tmp_path, era, suffix, has
     back = read_log(path, JOINTS, needs="commands")
     assert_same(back, log)
     assert back.notes == ()
+
+
+def test_definitions_in_idl_are_read(tmp_path):
+    path = write_idl_controller(tmp_path / "run.mcap", driven())
+    assert_same(read_log(path, JOINTS, needs="commands"), driven())
 
 
 def test_what_a_controller_put_out_is_the_command(tmp_path):
