@@ -73,7 +73,8 @@ def read_log(
 
     Args:
         path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, the folder of
-            a ROS 2 bag, or a DataFrame of pandas or polars with the same columns.
+            a ROS 2 bag or of a LeRobot dataset, or a DataFrame of pandas or polars with the same
+            columns.
         joints: Names of the joints wanted, in the order wanted.
         gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
             current with a gain is preferred to a torque column.
@@ -296,6 +297,8 @@ def lay_out(
         where, opened = "log", with_own_names(open_frame(path), "log", "DataFrames", source)
     else:
         raise _no_log(path)
+    if opened.angle_unit and units.angle is None:
+        raise DataError(f"{where}: {opened.angle_unit}", code="angle_unit")
     check_transmissions(transmissions, joints)
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
