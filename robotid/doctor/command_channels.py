@@ -22,6 +22,8 @@ _EXCITED = 1e-4  # of its strongest frequency, below which a command does not ex
 _SUREST = 0.999  # coherence beyond which no response is known: joints are not linear
 _HALF_POWER = np.sqrt(0.5)  # response, of that at rest, at which a loop's bandwidth ends
 _DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] that are tried
+_LONGEST = 0.5  # [s] by which a joint is sought to be late, or early
+_AS_ALIKE = 0.9  # share of the largest correlation that is as good
 _SURE = 3.84  # growth of a sum of squares that 5 % of chance exceed
 _TOLD = 0.02  # [s] a delay known to within less is told
 _RATE = 10.0  # rows per period of the bandwidth that are wanted
@@ -146,17 +148,34 @@ class _Loop:
     def lag(self) -> tuple[float, float]:
         """How late it is where it follows, and the standard error [s]; nan if nothing is excited.
 
-        The phase over the frequency, averaged with its weights.
+        The phase over the frequency, averaged with its weights: that beyond the lag at which their
+        changes are most alike.
         """
         f, H, weight = self.response
-        near = (np.abs(np.angle(H)) < np.pi / 2) & ~(f >= self.bandwidth)
-        w, phase, weight = 2 * np.pi * f[near], np.angle(H[near]), weight[near]
+        first = self._first_lag()
+        phase = np.angle(H * np.exp(2j * np.pi * f * first))
+        near = (np.abs(phase) < np.pi / 2) & ~(f >= self.bandwidth)
+        w, phase, weight = 2 * np.pi * f[near], phase[near], weight[near]
         if not len(w):
             return np.nan, np.nan
         share = weight * w**2 / np.sum(weight * w**2)
         late = float(share @ (-phase / w))
         spread = np.sqrt(float(share @ (-phase / w - late) ** 2) / max(len(w) - 1, 1))
-        return late, max(float(spread), float(1 / np.sqrt(np.sum(weight * w**2))))
+        return first + late, max(float(spread), float(1 / np.sqrt(np.sum(weight * w**2))))
+
+    def _first_lag(self) -> float:
+        """Return the lag at which changes of position and command are most alike [s].
+
+        Of lags at which they are about as alike, as of a sine, the shortest.
+        """
+        from scipy.signal import correlate
+
+        alike = correlate(np.diff(self.q), np.diff(self.told), method="fft")
+        rows = np.arange(len(alike)) - len(self.q) + 2
+        within = np.abs(rows) * self.step <= _LONGEST
+        alike, rows = alike[within], rows[within]
+        best = rows[alike >= _AS_ALIKE * alike.max()]
+        return float(best[np.argmin(np.abs(best))]) * self.step
 
     @cached_property
     def delays(self) -> tuple[float, float]:
@@ -316,12 +335,11 @@ def _slow(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
 def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
     """Yield joints whose slow sweeps are lost in friction or backlash, or in encoder steps."""
     for loop in loops:
-        far, gone = loop.sweeps
-        if len(far) < _SWEEPS:
-            continue
-        usual, lost = float(np.median(far)), float(np.median(far - gone))
-        share, step = float(np.median(gone / far)), quantum(log.q[:, loop.joint])
+        (far, gone), step = loop.sweeps, quantum(log.q[:, loop.joint])
+        usual = float(np.ptp(loop.told))
+        share = float(np.median(gone / far)) if len(far) >= _SWEEPS else 1.0
         if share < _FOLLOWED:
+            usual, lost = float(np.median(far)), float(np.median(far - gone))
             message = (
                 f"{loop.name} follows {100 * share:.0f} % of sweeps of {usual:.3g}, slow as they "
                 f"are: friction, backlash or the dead band of its drive swallow {lost:.2g}; move "
@@ -329,8 +347,8 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
             )
         elif usual < _FEW * step:
             message = (
-                f"sweeps of {loop.name} are {usual:.3g}, {usual / step:.1f} steps of its encoder: "
-                f"they show steps, not motion; move it by {5 * _FEW * step:.2g} or more"
+                f"{loop.name} is told to move by {usual:.3g}, {usual / step:.1f} steps of its "
+                f"encoder: they show steps, not motion; move it by {5 * _FEW * step:.2g} or more"
             )
         else:
             continue
