@@ -265,6 +265,10 @@ def _print_motion(content: dict[str, Any]) -> None:
     print("\nwhat it leaves of each limit, least where")
     for name, margin in content["limits"].items():
         say(f"  {name:13} {_margin(name, margin)}", 16 * " ")
+    if "payload" in content:
+        print()
+        for words in content["payload"]["words"]:
+            say(words)
 
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ from robotid.regressor.columns import drive_motion
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["CRITERIA", "MotionInformation", "MotionRows", "criterion"]
+__all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
 #: Which property of the information is made large, or small.
 CRITERIA = ("D", "A", "E", "condition")
@@ -166,6 +166,36 @@ class MotionInformation:
             share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)
             gradients.append(slope.T @ (share if name == "load" else R))
         return gradients
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """What is asked for, where it is not the base parameters: some of u unknowns that make them.
+
+    Attributes:
+        columns: What each unknown adds to the base parameters, both in units of their spreads,
+            shape (b, u).
+        asked: How many of them, the last ones, are asked for; the others are unknown, too.
+    """
+
+    columns: Array
+    asked: int
+
+    def information(self, F: Array) -> tuple[Array, Array]:
+        """Return the information about what is asked for, and L with d information = L^T dF L.
+
+        Args:
+            F: Information about the base parameters in units of their spread, shape (b, b).
+
+        Returns:
+            Shapes (asked, asked), in units of the spreads and with 1 for what is known before; and
+            (b, asked).
+        """
+        T, rest = self.columns, self.columns.shape[1] - self.asked
+        N = T.T @ F @ T + np.eye(T.shape[1])
+        others = np.linalg.solve(N[:rest, :rest], N[:rest, rest:])
+        L = np.vstack([-others, np.eye(self.asked)])
+        return L.T @ N @ L, T @ L
 
 
 def criterion(name: str, F: Array) -> tuple[float, Array]:
