@@ -30,6 +30,7 @@ __all__ = ["PayloadDesign", "design_payload"]
 
 _PARAMETERS = len(INERTIAL_TERMS)
 _RUNS = 2.0  # of the same noise: with the payload and without it
+_CHANGE = 10.0  # spreads by which friction and offsets may change from one run to the other
 _TRIED = 10  # random motions, of which the best says what joints can tell
 _OVER = 1.001  # share of a limit that is beyond it
 _RATE = 200.0  # [Hz] at which motions are looked at
@@ -202,7 +203,7 @@ def _sought(designer: Designer, payload: Payload) -> tuple[Designer, Aim]:
     changing = [not term.is_inertia for _, term in layout.drive_parameters]
     drives = layout.n_inertial + np.flatnonzero(changing)
     own = K[:, 10 * body : 10 * body + 10] @ transfer * payload_spread(model)
-    changes = K[:, drives] * designer.standard_spread[drives]
+    changes = K[:, drives] * (_CHANGE * designer.standard_spread[drives])
     aim = Aim(np.hstack([changes, own]) / designer.spread[:, None], _PARAMETERS)
     loaded = carried(model, np.zeros(K.shape[1]), payload)
     information = replace(information, beta=information.beta + K @ loaded)
