@@ -45,7 +45,8 @@ class MotionSettings:
             "stands", which show gravity; "payload", one of few joints for what hangs on a link.
         duration: Its length [s]; that of sweeps and stands is what they take.
         harmonics: Harmonics of a Fourier series; pieces of B-splines are twice as many.
-        criterion: "D", "A", "E" or "condition", as of ``criterion``.
+        criterion: "D", "A", "E", "condition" or "widest", as of ``criterion``; if None, "widest"
+            after logs that were identified, else "D".
         share: How much of the URDF's limits is used, more than 0 and at most 1.
         acceleration: Largest accelerations by joint [rad/s^2 or m/s^2].
         jerk: Largest jerks by joint [rad/s^3 or m/s^3].
@@ -65,7 +66,7 @@ class MotionSettings:
     kind: str = "fourier"
     duration: float = 10.0
     harmonics: int = 5
-    criterion: str = "D"
+    criterion: str | None = None
     share: float = 0.9
     acceleration: Mapping[str, float] = field(default_factory=dict)
     jerk: Mapping[str, float] = field(default_factory=dict)
@@ -158,26 +159,8 @@ def design_motion(
     """
     for file in (target, *([] if report is None else [report])):
         check_file(Path(file))
-    model, run = job.model(), None
-    if given is not None:
-        _, _, model, run = result_run(job, given)
-    limits = MotionLimits.of_model(
-        model,
-        share=settings.share,
-        acceleration=settings.acceleration,
-        jerk=settings.jerk,
-        power=settings.power,
-    )
-    clearance = None
-    if settings.clearance is not None:
-        clearance = Clearance(
-            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
-        )
-    basis = settings.basis()
-    designer = Designer.of_model(
-        model, basis, limits, name=settings.criterion, clearance=clearance, noise=settings.noise,
-        run=run,
-    )  # fmt: skip
+    designer, run = _designer(job, settings, given)
+    model = designer.information.model
 
     def told(start: int, _: float) -> None:
         if progress is not None:
@@ -198,7 +181,7 @@ def design_motion(
     if settings.kind in _ROUTES:
         _check_jerk(course, model.joints)
     write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    content = _content(model, design, course, settings)
+    content = _content(designer, design, course, settings)
     if carried is not None:
         content["payload"] = carried.to_dict()
     if report is not None:
@@ -210,6 +193,38 @@ def design_motion(
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
     return content
+
+
+def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[Designer, Run | None]:
+    """Return what looks for the motion, and what was recorded before."""
+    model, run = job.model(), None
+    if given is not None:
+        _, _, model, run = result_run(job, given)
+    name = settings.criterion
+    if name is None:
+        name = "D" if run is None or settings.kind == "payload" else "widest"
+    elif name == "widest" and (run is None or settings.kind == "payload"):
+        raise SettingsError(
+            "criterion is widest, which is about what logs have told of the robot: wanted --given "
+            "RESULT, and another kind than payload; or another criterion"
+        )
+    limits = MotionLimits.of_model(
+        model,
+        share=settings.share,
+        acceleration=settings.acceleration,
+        jerk=settings.jerk,
+        power=settings.power,
+    )
+    clearance = None
+    if settings.clearance is not None:
+        clearance = Clearance(
+            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
+        )
+    designer = Designer.of_model(
+        model, settings.basis(), limits, name=name, clearance=clearance, noise=settings.noise,
+        run=run,
+    )  # fmt: skip
+    return designer, run
 
 
 def _designed(
@@ -257,9 +272,10 @@ def _expected(
 
 
 def _content(
-    model: RobotModel, design: Design, course: Course, settings: MotionSettings
+    designer: Designer, design: Design, course: Course, settings: MotionSettings
 ) -> dict[str, Any]:
     """Return what was designed, for people and programs."""
+    model, names = designer.information.model, designer.information.mapping.base_names
     margins: dict[str, Any] = {}
     limits, clearance = course.limits, course.clearance
     jerk = LIMITS.index("jerk")
@@ -279,10 +295,10 @@ def _content(
             "unread": clearance.unread,
             "left_alone": clearance.made_to,
         }
-    return {
+    content = {
         "robot": model.name,
         "joints": list(model.joints),
-        "criterion": settings.criterion,
+        "criterion": designer.name,
         "objective": design.objective,
         "condition_number": design.condition if np.isfinite(design.condition) else None,
         "seconds": design.seconds,
@@ -296,3 +312,6 @@ def _content(
         "limits": margins,
         "history": [list(entry) for entry in design.history],
     }
+    if designer.name == "widest":
+        content["widest"] = [names[k] for k in designer.widest[::-1]]
+    return content

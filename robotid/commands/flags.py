@@ -260,8 +260,11 @@ def _add_excite(parser: argparse.ArgumentParser) -> None:
     add("--moving", metavar="JOINTS", help=words)
     add("--duration", metavar="S", type=float, help="default: 10")
     add("--harmonics", metavar="N", type=int, help="of the series; default: 5")
-    words = "of the information: D (volume), A (mean), E (weakest) or condition; default: D"
-    add("--criterion", choices=("D", "A", "E", "condition"), help=words)
+    words = (
+        "of the information: D (volume), A (mean), E (weakest), condition, or widest (the quarter "
+        "that RESULT knows the least); default: widest with --given, else D"
+    )
+    add("--criterion", choices=("D", "A", "E", "condition", "widest"), help=words)
     add("--share", metavar="X", type=float, help="of the URDF's limits; default: 0.9")
     for name, unit in (
         ("acceleration", "rad/s^2 or m/s^2"), ("jerk", "rad/s^3 or m/s^3"), ("power", "W"),

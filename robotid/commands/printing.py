@@ -262,6 +262,9 @@ def _print_motion(content: dict[str, Any]) -> None:
         f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
         f" {done}"
     )
+    if "widest" in content:
+        names = content["widest"]
+        say(f"made for what the logs given know the least: {listed(names, 5)}", "  ")
     print("\nwhat it leaves of each limit, least where")
     for name, margin in content["limits"].items():
         say(f"  {name:13} {_margin(name, margin)}", 16 * " ")

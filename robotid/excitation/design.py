@@ -53,6 +53,7 @@ _NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part i
 _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
 _TRIED = 200  # random postures until one is found that the robot can rest in
+_WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
 _STARTED = 10  # random motions of which the best is a start
 
 
@@ -317,6 +318,12 @@ class Designer:
         return known
 
     @cached_property
+    def widest(self) -> Array:
+        """The quarter of base parameters that are known the least already, shape (k,)."""
+        variance = np.diag(np.linalg.inv(self.known))
+        return np.argsort(variance, kind="stable")[-max(1, round(_WIDEST * len(variance))) :]
+
+    @cached_property
     def _moves(self) -> Array:
         """Which joints move, shape (n,), bool."""
         return np.ones(len(self.noise), dtype=bool) if self.moving is None else self.moving
@@ -328,7 +335,7 @@ class Designer:
             F: The information, in units of the spread, shape (b, b).
         """
         if self.aim is None:
-            return criterion(self.name, F)
+            return criterion(self.name, F, self.widest)
         own, L = self.aim.information(F)
         value, by_own = criterion(self.name, own)
         return value, L @ by_own @ L.T

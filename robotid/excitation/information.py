@@ -16,7 +16,7 @@ from robotid.robot.model import RobotModel
 __all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
 #: Which property of the information is made large, or small.
-CRITERIA = ("D", "A", "E", "condition")
+CRITERIA = ("D", "A", "E", "condition", "widest")
 _STEP = 1e-6  # of the differences by which drive columns are derived, in their argument's scale
 _TURN = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
 
@@ -198,13 +198,14 @@ class Aim:
         return L.T @ N @ L, T @ L
 
 
-def criterion(name: str, F: Array) -> tuple[float, Array]:
+def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
     """Return what is to be made small of an information matrix, and its gradient.
 
     Args:
         name: "D": -log det F / b; "A": log(trace F^-1 / b); "E": -log of the smallest eigenvalue;
-            "condition": log of the condition number.
+            "condition": log of the condition number; "widest": the mean log variance of some.
         F: Information about b parameters in units of like size, shape (b, b), positive definite.
+        widest: Which parameters these are, of "widest"; all if None.
 
     Raises:
         SettingsError: If there is no such criterion.
@@ -224,6 +225,11 @@ def criterion(name: str, F: Array) -> tuple[float, Array]:
         total = float(np.sum(1.0 / values))
         by_value = -1.0 / values**2 / total
         return float(np.log(total / size)), (vectors * by_value) @ vectors.T
+    if name == "widest":
+        some = np.arange(size) if widest is None else widest
+        C = (vectors[some] / values) @ vectors.T  # (k, b) of F^-1
+        variance = C[np.arange(len(some)), some]
+        return float(np.log(variance).mean()), -(C.T / variance) @ C / len(some)
     low, high = vectors[:, 0], vectors[:, -1]
     by_low = -np.outer(low, low) / values[0]
     if name == "E":

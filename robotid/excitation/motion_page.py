@@ -40,6 +40,7 @@ _CRITERIA = {
     "A": "A: log of the mean variance",
     "E": "E: −log of the weakest direction's information",
     "condition": "log of the information's condition number",
+    "widest": "mean log variance of the quarter of the parameters that was known the least",
 }
 
 

@@ -72,6 +72,7 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
         (["--max-jerk", "elbow=3"], "jerk is stated of 'elbow', which is no joint that moves"),
         (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1"),
         (["--harmonics", "1"], "harmonics is 1, wanted 2 or more"),
+        (["--criterion", "widest"], "criterion is widest, which is about what logs have told"),
     ],
 )
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):
@@ -144,7 +145,8 @@ def test_sweeps_say_what_they_use_of_jerk_and_refuse_what_is_too_little(tmp_path
 def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path, capsys):
     robot, motion = str(example_urdf("ur10_robot.urdf")), str(tmp_path / "motion.parquet")
     words = ["--kind", "payload", "--mass", "2", "--com", "0.02,0.01,0.05", "--harmonics", "3",
-             "--duration", "5", "--starts", "1", "--seconds", "0.5", "--clearance", "none"]  # fmt: skip
+             "--duration", "5", "--starts", "1", "--seconds", "0.5",
+             "--clearance", "none"]  # fmt: skip
     page = ["--report", str(tmp_path / "motion.html")]
     assert main(["excite", robot, "--out", motion, "--json", *words, *page]) == 0
     told = json.loads(capsys.readouterr().out)["payload"]
@@ -193,3 +195,29 @@ def test_flags_of_a_payload_that_do_not_fit_are_refused(tmp_path, capsys, words,
     )
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, capsys):
+    motion, log, out = (str(tmp_path / name) for name in ("m.parquet", "log.parquet", "out"))
+    assert main([*WORDS, "--out", motion, "--json"]) == 0
+    robot = [WORDS[1], WORDS[2], WORDS[3]]
+    noisy = ["--rate", "100", "--torque-noise", "0.02", "--controller", "perfect"]
+    assert main(["simulate", robot[0], motion, *robot[1:], "--out", log, *noisy, "--json"]) == 0
+    plain = ["--estimator", "wls", "--friction", "viscous+coulomb", "--json"]
+    assert main(["identify", robot[0], log, *robot[1:], "--out", out, *plain]) == 0
+    capsys.readouterr()
+    assert main([*WORDS, "--out", motion, "--given", out]) == 0
+    assert "made for what the logs given know the least: " in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert main([*WORDS, "--out", motion, "--given", out, "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["criterion"] == "widest"
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    names = [entry["name"] for entry in result["base_parameters"]]
+    assert len(content["widest"]) == round(len(names) / 4)
+    assert set(content["widest"]) < set(names)
+    assert main([*WORDS, "--out", motion, "--given", out, "--criterion", "A", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["criterion"] == "A"
+    assert "widest" not in content
