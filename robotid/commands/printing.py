@@ -254,8 +254,9 @@ def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> s
 def _print_motion(content: dict[str, Any]) -> None:
     done = f"in {content['seconds']:.1f} s"
     if content["starts"]:
-        settled = "" if content["converged"] else "not "
-        done = f"{content['starts']} starts {done}, {settled}settled"
+        plural = "start" if content["starts"] == 1 else "starts"
+        done = f"{content['starts']} {plural} {done}, "
+        done += "settled" if content["converged"] else "not settled: more --seconds may improve it"
     condition = content["condition_number"]
     say(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "

@@ -59,7 +59,8 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "a motion of 4 s for 3 joints, condition number" in said
     assert "collision" not in said
-    assert "not settled" in said
+    assert "1 start in " in said
+    assert "not settled: more --seconds may improve it" in " ".join(said.split())
     assert (tmp_path / "motion.yaml").read_text().startswith("joint_names: [wrist_1_joint, ")
 
 
