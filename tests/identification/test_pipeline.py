@@ -210,7 +210,7 @@ def test_links_on_locked_joints_that_weigh_less_than_the_urdf_says_are_named():
         pi = model.standard_parameters()
         pi[10:20] *= share  # the hand alone has 0.53 of it by the URDF
         pi[20:] = 0.5
-        log = exact_log(model, pi, np.random.default_rng(0), samples=800, rate=100.0, noise=0.02)
+        log = exact_log(model, pi, np.random.default_rng(0), samples=400, rate=50.0, noise=0.02)
         found = identify(model, [log])
         costs.append([f.message for f in found.findings if f.code == "constraint_costs"])
     assert costs[1] == []
