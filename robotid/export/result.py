@@ -15,6 +15,7 @@ from robotid._files import file_sha256, read_json
 from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.export.commanded import CommandedDrive, commanded_drives
 from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
@@ -84,7 +85,8 @@ _SHAPE = {
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
-    "ranges?": {"robot": TEXT},
+    "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
+    "simulation?": {"controller": {"kind": TEXT}},
     "own_terms?": {...: [TABLE]},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
@@ -255,6 +257,11 @@ class Result:
     def parameters(self) -> Array:
         """Its standard parameters, shape (p,), SI units, in ``robot.layout.names`` order."""
         return self.identified[1]
+
+    @cached_property
+    def commanded(self) -> tuple[CommandedDrive, ...]:
+        """The drives that follow position commands, joint by joint; none without gains."""
+        return commanded_drives(*self.identified, self.content, self.path.name)
 
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
