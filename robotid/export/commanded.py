@@ -26,14 +26,14 @@ class CommandedDrive:
 
     The drive gives tau = kp (q_ref(t - delay) - q) - kd v, within +-effort_limit, and moves the
     bodies with tau - armature a - viscous v - coulomb sign(v) - offset. Its encoder reads
-    q = q_urdf + zero.
+    q = q_urdf - zero.
 
     Attributes:
         joint: Its name.
         kp: Torque per error [N m/rad or N/m].
         kd: Torque per speed [N m s/rad or N s/m].
         delay: How late a command acts [s].
-        zero: What the encoder reads at the URDF's zero [rad or m].
+        zero: Position of the URDF at which the encoder reads 0 [rad or m].
         armature: Inertia of the rotor behind its gear [kg m^2 or kg].
         viscous: Viscous friction [N m s/rad or N s/m].
         coulomb: Coulomb friction [N m or N].
@@ -60,7 +60,7 @@ def commanded_drives(
 ) -> tuple[CommandedDrive, ...]:
     """Return the drives of a result that has gains, joint by joint; none if it has no gains.
 
-    Limits are those of the controller, else those of the URDF.
+    Limits are those found, else those of the controller, else those of the URDF.
 
     Args:
         model: The identified robot.
@@ -98,7 +98,9 @@ def commanded_drives(
             stated[f"{limits.name}.kp"],
             **{key: stated.get(f"{limits.name}.{key}", 0.0) for key in _OF_CONTROLLER},
             **{key: found.get(f"{limits.name}.{key}", 0.0) for key in _OF_DRIVE},
-            effort_limit=efforts.get(limits.name) or _stated(limits.effort),
+            effort_limit=stated.get(f"{limits.name}.limit")
+            or efforts.get(limits.name)
+            or _stated(limits.effort),
             velocity_limit=_stated(limits.velocity),
         )
         for limits in model.limits

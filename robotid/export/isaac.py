@@ -101,7 +101,7 @@ def write_isaac(
     said = [*notes, *unstated_terms(model, pi, "Isaac Lab", _STATED)]
     for key, words in (
         ("offset", "the offset, which may be subtracted from the effort target"),
-        ("zero", "the encoder's zero, which the simulator's position and command are less by"),
+        ("zero", "the encoder's zero, which the simulator's position and command have more"),
     ):
         values = [f"{drive.joint} {x:.4g}" for drive in commanded if (x := getattr(drive, key))]
         if values:

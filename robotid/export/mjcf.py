@@ -216,10 +216,10 @@ def _add_motion(
         kind = "slide" if joint.type == "prismatic" else "hinge"
         at = {"name": joint.name, "type": kind, "axis": numbers_text(joint.axis)}
         zero = servos.of[joint.name].zero if joint.name in servos.of else 0.0
-        if zero:
-            at |= {"ref": numbers_text([zero]), "springref": numbers_text([zero])}
+        if zero:  # an encoder reads q_urdf - zero
+            at |= {"ref": numbers_text([-zero]), "springref": numbers_text([-zero])}
         if joint.has_limits:
-            at["range"] = numbers_text([joint.lower + zero, joint.upper + zero])
+            at["range"] = numbers_text([joint.lower - zero, joint.upper - zero])
         ET.SubElement(body, "joint", at | _drive(joint.name, values))
 
 

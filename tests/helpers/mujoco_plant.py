@@ -12,6 +12,7 @@ from mujoco import rollout
 from helpers.paths import URDF
 from robotid.export.commanded import CommandedDrive
 from robotid.export.mjcf import write_mjcf
+from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -57,16 +58,6 @@ class Plant:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """What a plant's log holds; arrays of shape (N, n)."""
-
-    t: np.ndarray  # shape (N,) [s]
-    q_ref: np.ndarray  # [rad]
-    q: np.ndarray  # as the encoders say [rad]
-    truth: dict[str, float]
-
-
 def plant(name, rng, **changes):
     """Return one of these robots with drives drawn about their usual values.
 
@@ -92,7 +83,7 @@ def plant(name, rng, **changes):
 
 
 def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4):
-    """Return the log of a multi-sine that a plant was commanded to follow.
+    """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
 
     Args:
         plant: The robot.
@@ -104,7 +95,9 @@ def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4):
     t = np.arange(round(duration * rate)) / rate
     q_ref = multisine(t, plant.middle, plant.reach, rng)
     q = followed(loaded(plant, rate), q_ref, rate)
-    return Recorded(t, q_ref, q + noise * rng.standard_normal(q.shape), plant.truth)
+    q = q + noise * rng.standard_normal(q.shape)
+    log = Log(t, q, np.zeros_like(q), plant.model.joints, q_ref=q_ref, has_torque=False)
+    return log, plant.truth
 
 
 def multisine(t, middle, reach, rng, lowest=0.1, highest=4.0):
