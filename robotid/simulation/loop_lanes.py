@@ -22,15 +22,16 @@ from robotid.regressor.lanes import add, compiled, cos_sin, cross, dot, into_chi
 
 __all__ = [
     "ARMATURE",
-    "COMMAND",
     "INERTIAL",
     "KD",
     "KP",
     "LANES",
     "LATE",
+    "LIMIT",
     "LOAD",
     "TERM",
     "ZERO",
+    "average_command",
     "roll_out",
     "work_size",
 ]
@@ -42,7 +43,7 @@ _NEWTON = 60  # steps, of which three or four are usual
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
 # kinds of sensitivities
-ARMATURE, KP, KD, TERM, COMMAND, LATE, ZERO, INERTIAL = range(8)
+ARMATURE, KP, KD, LIMIT, TERM, LATE, ZERO, INERTIAL = range(8)
 LOAD = 9  # code of the term that multiplies the load of the gear
 
 _R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
@@ -284,9 +285,7 @@ def _seed(work, own, joint, v, is_speed):
             bent = add(cross(tw, scale(rate, slide)), cross(tv, scale(rate, turn)))
             _put3(work, own + _TV, lane, tw)
             _put3(work, own + _TV + 3, lane, tv)
-            _put3(
-                work, own + _TA, lane, add(cross(dw, turn), cross(tw, scale(rate, turn)))
-            )
+            _put3(work, own + _TA, lane, add(cross(dw, turn), cross(tw, scale(rate, turn))))
             _put3(work, own + _TA + 3, lane, add(ta, bent))
 
 
@@ -366,8 +365,9 @@ def _derivatives(work, parents, joints, bodies, is_below, v, T, is_speed):
 
 
 @compiled
-def term(code, x0, x1, q, u):
+def term(code, shape, q, u):
     """Return what a term's parameter multiplies, and its derivatives by speed and position."""
+    x0, x1 = shape[0], shape[1]
     root = math.sqrt(u * u + _SIGN * _SIGN)
     s, s_u = u / root, _SIGN * _SIGN / (root * root * root)
     y, y_u, y_q = 1.0, 0.0, 0.0  # code 2: offset
@@ -376,8 +376,10 @@ def term(code, x0, x1, q, u):
     elif code == 0:  # viscous
         y, y_u = u, 1.0
     elif code == 3:  # coulomb times a power of the position
-        p = (q - x1) ** (x0 - 1.0)
-        y, y_u, y_q = s * p * (q - x1), s_u * p * (q - x1), s * x0 * p
+        seen = min(max(q, shape[2]), shape[3])  # beyond what the fit has seen it stays as it is
+        p = (seen - x1) ** (x0 - 1.0)
+        y, y_u = s * p * (seen - x1), s_u * p * (seen - x1)
+        y_q = s * x0 * p if seen == q else 0.0
     elif code == 4:  # stribeck, x0 the speed
         e = math.exp(-(root - _SIGN) / x0)
         y, y_u = s * e, (s_u - s * s / x0) * e
@@ -455,7 +457,7 @@ def _balance(work, n, at, drives, terms, step, command):
             speed, angle = _get(work, u + i, lane), _get(work, middle + i, lane)
             f, f_u, f_q, e, e_u = 0.0, 0.0, 0.0, 1.0, 0.0
             for k in range(first[i], first[i + 1]):
-                y, y_u, y_q = term(codes[k], shapes[k, 0], shapes[k, 1], angle, speed)
+                y, y_u, y_q = term(codes[k], shapes[k], angle, speed)
                 if codes[k] == LOAD:
                     side = math.copysign(values[k], tau)
                     e += side * y
@@ -535,15 +537,14 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                     x = -is_on * (command[j, 0, lane] - _get(work, q + j, lane) - span * speed)
                 elif kind == KD:
                     x = -is_on * (command[j, 2, lane] - speed)
-                elif kind == COMMAND:
-                    x = -is_on * kp
+                elif kind == LIMIT:
+                    asked = kp * (command[j, 0, lane] - _get(work, q + j, lane) - span * speed)
+                    asked += kd * (command[j, 2, lane] - speed) + command[j, 3, lane]
+                    x = 0.0 if is_on else math.copysign(1.0, -asked)
                 elif kind == LATE:
                     x = -is_on * (kp * command[j, 1, lane] + kd * command[j, 4, lane])
                 elif kind == TERM:
-                    x, _, _ = term(
-                        codes[index], shapes[index, 0], shapes[index, 1],
-                        _get(work, middle + j, lane), speed,
-                    )  # fmt: skip
+                    x, _, _ = term(codes[index], shapes[index], _get(work, middle + j, lane), speed)
                     x *= abs(_get(work, load + j, lane)) if codes[index] == LOAD else 1.0
                 _put(work, own + j, lane, x / _get(work, loss + j, lane))
         _advance_column(work, n, at, sweeps, drives, step, p, P)
@@ -622,7 +623,7 @@ def roll_out(
         gravity: Shape (3,) [m/s^2].
         drives: Armature, kp, kd and largest torque of each joint, shape (n, 4).
         codes: Kind of each term of friction, shape (T,), int.
-        shapes: What shapes it, shape (T, 2).
+        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4).
         values: Its parameter, shape (T,).
         first: Where the terms of a joint begin, shape (n + 1,), int.
         columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
@@ -691,3 +692,31 @@ def roll_out(
                     for p in range(P):
                         out_S[sample, i, p, lane] = _get(work, S + i * P + p, lane)
     return -1
+
+
+@compiled
+def average_command(stamps, values, times, delay, mean, change):
+    """Write what a drive is told on average over each step, and how that changes with the delay.
+
+    Args:
+        stamps: When each value is sent, shape (N,) [s]; it holds until the next.
+        values: Shape (N,).
+        times: Where the steps begin and end, shape (K + 1,) [s].
+        delay: How much later it acts [s].
+        mean: Shape (K,); written.
+        change: Derivative of the mean by the delay, shape (K,); written.
+    """
+    last, i = len(stamps) - 1, 0
+    begin = times[0] - delay
+    while i < last and stamps[i + 1] <= begin:
+        i += 1
+    for k in range(len(mean)):
+        end, before, at, total = times[k + 1] - delay, values[i], begin, 0.0
+        while i < last and stamps[i + 1] <= end:
+            total += values[i] * (stamps[i + 1] - at) if stamps[i + 1] > at else 0.0
+            at = max(at, stamps[i + 1])
+            i += 1
+        total += values[i] * (end - at)
+        mean[k] = total / (end - begin)
+        change[k] = (before - values[i]) / (end - begin)
+        begin = end
