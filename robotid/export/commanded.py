@@ -1,6 +1,6 @@
 """Drives that follow position commands, as an identification from commands found them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,10 @@ from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
+from robotid.simulation.loops import Loops
 
-__all__ = ["CommandedDrive", "commanded_drives", "with_mean_friction"]
+__all__ = ["CommandedDrive", "commanded_drives", "limit_of", "loops_of", "with_mean_friction"]
 
 _POSITIONS = 200  # at which friction that depends on the position is averaged
 #: Parameters of a joint's controller, 0 where a result has none.
@@ -38,8 +40,7 @@ class CommandedDrive:
         viscous: Viscous friction [N m s/rad or N s/m].
         coulomb: Coulomb friction [N m or N].
         offset: Constant torque [N m or N].
-        effort_limit: The most that it gives, inf if no limit is stated [N m or N].
-        velocity_limit: The fastest that it moves, inf if no limit is stated [rad/s or m/s].
+        effort_limit: The most that it gives, inf if the controller states none [N m or N].
     """
 
     joint: str
@@ -52,15 +53,12 @@ class CommandedDrive:
     coulomb: float
     offset: float
     effort_limit: float
-    velocity_limit: float
 
 
 def commanded_drives(
     model: RobotModel, pi: Array, content: Mapping[str, Any], name: str
 ) -> tuple[CommandedDrive, ...]:
     """Return the drives of a result that has gains, joint by joint; none if it has no gains.
-
-    Limits are those found, else those of the controller, else those of the URDF.
 
     Args:
         model: The identified robot.
@@ -94,17 +92,52 @@ def commanded_drives(
     found = dict(zip(model.layout.names, pi.tolist(), strict=True))
     return tuple(
         CommandedDrive(
-            limits.name,
-            stated[f"{limits.name}.kp"],
-            **{key: stated.get(f"{limits.name}.{key}", 0.0) for key in _OF_CONTROLLER},
-            **{key: found.get(f"{limits.name}.{key}", 0.0) for key in _OF_DRIVE},
-            effort_limit=stated.get(f"{limits.name}.limit")
-            or efforts.get(limits.name)
-            or _stated(limits.effort),
-            velocity_limit=_stated(limits.velocity),
+            joint,
+            stated[f"{joint}.kp"],
+            **{key: stated.get(f"{joint}.{key}", 0.0) for key in _OF_CONTROLLER},
+            **{key: found.get(f"{joint}.{key}", 0.0) for key in _OF_DRIVE},
+            effort_limit=stated.get(f"{joint}.limit") or efforts.get(joint, np.inf),
         )
-        for limits in model.limits
+        for joint in model.joints
     )
+
+
+def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> Loops:
+    """Return bodies, drives and loops as roll-outs take them.
+
+    Args:
+        model: The identified robot.
+        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        drives: Its drives; armature, friction and offset are those of pi.
+    """
+    layout, n = model.layout, model.layout.n_inertial
+    terms: list[list[DriveTerm]] = [[] for _ in drives]
+    values: list[list[float]] = [[] for _ in drives]
+    for (d, term), value in zip(layout.drive_parameters, pi[n:].tolist(), strict=True):
+        if not term.is_inertia:
+            terms[d].append(term)
+            values[d].append(value)
+    figures = {
+        key: np.array([getattr(drive, key) for drive in drives])
+        for key in ("armature", "kp", "kd", "delay", "zero")
+    }
+    return Loops(
+        bodies=pi[:n].reshape(-1, 10),
+        limit=np.array([drive.effort_limit for drive in drives]),
+        terms=tuple(map(tuple, terms)),
+        values=np.concatenate(values),
+        **figures,
+    )
+
+
+def limit_of(drive: CommandedDrive, joint: Joint) -> float:
+    """Return the most that a drive gives: the controller's limit, else the URDF's, else inf.
+
+    Args:
+        drive: The drive.
+        joint: Its joint as the URDF describes it.
+    """
+    return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)
 
 
 def with_mean_friction(model: RobotModel, pi: Array) -> tuple[Array, tuple[str, ...]]:
@@ -142,7 +175,3 @@ def _mean(term: DriveTerm) -> float:
     q = low + (high - low) * (np.arange(_POSITIONS) + 0.5) / _POSITIONS
     one = np.ones_like(q)
     return float(np.mean(term.column(DriveMotion(q, one, 0 * q, one, 0 * q, 0 * q))))
-
-
-def _stated(limit: float) -> float:
-    return limit if 0.0 < limit < np.inf else np.inf

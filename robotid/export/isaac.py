@@ -10,11 +10,12 @@ from typing import Any
 from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.commanded import CommandedDrive
+from robotid.export.commanded import CommandedDrive, limit_of
 from robotid.export.links import unstated_terms
 from robotid.export.yaml_text import yaml_text
 from robotid.findings import listed
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 from robotid.versions import __version__
 
 __all__ = ["isaac_actuators", "write_isaac"]
@@ -36,11 +37,14 @@ which Isaac Lab draws one for each robot at each reset. Friction is Coulomb's, a
 """
 
 
-def isaac_actuators(drives: Sequence[CommandedDrive], physics_dt: float) -> dict[str, Any]:
+def isaac_actuators(
+    model: RobotModel, commanded: Sequence[CommandedDrive], physics_dt: float
+) -> dict[str, Any]:
     """Return the groups of joints that have the same drives, as Isaac Lab's fields name them.
 
     Args:
-        drives: The drives.
+        model: The robot, whose URDF has limits of speeds and of what has no other limit.
+        commanded: The drives of its joints.
         physics_dt: Time step of the simulator, in which delays are counted [s].
 
     Returns:
@@ -53,14 +57,14 @@ def isaac_actuators(drives: Sequence[CommandedDrive], physics_dt: float) -> dict
     """
     if not 0 < physics_dt < math.inf:
         raise SettingsError(f"step is {physics_dt:g} s, wanted a positive time")
-    if not drives:
+    if not commanded:
         raise DataError(
             "the result has no gains of drives, which Isaac Lab's actuators need: identify a log "
             'with commands, with [controller] and [estimator] name = "simulation"'
         )
     groups: dict[str, tuple[dict[str, Any], list[str]]] = {}
-    for drive in drives:
-        fields = _fields(drive, physics_dt)
+    for drive, joint in zip(commanded, model.limits, strict=True):
+        fields = _fields(drive, joint, physics_dt)
         groups.setdefault(yaml_text(fields, ""), (fields, []))[1].append(drive.joint)
     actuators: dict[str, Any] = {}
     for fields, joints in groups.values():
@@ -97,7 +101,7 @@ def write_isaac(
         DataError: If there are no drives that follow commands, or the folder does not exist.
         SettingsError: If step is not positive, or the target is a folder.
     """
-    content = isaac_actuators(commanded, step)
+    content = isaac_actuators(model, commanded, step)
     said = [*notes, *unstated_terms(model, pi, "Isaac Lab", _STATED)]
     for key, words in (
         ("offset", "the offset, which may be subtracted from the effort target"),
@@ -111,12 +115,12 @@ def write_isaac(
     return tuple(said)
 
 
-def _fields(drive: CommandedDrive, physics_dt: float) -> dict[str, Any]:
+def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str, Any]:
     """Return the fields of one joint's actuator but for its name."""
     steps = drive.delay / physics_dt
     return {
-        "effort_limit": _limit(drive.effort_limit),
-        "velocity_limit": _limit(drive.velocity_limit),
+        "effort_limit": _limit(limit_of(drive, joint)),
+        "velocity_limit": _limit(joint.velocity),
         "stiffness": drive.kp,
         "damping": drive.kd,
         "armature": drive.armature,
@@ -129,7 +133,7 @@ def _fields(drive: CommandedDrive, physics_dt: float) -> dict[str, Any]:
 
 
 def _limit(value: float) -> float | None:
-    return value if value < math.inf else None
+    return value if 0 < value < math.inf else None
 
 
 def _group_name(joints: Sequence[str]) -> str:

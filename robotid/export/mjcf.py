@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.export.commanded import CommandedDrive
+from robotid.export.commanded import CommandedDrive, limit_of
 from robotid.export.links import WORLD, Format, SimulatedLink, own_drives, write_model
 from robotid.export.urdf import numbers_text
 from robotid.findings import listed
 from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 
 __all__ = ["DELAYS", "write_mjcf"]
 
@@ -87,16 +88,15 @@ class _Servos:
             said.append(f"delays below half a step are half a step: {listed(short)}")
         return said
 
-    def actuator(self, name: str, offset: float) -> dict[str, str]:
+    def actuator(self, joint: Joint, offset: float) -> dict[str, str]:
         """Return the attributes of a joint's actuator: kp (ctrl(t - delay) - q) - kd v - offset."""
-        drive = self.of[name]
+        drive = self.of[joint.name]
         at = {
             "gainprm": numbers_text([drive.kp, 0.0, 0.0]),
             "biastype": "affine",
             "biasprm": numbers_text([-offset, -drive.kp, -drive.kd]),
         }
-        if drive.effort_limit < np.inf:  # of the drive's torque, before the offset
-            limit = drive.effort_limit
+        if (limit := limit_of(drive, joint)) < np.inf:  # of the drive, before the offset
             at["forcerange"] = numbers_text([-limit - offset, limit - offset])
         if drive.delay and self.delay == "filter":
             at |= {"dyntype": "filterexact", "dynprm": numbers_text([drive.delay, 0.0, 0.0])}
@@ -273,7 +273,7 @@ def _add_drives(
             if joint == limits.name
         )
         if limits.name in servos.of:
-            at |= servos.actuator(limits.name, offset)
+            at |= servos.actuator(limits, offset)
         elif offset:
             at |= {"biastype": "affine", "biasprm": numbers_text([-offset, 0.0, 0.0])}
         ET.SubElement(actuators, "general" if "biastype" in at else "motor", at)

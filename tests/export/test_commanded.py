@@ -16,12 +16,14 @@ from helpers.mujoco_plant import LEG, ROBOTS, followed, loaded, multisine, plant
 
 from robotid.cli import main
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.commanded import with_mean_friction
+from robotid.export.commanded import loops_of, with_mean_friction
 from robotid.export.isaac import isaac_actuators
 from robotid.export.mjcf import write_mjcf
 from robotid.export.ranges import stated_ranges
 from robotid.export.result import load_result
 from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, cut_windows
 
 RATE = 200.0  # [Hz] of the commands
 CHIRP = Path(os.environ.get("ROBOTID_DATA", "/none")) / "commands" / "go2" / "chirp.parquet"
@@ -100,12 +102,12 @@ def test_a_delay_is_exact_to_a_step(late):
     data = mujoco.MjData(robot)
     forces = []
     for k in range(40):
-        data.ctrl[:] = k
+        data.ctrl[:] = 0.01 * k
         mujoco.mj_step(robot, data)
         data.qpos[:] = data.qvel[:] = 0.0
         forces.append(data.actuator_force[0])
-    lag = np.arange(40) - np.array(forces) / leg.drives[0].kp
-    np.testing.assert_allclose(lag[20:], max(late / step + 0.5, 1.0) if late else 0.0)
+    lag = np.arange(40) - 100 * np.array(forces) / leg.drives[0].kp
+    np.testing.assert_allclose(lag[20:], max(late / step + 0.5, 1.0) if late else 0.0, atol=1e-9)
 
 
 def test_a_filter_stands_for_the_delay_where_it_is_asked_for(tmp_path):
@@ -154,11 +156,7 @@ def test_the_drives_of_a_result_are_read(result):
     folder, leg = result
     found = load_result(folder).commanded
     for drive, wanted in zip(found, leg.drives, strict=True):
-        # limits: of the controller, else the URDF's
-        most = 21.0 if drive.joint == LEG[0] else {LEG[1]: 23.7, LEG[2]: 45.43}[drive.joint]
-        fastest = drive.velocity_limit
-        assert 10 < fastest < 40
-        assert drive == replace(wanted, effort_limit=most, velocity_limit=fastest)
+        assert drive == replace(wanted, effort_limit=21.0 if drive.joint == LEG[0] else np.inf)
 
 
 def test_impossible_drives_are_refused(result, tmp_path):
@@ -183,6 +181,20 @@ def test_impossible_drives_are_refused(result, tmp_path):
             _ = changed.commanded
     none = with_entries(lambda e: None if e["name"].endswith((".kp", ".kd")) else e)
     assert none.commanded == ()
+
+
+def test_mujoco_rolls_out_what_our_own_roll_out_does():
+    """The estimator's simulator and the exported file are one robot, on a log."""
+    leg = plant("leg", np.random.default_rng(4), zero=0.04, offset=0.1, effort_limit=4.0)
+    log, _ = recorded(leg, np.random.default_rng(5), duration=4.0, noise=0.0)
+    pi, names = leg.model.standard_parameters(), leg.model.layout.names
+    for drive in leg.drives:
+        for term in ("armature", "viscous", "coulomb", "offset"):
+            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
+    robot = LoopedRobot(leg.model, step=1e-3)
+    (found,) = robot.roll_out(loops_of(leg.model, pi, leg.drives), cut_windows(log, np.inf, 0.0))
+    assert np.abs(found.q - log.q).max() < 1e-3
+    assert np.abs(log.q - log.q_ref).max() > 0.05
 
 
 def export(folder, kind, target, capsys, *flags):
@@ -210,7 +222,9 @@ def test_mjcf_of_a_result_says_what_it_lacks(result, tmp_path, capsys):
     np.testing.assert_allclose(robot.actuator_gainprm[:, 0], [d.kp for d in leg.drives])
     bias = [[-0.1, -d.kp, -d.kd] for d in leg.drives]
     np.testing.assert_allclose(robot.actuator_biasprm[:, :3], bias)
-    np.testing.assert_allclose(robot.actuator_forcerange[0], [-21.1, 20.9])
+    np.testing.assert_allclose(
+        robot.actuator_forcerange, [[-21.1, 20.9], [-23.8, 23.6], [-45.53, 45.33]]
+    )  # of the controller, else the URDF
     np.testing.assert_allclose(robot.qpos0, -0.02)
     urdf = [[j.lower, j.upper] for j in leg.model.limits]
     np.testing.assert_allclose(robot.jnt_range, np.array(urdf) - 0.02)
@@ -250,14 +264,17 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
     text = (tmp_path / "a.yaml").read_text()
     assert "# Isaac Lab has no place for the offset" in text
     content = yaml.safe_load(text)
-    drives = load_result(folder).commanded
+    loaded_result = load_result(folder)
+    drives, model = loaded_result.commanded, loaded_result.robot
+    efforts = dict(zip(LEG, (21.0, 23.7, 45.43), strict=True))
+    speeds = {joint.name: joint.velocity for joint in model.limits}
     assert content["physics_dt"] == 0.002
     assert list(content["actuators"]) == list(LEG)
     for drive, (joint, group) in zip(drives, content["actuators"].items(), strict=True):
         assert group == {
             "joint_names_expr": [joint],
-            "effort_limit": pytest.approx(drive.effort_limit),
-            "velocity_limit": pytest.approx(drive.velocity_limit),
+            "effort_limit": efforts[joint],
+            "velocity_limit": speeds[joint],
             "stiffness": pytest.approx(drive.kp, rel=1e-5),
             "damping": pytest.approx(drive.kd, rel=1e-5),
             "armature": pytest.approx(drive.armature, rel=1e-5),
@@ -267,18 +284,30 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.5 steps
             "max_delay": 4 if joint != LEG[2] else 3,
         }
-    alike = [replace(drives[0], joint=f"{leg_name}_hip.joint") for leg_name in ("FL", "FR", "RL")]
-    groups = isaac_actuators([*alike, replace(drives[2], effort_limit=np.inf)], 0.0063)
-    hips, calf = groups["actuators"].values()
-    assert list(groups["actuators"]) == ["hip.joint", LEG[2]]
-    assert hips["joint_names_expr"] == [
-        rf"{leg_name}_hip\.joint" for leg_name in ("FL", "FR", "RL")
+
+
+def test_isaac_groups_are_of_equal_drives_with_whole_delays():
+    """Joints of four legs; their names are taken literally."""
+    quadruped = RobotModel.from_urdf(example_urdf("go2.urdf"))
+    (one, *_) = plant("leg", np.random.default_rng(0), delay=0.0063).drives
+    drives = [replace(one, joint=name, kp=2.0 if "calf" in name else 1.0)
+              for name in quadruped.joints]  # fmt: skip
+    groups = isaac_actuators(quadruped, drives, 0.0063)["actuators"]
+    assert list(groups) == ["joint", "calf_joint"]  # hips and thighs are alike
+    assert groups["calf_joint"]["joint_names_expr"] == [
+        f"{leg}_calf_joint" for leg in ("FL", "FR", "RL", "RR")
     ]
-    assert (hips["min_delay"], hips["max_delay"]) == (1, 1)  # a whole step is one
-    for late, step, whole in ((0.3, 0.1, 3), (0.035, 0.005, 7)):  # but for the last bit
-        (group,) = isaac_actuators([replace(alike[0], delay=late)], step)["actuators"].values()
-        assert group["min_delay"] == group["max_delay"] == whole
-    assert calf["effort_limit"] is None
+    for late, step, least, most in (
+        (0.0063, 0.0063, 1, 1), (0.3, 0.1, 3, 3), (0.035, 0.005, 7, 7), (0.0125, 0.005, 2, 3),
+    ):  # fmt: skip
+        own = [replace(drive, delay=late) for drive in drives]
+        group = isaac_actuators(quadruped, own, step)["actuators"]["calf_joint"]
+        assert (group["min_delay"], group["max_delay"]) == (least, most)
+    dotted = plant("planar", np.random.default_rng(0))
+    named = [replace(drive, joint=f"{drive.joint}.x") for drive in dotted.drives]
+    for group in isaac_actuators(dotted.model, named, 0.005)["actuators"].values():
+        assert group["joint_names_expr"][0].endswith(r"\.x")
+        assert group["velocity_limit"] is None or group["velocity_limit"] > 0
 
 
 def test_ranges_have_gains_delays_and_friction(result, tmp_path, capsys):
@@ -320,7 +349,7 @@ def test_options_of_other_formats_and_results_without_gains_are_refused(result, 
     assert code == 2
     assert "step is 0 s, wanted a positive time" in err
     with pytest.raises(DataError, match="the result has no gains of drives"):
-        isaac_actuators((), 0.005)
+        isaac_actuators(plant("leg", np.random.default_rng(0)).model, (), 0.005)
     assert not list(tmp_path.iterdir())
 
 

@@ -54,7 +54,7 @@ class Plant:
             f"{drive.joint}.{key}": value
             for drive in self.drives
             for key, value in asdict(drive).items()
-            if key not in ("joint", "effort_limit", "velocity_limit")
+            if key not in ("joint", "effort_limit")
         }
 
 
@@ -76,7 +76,7 @@ def plant(name, rng, **changes):
         drive = CommandedDrive(
             joint, kp=kp, kd=0.06 * kp * a, delay=0.006 * b, zero=0.0, armature=1e-3 * kp * c,
             viscous=5e-3 * kp * d, coulomb=0.01 * kp * e, offset=0.0,
-            effort_limit=np.inf, velocity_limit=np.inf,
+            effort_limit=np.inf,
         )  # fmt: skip
         drives.append(replace(drive, **changes))
     return Plant(model, tuple(drives), np.array(middle), np.array(reach))
