@@ -127,10 +127,10 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     motion = job.read(entry, model, needs="motion" if is_motion else "torque")
     robots = {label: stated_model(r, model) for label, r in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
-    second = None
+    ghosts = {}
     if ghost is not None:
         shadow = job.read(LogEntry(Path(ghost)), model, needs="motion")
-        second = (Path(ghost).name, shadow.t, shadow.q)
+        ghosts[Path(ghost).name] = (shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:
         used, said = _limits_used(job, motion, model)
@@ -140,7 +140,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         marks += _contacts(torques, model)
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     shown, q = model, motion.q
-    base = None if second else _base_poses(job, entry, motion)
+    base = None if ghosts else _base_poses(job, entry, motion)
     if base is not None:  # the same robot, whose first body is the trunk
         shown, q = _afloat(job, model), np.hstack([base, q])
         trunk = shown.standard_parameters()[:10]
@@ -152,7 +152,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         q,
         torques=torques,
         masses=masses or None,
-        ghost=second,
+        ghosts=ghosts,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=marks,
         notes=notes,

@@ -87,8 +87,8 @@ def test_two_results_are_called_by_their_folders(folder):
 
 def test_a_ghost_starts_with_the_motion(folder):
     _, data = run(folder, folder / "log.csv", "--ghost", folder / "log.csv")
-    assert data["ghost"]["label"] == "log.csv"
-    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+    assert data["ghosts"][0]["label"] == "log.csv"
+    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
 
 
 def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
@@ -97,7 +97,7 @@ def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
     cut = [",".join(line.split(",")[k] for k in kept) for line in (header, *rows)]
     (folder / "design.csv").write_text("\n".join(cut) + "\n")
     _, data = run(folder, folder / "log.csv", "--ghost", folder / "design.csv")
-    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
     cut[0] = cut[0].replace("q_elbow", "x_elbow")
     (folder / "design.csv").write_text("\n".join(cut) + "\n")
     assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1

@@ -55,7 +55,7 @@ def page(ur5, tmp_path_factory):
         ur5, T, q,
         torques=Torques(T, tau, {"fit": FIT}, NOISE),
         masses={"URDF": pi, "fit": heavier},
-        ghost=("designed </script>", T, q + 0.3),
+        ghosts={"designed </script>": (T, q + 0.3)},
         bands=Bands(T, ["elbow.m", "wrist.m"], ["kg", "kg"], theta, 0.1 + 0 * theta),
         marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2])],
     )  # fmt: skip
@@ -111,16 +111,16 @@ def test_the_robot_is_drawn_where_pinocchio_says(still, ur5):
     seen = still
     for row in (0, 130, 400):
         seen.page.evaluate(f"replay.seek({T[row]})")
-        for which, shift in (("robot", 0.0), ("ghost", 0.3)):
+        for which, shift in (("robot", 0.0), ("ghosts[0]", 0.3)):
             pin.forwardKinematics(ur5.pin_model, data, q[row] + shift)
             for M, drawn in zip(list(data.oMi), poses(seen, which), strict=True):
                 # keyframes are 1/30 s apart, and straight lines between them
                 np.testing.assert_allclose(drawn, M.homogeneous, atol=2e-3)
     shown = pixels(seen)
-    seen.page.evaluate("replay.robot.root.visible = replay.ghost.root.visible = false")
+    seen.page.evaluate("replay.robot.root.visible = replay.ghosts[0].root.visible = false")
     seen.page.evaluate("replay.viewer.set_dirty()")
     differs = np.abs(shown - pixels(seen)).max(axis=2) > 30
-    seen.page.evaluate("replay.robot.root.visible = replay.ghost.root.visible = true")
+    seen.page.evaluate("replay.robot.root.visible = replay.ghosts[0].root.visible = true")
     assert 0.01 < differs.mean() < 0.6
 
 
