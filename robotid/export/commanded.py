@@ -9,12 +9,20 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
+from robotid.logs.data import Log
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
-from robotid.simulation.loops import Loops
+from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
 
-__all__ = ["CommandedDrive", "commanded_drives", "limit_of", "loops_of", "with_mean_friction"]
+__all__ = [
+    "CommandedDrive",
+    "commanded_drives",
+    "follow_commands",
+    "limit_of",
+    "loops_of",
+    "with_mean_friction",
+]
 
 _POSITIONS = 200  # at which friction that depends on the position is averaged
 #: Parameters of a joint's controller, 0 where a result has none.
@@ -128,6 +136,33 @@ def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> 
         values=np.concatenate(values),
         **figures,
     )
+
+
+def follow_commands(
+    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], log: Log
+) -> Array:
+    """Return the positions that a robot takes on the commands of a log, in open loop.
+
+    It starts as the log does, and again after each gap.
+
+    Args:
+        model: The identified robot.
+        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        drives: Its drives.
+        log: The log, of its joints in its order, with commands.
+
+    Returns:
+        Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
+
+    Raises:
+        MissingDependencyError: If Numba is not installed.
+        NotConvergedError: If a step has no solution.
+        SettingsError: If a term of the drives cannot be rolled out.
+    """
+    robot, q = LoopedRobot(model), np.full_like(log.q, np.nan)
+    for out in robot.roll_out(loops_of(model, pi, drives), cut_windows(log, np.inf, 0.0)):
+        q[out.window.counted] = out.q
+    return q
 
 
 def limit_of(drive: CommandedDrive, joint: Joint) -> float:

@@ -24,7 +24,10 @@ function showRobot(time) {
   const row = motion.at(time);
   robot.pose(row);
   follow(row);
-  ghosts.forEach((ghost, k) => ghost.pose(ghostMotions[k].at(time)));
+  ghosts.forEach((ghost, k) => {
+    const own = ghostMotions[k].at(time); // how far it is from the robot may be shown larger
+    ghost.pose(boost === 1 ? own : own.map((x, i) => row[i] + boost * (x - row[i])));
+  });
   if (torques && torqueTable.rows.length) showArcs(torqueTable.at(time));
   viewer.set_dirty();
 }

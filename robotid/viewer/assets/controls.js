@@ -62,6 +62,8 @@ function drawSwitches() {
       made.label.classList.add("key");
       place.append(made.label);
     });
+    if (torques && !isTorque && !floats)
+      add(`ghosts ${BOOST} × as far away`, false, (on) => { boost = on ? BOOST : 1; shown = null; });
     if (floats) add("camera follows the robot", true, (on) => { follows = on; });
     add(`grid of ${cell} m`, true, (on) => { ground.visible = on; });
     add("frames", false, showFrames);

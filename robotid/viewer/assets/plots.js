@@ -39,7 +39,8 @@ function torqueRows(j) { // measured, predicted, and what the first prediction l
 }
 
 function drawTorques() {
-  const tones = torques.labels.map((_, k) => ["text", "predicted"][k] || `tone-${k + 1}`);
+  const tones = torques.labels.map((label, k) => ["text", "predicted"][k]
+    || (label === "commanded" ? "tone-5" : `tone-${k + 1}`));
   const marks = data.marks.map(({ t }) => t);
   const section = element("section", {}, element("h2", {}, isTorque ? "Torque" : "Position"));
   byId("plots").append(section);

@@ -111,6 +111,8 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
 
 const robot = viewer && new Robot("robot", (color, side) => new THREE.MeshLambertMaterial({ color, side }));
 const GHOSTS = ["#3b82f6", "#d9820f", "#3a9d5d"];
+const BOOST = 10;
+let boost = 1; // times that a ghost stands away from the robot
 const ghosts = !viewer ? [] : ghostMotions.map((_, k) => new Robot(`ghost ${k}`,
   () => new THREE.MeshPhongMaterial({ color: GHOSTS[k % GHOSTS.length], transparent: true,
     opacity: 0.3, depthWrite: false })));
