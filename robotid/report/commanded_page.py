@@ -297,13 +297,13 @@ def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: 
         Series("measured − commanded", (q - q_ref) / _SMALL, "tone-5", is_hidden=True),
         Series("measured − simulated", (q - q_sim) / _SMALL, "residual"),
     )
-    rmse = float(np.sqrt(np.mean((q - q_sim) ** 2))) / _SMALL
+    rmse = float(np.sqrt(np.nanmean((q - q_sim) ** 2))) / _SMALL
     kind = "kept apart" if log.is_kept else "fitted"
     above = Chart(
         f"position of {joint}", log.t, positions, "time [s]", f"position [{unit}]", link=link
     )
     below = Chart(
-        f"position of {joint} that is left", log.t, left, "time [s]", f"error [m{unit}]",
+        f"position error of {joint}", log.t, left, "time [s]", f"error [m{unit}]",
         link=link, height=110,
     )  # fmt: skip
     caption = f"{escape(log.name)}, {kind}: RMSE {rmse:.3g} m{unit}"
