@@ -24,8 +24,9 @@ __all__ = ["Box", "Clearance", "Contact", "Nearness"]
 
 _TRIED = 400  # random poses that say which links may meet at all
 _APART = 0.05  # [m] links that stay so far apart at all of them are looked at in the end alone
-_MADE_TO = 0.95  # share of the poses: links that are too near in so many are made to
-_ROOM = 5e-3  # [m] beyond the clearance that links must have to move at all
+_ALMOST_ALL = 0.95  # share of the poses
+_TOUCH = 1e-3  # [m] hulls nearer than this touch
+_ROOM = 5e-3  # [m] beyond the clearance: links that have no more are built near each other
 _THINNEST = 1e-3  # [m] a flat shape is as thick
 _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
@@ -57,12 +58,19 @@ class Contact:
         second: Name of the other.
         distance: Between their hulls, below 0 if they overlap [m].
         time: When [s].
+        kept: Distance that is to be kept between them [m].
     """
 
     first: str
     second: str
     distance: float
     time: float
+    kept: float = 0.0
+
+    @property
+    def margin(self) -> float:
+        """How much farther apart they stay than they have to [m]."""
+        return self.distance - self.kept
 
     def __str__(self) -> str:
         said = f"come to {1e3 * self.distance:.0f} mm" if self.distance > 0 else "overlap"
@@ -101,6 +109,11 @@ class _Hull:
 class Clearance:
     """What keeps a robot from hitting itself and what stands around it.
 
+    Links that a joint joins are not looked at. Of other links the hulls of two may touch where the
+    robot stands at zero and in 95 % of random poses: they are made to, and left alone. Links that
+    are built near each other, without room for the clearance in 95 % of the poses, but that come
+    apart, are watched at half the distance that they usually have.
+
     Args:
         model: The robot, with a fixed base.
         least: Distance that is to be kept [m].
@@ -111,9 +124,12 @@ class Clearance:
     Attributes:
         pairs: Numbers of the two hulls of each pair.
         likely: Which pairs may meet within the limits, shape (pairs,), bool.
+        kept: Distance that each pair is to keep, shape (pairs,) [m].
+        room: How much more than that pairs that are built near each other usually have, shape
+            (pairs,) [m]; inf of the others.
         unread: Links of which a shape cannot be read: nothing keeps them from hitting anything.
-        made_to: Links that are nearer, or within 5 mm of it, in almost every pose, by two, and are
-            left to it.
+        made_to: Links that are made to touch and left alone, by two, with their least distance.
+        built_near: Links that are built near each other, by two, with the distance they keep.
 
     Raises:
         DataError: If no link has a shape that can be read.
@@ -148,7 +164,7 @@ class Clearance:
             self._hulls.append(_hull(below.name, -1, _corners(below)))
         self._request = coal.DistanceRequest(True, True)
         self.pairs = self._possible_pairs()
-        self.likely = self._likely(np.random.default_rng(seed))
+        self._sort_out(np.random.default_rng(seed))
 
     def _possible_pairs(self) -> Array:
         """Return pairs that can move against each other: not links that a joint joins."""
@@ -162,22 +178,36 @@ class Clearance:
                 found.append((i, j))
         return np.array(found, dtype=int).reshape(-1, 2)
 
-    def _likely(self, rng: np.random.Generator) -> Array:
-        """Return which pairs may meet, by random poses; those that always do are taken out."""
+    def _sort_out(self, rng: np.random.Generator) -> None:
+        """Find by random poses which pairs may meet, are made to, or are built near each other."""
         low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
         high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
-        q = rng.uniform(low, high, (_TRIED, len(low)))
-        near = self.near(self.poses(q), self.least + _APART, self.everything)
-        distance = near.distance
+        q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
+        distance = self.near(self.poses(q), self.least + _APART, self.everything).distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
-        always: Array = (distance < self.least + _ROOM).mean(axis=1) > _MADE_TO
-        always &= is_link[self.pairs].all(axis=1)
-        names = self.named
-        self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
-        likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
-        self.pairs = self.pairs[~always]
-        kept: Array = likely[~always]
-        return kept
+        are_links = is_link[self.pairs].all(axis=1)
+        touch = distance < _TOUCH
+        always = are_links & touch[:, 0] & (touch.mean(axis=1) > _ALMOST_ALL)
+        self.made_to = self._listed(always, distance.min(axis=1))
+        self.pairs, distance, touch = self.pairs[~always], distance[~always], touch[~always]
+        near = (distance < self.least + _ROOM).mean(axis=1) > _ALMOST_ALL
+        near &= are_links[~always] & ~touch.all(axis=1)
+        self.kept, self.room = np.full(len(near), self.least), np.full(len(near), np.inf)
+        for k in np.flatnonzero(near):
+            usual = float(np.median(distance[k, ~touch[k]]))
+            self.kept[k] = min(self.least, usual / 2)
+            self.room[k] = usual - self.kept[k]
+        self.built_near = self._listed(near, self.kept)
+        self.likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
+
+    def _listed(self, chosen: Array, distance: Array) -> list[str]:
+        """Return the links of pairs and their least distances, in words, each two once."""
+        least: dict[tuple[str, str], float] = {}
+        for k in np.flatnonzero(chosen).tolist():
+            names = self.named[k]
+            least[names] = min(least.get(names, np.inf), float(distance[k]))
+        said = {k: f"overlap by {-1e3 * d:.0f}" if d < 0 else f"{1e3 * d:.3g}" for k, d in least.items()}
+        return [f"{a} and {b} ({words} mm)" for (a, b), words in said.items()]
 
     @cached_property
     def _supports(self) -> Array:
@@ -212,7 +242,8 @@ class Clearance:
 
         Args:
             poses: Where the bodies are at N instants.
-            within: Distance from which a lower bound will do, one or one per instant [m].
+            within: Distance from which a lower bound will do, one, or one per pair and instant,
+                shape (pairs, N) or one that broadcasts to it [m].
             chosen: Which pairs to look at, shape (pairs,), bool; those that may meet if None.
         """
         import coal
@@ -224,10 +255,10 @@ class Clearance:
         bound = np.full((len(self.pairs), centres.shape[1]), np.inf)
         gap = np.linalg.norm(centres[i[chosen]] - centres[j[chosen]], axis=2)
         bound[chosen] = gap - (radii[i] + radii[j])[chosen, None]
-        pairs, samples = np.nonzero(bound < within)
-        limit = np.broadcast_to(within, len(gap[0]))[samples]
+        limit = np.broadcast_to(within, bound.shape)
+        pairs, samples = np.nonzero(bound < limit)
         bound[pairs, samples] = self._box_bound(centres, turns, self.pairs[pairs], samples)
-        is_near = bound[pairs, samples] < limit
+        is_near = bound[pairs, samples] < limit[pairs, samples]
         pairs, samples = pairs[is_near], samples[is_near]
         witness = np.empty((2, len(pairs), 3))
         normals, result = np.empty((len(pairs), 3)), coal.DistanceResult()
@@ -247,7 +278,7 @@ class Clearance:
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
-        """Return where a motion comes nearest to a collision, between any samples, too.
+        """Return where a motion has the least margin to a collision, between any samples, too.
 
         An interval of time is halved until no two hulls can come nearer within it, by what the
         joints between them can still move them, than by 1 mm what has been seen elsewhere.
@@ -257,13 +288,13 @@ class Clearance:
             duration: Its length [s].
 
         Returns:
-            The nearest pair with a lower bound of its distance; None if nothing comes nearer than
-            5 cm beyond the clearance.
+            The pair with the least margin, by a lower bound of its distance; None if all of them
+            keep 5 cm more than they have to.
 
         References:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
         """
-        seen = self.least + _APART
+        seen, kept = _APART, self.kept[:, None]  # seen: the least margin so far
         lowest: Contact | None = None
         h = duration / max(2, round(duration / _FIRST)) / 2
         middles = np.arange(h, duration, 2 * h)
@@ -273,16 +304,17 @@ class Clearance:
             q, v, _ = motion.evaluate(middles)
             way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
             moved = self._levers @ way.T  # (pairs, N)
-            near = self.near(self.poses(q), seen + moved.max(axis=0), self.everything)
-            exact = near.distance[near.pairs, near.samples]
+            near = self.near(self.poses(q), kept + seen + moved, self.everything)
+            exact = near.distance[near.pairs, near.samples] - self.kept[near.pairs]
             seen = min(seen, exact.min(initial=np.inf))
-            bound = near.distance - moved
+            bound = near.distance - kept - moved
             is_open = (bound < seen - _SURE).any(axis=0) & (2 * h > _SHORTEST)
             closed = np.where(is_open, np.inf, bound)
             pair, sample = np.unravel_index(np.argmin(closed), closed.shape)
             found = float(closed[pair, sample])
-            if found < (seen if lowest is None else lowest.distance):
-                lowest = Contact(*self.named[pair], found, float(middles[sample]))
+            if found < (seen if lowest is None else lowest.margin):
+                own = float(self.kept[pair])
+                lowest = Contact(*self.named[pair], found + own, float(middles[sample]), own)
             h /= 2
             middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
         return lowest

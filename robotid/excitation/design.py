@@ -27,6 +27,7 @@ from robotid.identification.previews import (
     assumed_parameters,
     largest_torques,
 )
+from robotid.regressor.adjoint import Poses
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -46,13 +47,16 @@ _GROWTH = 3.0  # of that from one round to the next
 _SETTLED = 1e-3  # change of the criterion below which a design has converged
 _LOST = 0.02  # of the criterion that may be lost where a motion is made to keep its limits
 _OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
-_HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
+_TRIALS = 10  # of shares of a motion, until the largest that keeps the limits is known ...
+_SHARE = 1e-3  # ... to within this, or as near to a limit
 _SPARE = 0.003  # of limits that a design leaves for what lies between its instants
 _SPARE_WAY = 0.002  # [m] the same of distances
-_NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part in the design
+_SPARE_ROOM = 0.25  # of the room that links have which are built near each other: at most that
+_SEEN = 0.01  # [m] short of which distances are reckoned where a motion is made to keep them
 _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
-_TRIED = 200  # random postures until one is found that the robot can rest in
+_TRIED = 200  # random postures until one is found that the robot can rest in ...
+_AT_ONCE = 10  # ... so many at a time
 _STARTED = 10  # random motions of which the best is a start
 
 
@@ -204,7 +208,7 @@ class Designer:
         done = 0
         while done < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
-            begin = min(random, key=lambda C: self._looked_at(C)[0])
+            begin = min(random, key=self._objective)
             follow(self, begin, _ROUNDS, _Multipliers(_WEIGHT / self._functions.shape[1]))
             done += 1
         chosen, best = best, _Best()
@@ -227,7 +231,7 @@ class Designer:
             C: Coefficients of a motion, shape (h, n).
         """
         C, contact = self._clear(self._feasible(C, 1.0))
-        _, used, _, rows = self._looked_at(C)
+        used, _, rows = self._kept(C)
         motion = DesignedMotion(self.basis, C)
         information = self.matrix(rows)
         return self._weighed(motion, self.basis.duration, information, used, contact)
@@ -277,9 +281,9 @@ class Designer:
         """
         if self.clearance is None:
             return C, None
-        for _ in range(_HALVINGS):
+        for _ in range(_TRIALS):
             contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
-            if contact is None or contact.distance >= self.clearance.least:
+            if contact is None or contact.margin >= 0.0:
                 return C, contact
             C = _scaled(C, 0.99)
         raise NotConvergedError(
@@ -313,16 +317,36 @@ class Designer:
         F: Array = flat @ flat.T + self.known
         return F
 
-    def _looked_at(self, C: Array) -> tuple[float, Array, float, MotionRows]:
-        """Return criterion, shares of limits used (6, N, n), least distance and rows."""
+    @cached_property
+    def _spare(self) -> Array:
+        """What is left of distances for what lies between instants, shape (pairs, 1) [m]."""
+        if self.clearance is None:
+            return np.zeros((0, 1))
+        return np.minimum(_SPARE_WAY, _SPARE_ROOM * self.clearance.room)[:, None]
+
+    def _kept(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
+        """Return shares of limits used (6, N, n), the least margin of distances and rows.
+
+        Args:
+            C: Coefficients of a motion, shape (h, n).
+            spare: How many times what distances spare is taken off the margin.
+        """
         q, v, a, jerk = self._functions @ C
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
-        distance = np.inf
-        if self.clearance is not None:
-            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-            distance = float(near.distance.min(initial=np.inf))
-        return criterion(self.name, self.matrix(rows))[0], used, distance, rows
+        return used, float(self._margins(rows.state, spare).min(initial=np.inf)), rows
+
+    def _margins(self, poses: Poses, spare: float) -> Array:
+        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm."""
+        if self.clearance is None:
+            return np.zeros((0, poses.p.shape[2]))
+        kept = self.clearance.kept[:, None] + spare * self._spare
+        return self.clearance.near(poses, kept + _SEEN).distance - kept
+
+    def _objective(self, C: Array) -> float:
+        """Return the criterion of a motion."""
+        q, v, a, _ = self._functions @ C
+        return criterion(self.name, self.matrix(self.information.rows(q, v, a)))[0]
 
     def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
         """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
@@ -343,8 +367,9 @@ class Designer:
         by_torque = by_torque + by_power * v
         value += cost
         if self.clearance is not None:
-            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-            cost, pushed = multipliers.of_distances(near.distance, self.clearance.least)
+            aim = self._aim
+            near = self.clearance.near(rows.state, multipliers.reach(aim))
+            cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
             along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
@@ -354,6 +379,13 @@ class Designer:
         by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
         gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
         return value, gradient
+
+    @property
+    def _aim(self) -> Array:
+        """Distances that the search aims at, shape (pairs, 1) [m]."""
+        if self.clearance is None:
+            return self._spare
+        return self.clearance.kept[:, None] + 2.0 * self._spare
 
     def random(self, rng: np.random.Generator) -> Array:
         """Return the coefficients of a random motion that keeps the limits, shape (h, n).
@@ -366,7 +398,7 @@ class Designer:
         """
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
-        C[0] = self.postures(rng)[0]
+        C[0] = self._posture(rng)
         return self._feasible(C, 1.0 - _SPARE)
 
     def postures(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
@@ -379,13 +411,26 @@ class Designer:
         Raises:
             SettingsError: If none of them does.
         """
-        reach = rng.uniform(-0.8, 0.8, (tried, len(self.limits.middle)))
-        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
-        q = self.limits.middle + reach * self.limits.sizes[0]
+        q = self._drawn(rng, tried)
         kept: Array = q[self.can_rest(q)]
         if not len(kept):
             raise SettingsError(self._why_not(*self._at_rest(q)))
         return kept
+
+    def _posture(self, rng: np.random.Generator) -> Array:
+        """Return the first of ``postures``, which are tried a few at a time, shape (n,)."""
+        for _ in range(_TRIED // _AT_ONCE):
+            q = self._drawn(rng, _AT_ONCE)
+            kept: Array = q[self.can_rest(q)]
+            if len(kept):
+                return kept[0]
+        return self.postures(rng)[0]
+
+    def _drawn(self, rng: np.random.Generator, count: int) -> Array:
+        """Return random postures, shape (count, n) [rad or m]."""
+        reach = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
+        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
+        return self.limits.middle + reach * self.limits.sizes[0]
 
     def can_rest(self, q: Array) -> Array:
         """Return whether postures keep limits and distances at rest, shape (N,), bool.
@@ -393,23 +438,19 @@ class Designer:
         Args:
             q: Postures, shape (N, n) [rad or m].
         """
-        used, distance = self._at_rest(q)
-        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
-        can: Array = (used.max(axis=(0, 2)) <= 1.0) & (distance >= least)
+        used, margins = self._at_rest(q)
+        is_clear = (margins >= 0.0).all(axis=0)
+        can: Array = (used.max(axis=(0, 2)) <= 1.0) & is_clear
         return can
 
     def _at_rest(self, q: Array) -> tuple[Array, Array]:
-        """Return the shares of limits that postures use, (6, N, n), and least distances, (N,)."""
+        """Return shares of limits that postures use, (6, N, n), and margins, (pairs, N) [m]."""
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
-        distance = np.full(len(q), np.inf)
-        if self.clearance is not None:
-            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-            distance = near.distance.min(axis=0, initial=np.inf)
-        return used, distance
+        return used, self._margins(rows.state, 1.0)
 
-    def _why_not(self, used: Array, distance: Array) -> str:
+    def _why_not(self, used: Array, margins: Array) -> str:
         """Return which limit leaves no posture, and by how much."""
         least = used.min(axis=1)  # (6, n)
         kind, joint = np.unravel_index(int(np.argmax(least)), least.shape)
@@ -421,11 +462,16 @@ class Designer:
                 f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
                 "load that it carries"
             )
+        if self.clearance is None:
+            return f"{tried}: each needs more than a limit allows"
+        best = int(np.argmax(margins.min(axis=0)))
+        pair = int(np.argmin(margins[:, best]))
+        wanted = float(self.clearance.kept[pair] + self._spare[pair, 0])
+        first, second = self.clearance.named[pair]
         return (
-            f"{tried}: the nearest links or obstacles are at most "
-            f"{1e3 * float(distance.max()):.0f} mm apart, wanted "
-            f"{1e3 * (self.clearance.least if self.clearance else 0.0):.0f} mm; lower the "
-            "clearance, or move the floor and the boxes"
+            f"{tried}: in the best of them {first} and {second} are "
+            f"{1e3 * (float(margins[pair, best]) + wanted):.1f} mm apart, wanted "
+            f"{1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the boxes"
         )
 
     def _feasible(self, C: Array, most: float) -> Array:
@@ -449,16 +495,19 @@ class Designer:
             C: Where it ends.
             most: Share of the limits that may be used.
         """
-        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
-        low, high = 0.0, 1.0
-        for k in range(_HALVINGS):
-            share = 1.0 if k == 0 else (low + high) / 2
-            _, used, distance, _ = self._looked_at(kept + share * (C - kept))
-            is_kept = np.abs(used).max() <= most and distance >= least
-            low, high = (share, high) if is_kept else (low, share)
-            if low == 1.0:
+        way, low, high, share = C - kept, 0.0, 1.0, 1.0
+        under, over = -1.0, np.inf  # by how much limits are broken at both
+        for _ in range(_TRIALS):
+            used, margin, _ = self._kept(kept + share * way, 1.0)
+            broken = max(float(np.abs(used).max()) / most - 1.0, -margin / _SOFT)
+            if broken <= 0.0:
+                low, under, over = share, broken, over / 2
+            else:
+                high, over, under = share, broken, under / 2
+            if low == 1.0 or high - low < _SHARE or (low > 0.0 and under > -_SHARE):
                 break
-        return kept + low * (C - kept)
+            share = low + (high - low) * np.clip(under / (under - over), 0.02, 0.98)
+        return kept + low * way
 
     def _search(
         self,
@@ -471,7 +520,6 @@ class Designer:
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
-        least = -np.inf if self.clearance is None else self.clearance.least
         C = kept = start
 
         def scaled(x: Array) -> tuple[float, Array]:
@@ -480,7 +528,7 @@ class Designer:
             value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
             return value, (gradient * unit).reshape(-1)
 
-        before = self._looked_at(start)[0]
+        before = self._objective(start)
         yield start, before, False
         for _ in range(rounds):
             try:
@@ -494,17 +542,18 @@ class Designer:
             except _OutOfTime:
                 return
             C = found.x.reshape(C.shape) * unit
-            own, used, distance, rows = self._looked_at(C)
+            used, margin, rows = self._kept(C)
+            own = criterion(self.name, self.matrix(rows))[0]
             multipliers.raise_by(used)
             if self.clearance is not None:
-                near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-                multipliers.raise_by_distances(near.distance, self.clearance.least)
-            is_near = np.abs(used).max() < _OVER and distance >= least
+                near = self.clearance.near(rows.state, multipliers.reach(self._aim))
+                multipliers.raise_by_distances(near.distance, self._aim)
+            is_near = np.abs(used).max() < _OVER and margin >= 0.0
             best, kept = kept, self._feasible(C, 1.0 - _SPARE)
-            objective = self._looked_at(kept)[0]
+            objective = self._objective(kept)
             if objective > before - _SETTLED:
                 kept = self._towards(best, C, 1.0 - _SPARE)
-                objective = self._looked_at(kept)[0]
+                objective = self._objective(kept)
             is_near &= objective - own < _LOST
             is_settled = abs(before - objective) < _SETTLED and is_near
             if not is_near and objective > before - _LOST:
@@ -562,9 +611,13 @@ class _Multipliers:
         """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
         return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self._limits)
 
-    def of_distances(self, distance: Array, least: float) -> tuple[float, Array]:
+    def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
         """Return the cost of distances and its slope by what they are short, shape (pairs, N)."""
-        return self._cost((least + 2 * _SPARE_WAY - distance) / _SOFT, self._distances)
+        return self._cost((aim - distance) / _SOFT, self._distances)
+
+    def reach(self, aim: Array) -> Array:
+        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m]."""
+        return aim + _SOFT / self.weight * self._distances
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
         pushed = np.maximum(0.0, multipliers + self.weight * over)
@@ -575,9 +628,9 @@ class _Multipliers:
         """Take the slopes as the new multipliers."""
         self._limits = self.of_limits(used)[1]
 
-    def raise_by_distances(self, distance: Array, least: float) -> None:
+    def raise_by_distances(self, distance: Array, aim: Array) -> None:
         """Take the slopes as the new multipliers."""
-        self._distances = self.of_distances(distance, least)[1]
+        self._distances = self.of_distances(distance, aim)[1]
 
 
 def _scaled(C: Array, share: float | Array) -> Array:
