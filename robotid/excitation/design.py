@@ -40,11 +40,13 @@ _PER_PERIOD = 20  # instants within the shortest period of a basis that a design
 _POLISHED = 2  # times as many that its last rounds look at ...
 _FINER = 10  # ... and at which its limits are checked in the end
 _ROUNDS = 14  # of the augmented Lagrangian ...
-_LAST_ROUNDS = 4  # ... and on the finer grid
+_LAST_ROUNDS = 8  # ... and on the finer grid
 _STEPS = 20  # of L-BFGS in each
 _WEIGHT = 3.0  # of what is violated at all instants together, at first
 _GROWTH = 3.0  # of that from one round to the next
-_SETTLED = 1e-3  # change of the criterion below which a design has converged
+_LESS = 0.25  # of what a round broke: more weight is put on it if the next one breaks more
+_NEARLY = 1e-2  # change of the criterion from which on the finer grid is used ...
+_SETTLED = 2e-3  # ... and below which a design has converged
 _LOST = 0.02  # of the criterion that may be lost where a motion is made to keep its limits
 _OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
 _TRIALS = 10  # of shares of a motion, until the largest that keeps the limits is known ...
@@ -186,41 +188,41 @@ class Designer:
         Raises:
             SettingsError: If the robot cannot even rest within its limits.
         """
-        begun = time.monotonic()
+        begun, best = time.monotonic(), np.inf
         history: list[tuple[float, float]] = []
-        best = _Best()
+        followed: list[_State] = []
 
         def is_over() -> bool:
-            return best.coefficients is not None and time.monotonic() - begun > seconds
+            return bool(history) and time.monotonic() - begun > seconds
 
-        def follow(designer: Designer, C: Array, rounds: int, held: _Multipliers) -> bool:
-            """Follow a start; return whether it settled."""
-            is_settled = False
-            search = designer._search(C, rounds, is_over, held)
-            for kept, objective, is_settled in search:  # noqa: B007
-                if objective < best.objective:
-                    best.coefficients, best.objective, best.multipliers = kept, objective, held
-                    history.append((time.monotonic() - begun, objective))
+        def follow(designer: Designer, state: _State, rounds: int, settled: float) -> _State:
+            """Return what a start leads to."""
+            nonlocal best
+            for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
+                if state.objective < best:
+                    best = state.objective
+                    history.append((time.monotonic() - begun, best))
                 if progress is not None:
-                    progress(done, best.objective)
-            return is_settled
+                    progress(len(followed), best)
+            return state
 
-        done = 0
-        while done < starts and not is_over():
+        while len(followed) < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
-            begin = min(random, key=self._objective)
-            follow(self, begin, _ROUNDS, _Multipliers(_WEIGHT / self._functions.shape[1]))
-            done += 1
-        chosen, best = best, _Best()
-        fine = replace(self, finer=_POLISHED * self.finer)
-        begin = fine._feasible(chosen.of(), 1.0 - _SPARE)
-        is_settled = follow(fine, begin, _LAST_ROUNDS, chosen.multipliers.finer(_POLISHED))
-        found = replace(self, finer=_FINER * self.finer).checked(best.of())
+            objective, k = min((self._objective(C), k) for k, C in enumerate(random))
+            held = _Multipliers(_WEIGHT / self._functions.shape[1])
+            begin = _State(random[k], objective, random[k], held)
+            followed.append(follow(self, begin, _ROUNDS, _NEARLY))
+        chosen = min(followed, key=lambda state: state.objective)
+        fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
+        kept, held = fine._feasible(chosen.kept, 1.0 - _SPARE), chosen.multipliers.finer(_POLISHED)
+        begin = _State(kept, fine._objective(kept), chosen.away, held)
+        polished = follow(fine, begin, _LAST_ROUNDS, _SETTLED)
+        found = replace(self, finer=_FINER * self.finer).checked(polished.kept)
         return replace(
             found,
             seconds=time.monotonic() - begun,
-            starts=done,
-            is_converged=is_settled,
+            starts=len(followed),
+            is_converged=polished.is_settled,
             history=tuple(history),
         )
 
@@ -510,59 +512,70 @@ class Designer:
         return kept + low * way
 
     def _search(
-        self,
-        start: Array,
-        rounds: int,
-        is_over: Callable[[], bool],
-        multipliers: "_Multipliers",
-    ) -> Iterator[tuple[Array, float, bool]]:
-        """Yield motions that keep the limits, their criterion, and whether the search settled."""
+        self, state: "_State", rounds: int, settled: float, is_over: Callable[[], bool]
+    ) -> Iterator["_State"]:
+        """Yield where a search stands, at first and after each round, until it has settled."""
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
-        C = kept = start
+        before = np.inf  # by how much limits were broken
 
         def scaled(x: Array) -> tuple[float, Array]:
             if is_over():
                 raise _OutOfTime
-            value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
+            value, gradient = self._lagrangian(x.reshape(-1, len(unit)) * unit, state.multipliers)
             return value, (gradient * unit).reshape(-1)
 
-        before = self._objective(start)
-        yield start, before, False
+        yield state
         for _ in range(rounds):
             try:
                 found = minimize(
                     scaled,
-                    (C / unit).reshape(-1),
+                    (state.away / unit).reshape(-1),
                     jac=True,
                     method="L-BFGS-B",
                     options={"maxiter": _STEPS, "maxcor": 20},
                 )
             except _OutOfTime:
                 return
-            C = found.x.reshape(C.shape) * unit
-            used, margin, rows = self._kept(C)
-            own = criterion(self.name, self.matrix(rows))[0]
-            multipliers.raise_by(used)
-            if self.clearance is not None:
-                near = self.clearance.near(rows.state, multipliers.reach(self._aim))
-                multipliers.raise_by_distances(near.distance, self._aim)
-            is_near = np.abs(used).max() < _OVER and margin >= 0.0
-            best, kept = kept, self._feasible(C, 1.0 - _SPARE)
-            objective = self._objective(kept)
-            if objective > before - _SETTLED:
-                kept = self._towards(best, C, 1.0 - _SPARE)
-                objective = self._objective(kept)
-            is_near &= objective - own < _LOST
-            is_settled = abs(before - objective) < _SETTLED and is_near
-            if not is_near and objective > before - _LOST:
-                C = kept  # the way from there leads farther
-            yield kept, objective, is_settled
-            if is_settled:
+            state, broken = self._judged(state, found.x.reshape(-1, len(unit)) * unit, settled)
+            if broken > _LESS * before:
+                state = replace(state, multipliers=state.multipliers.heavier())
+            before = broken
+            yield state
+            if state.is_settled:
                 return
-            before = objective
-            multipliers.weight *= _GROWTH
+
+    def _judged(self, state: "_State", C: Array, settled: float) -> tuple["_State", float]:
+        """Return where a search stands after a round, and by how much a limit is broken.
+
+        Args:
+            state: Where it stood before.
+            C: Where the round has led.
+            settled: Change of the criterion below which it has settled.
+        """
+        used, margin, rows = self._kept(C)
+        own = criterion(self.name, self.matrix(rows))[0]
+        held = state.multipliers
+        distance = None
+        if self.clearance is not None:
+            distance = self.clearance.near(rows.state, held.reach(self._aim)).distance
+        kept = self._feasible(C, 1.0 - _SPARE)
+        objective = self._objective(kept)
+        if objective > state.objective - settled:
+            mixed = self._towards(state.kept, C, 1.0 - _SPARE)
+            objective, kept = min(
+                [(objective, kept), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
+            )
+        gain = state.objective - objective
+        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - own < _LOST
+        is_lost = not is_near and gain < _LOST  # the way from what keeps the limits leads farther
+        if gain < 0.0:
+            kept, objective = state.kept, state.objective
+        broken = max(float(np.abs(used).max()) - 1.0 + _SPARE, -margin / _SOFT, 0.0)
+        held = held.raised(used, distance, self._aim)
+        is_settled = bool(is_near and gain < settled)
+        return _State(kept, objective, kept if is_lost else C, held, is_settled), broken
 
 
 def _gravity(model: RobotModel) -> Array:
@@ -578,59 +591,69 @@ class _OutOfTime(Exception):
     """The time of a design is over."""
 
 
-class _Best:
-    """The best motion so far."""
-
-    coefficients: Array | None = None
-    objective: float = np.inf
-    multipliers: "_Multipliers"
-
-    def of(self) -> Array:
-        """Return its coefficients."""
-        if self.coefficients is None:
-            raise NotConvergedError("no motion was looked at", "max_iterations")
-        return self.coefficients
-
-
+@dataclass(frozen=True, eq=False)
 class _Multipliers:
-    """Multipliers of the limits at each instant, and of distances."""
+    """Multipliers of the limits at each instant, and of distances.
 
-    def __init__(self, weight: float) -> None:
-        self.weight = weight
-        self._limits: Array | float = 0.0
-        self._distances: Array | float = 0.0
+    Attributes:
+        weight: Of what is violated.
+        limits: Shape (6, N, n); 0 at first.
+        distances: Shape (pairs, N).
+    """
+
+    weight: float
+    limits: Array | float = 0.0
+    distances: Array | float = 0.0
 
     def finer(self, times: int) -> "_Multipliers":
         """Return the same on a grid of as many times the instants."""
-        fine = _Multipliers(self.weight / times)
-        fine._limits = _between(self._limits, times)
-        fine._distances = _between(self._distances, times)
-        return fine
+        limits, distances = _between(self.limits, times), _between(self.distances, times)
+        return _Multipliers(self.weight / times, limits, distances)
+
+    def heavier(self) -> "_Multipliers":
+        """Return the same with more weight."""
+        return replace(self, weight=_GROWTH * self.weight)
+
+    def raised(self, used: Array, distance: Array | None, aim: Array) -> "_Multipliers":
+        """Return the slopes as the new multipliers."""
+        distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
+        return replace(self, limits=self.of_limits(used)[1], distances=distances)
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
         """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
-        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self._limits)
+        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self.limits)
 
     def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
         """Return the cost of distances and its slope by what they are short, shape (pairs, N)."""
-        return self._cost((aim - distance) / _SOFT, self._distances)
+        return self._cost((aim - distance) / _SOFT, self.distances)
 
     def reach(self, aim: Array) -> Array:
         """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m]."""
-        return aim + _SOFT / self.weight * self._distances
+        return aim + _SOFT / self.weight * self.distances
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
         pushed = np.maximum(0.0, multipliers + self.weight * over)
         cost = float(np.sum(pushed**2 - np.square(multipliers))) / (2 * self.weight)
         return cost, pushed
 
-    def raise_by(self, used: Array) -> None:
-        """Take the slopes as the new multipliers."""
-        self._limits = self.of_limits(used)[1]
 
-    def raise_by_distances(self, distance: Array, aim: Array) -> None:
-        """Take the slopes as the new multipliers."""
-        self._distances = self.of_distances(distance, aim)[1]
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where a search stands.
+
+    Attributes:
+        kept: Coefficients of the best motion that keeps the limits, shape (h, n).
+        objective: Its criterion.
+        away: Where the search goes on; it may break limits.
+        multipliers: Those of the limits.
+        is_settled: Whether more rounds change nothing.
+    """
+
+    kept: Array
+    objective: float
+    away: Array
+    multipliers: _Multipliers
+    is_settled: bool = False
 
 
 def _scaled(C: Array, share: float | Array) -> Array:
