@@ -32,6 +32,7 @@ _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
 _SURE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
+_SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ class _Hull:
     centre: Array
     radius: float
     half: Array  # of the box around it, in that frame, shape (3,)
+    corners: Array  # about the centre, shape (k, 3)
     shape: Any  # of coal, about the centre
 
 
@@ -120,6 +122,8 @@ class Clearance:
         floor: Height below which nothing that moves may go, in the frame of the root link [m].
         boxes: What stands around the robot.
         seed: Of the random poses that say which links may meet.
+        is_fast: Whether hulls that are far enough apart are left out by compiled code, which needs
+            the extra ``fast``; what is near has the same distances.
 
     Attributes:
         pairs: Numbers of the two hulls of each pair.
@@ -144,12 +148,14 @@ class Clearance:
         floor: float | None = None,
         boxes: Sequence[Box] = (),
         seed: int = 0,
+        is_fast: bool = False,
     ) -> None:
         import coal
 
         if not least >= 0:
             raise SettingsError(f"clearance is {least}, wanted 0 m or more")
         self.least, self._model, self._regressor = least, model, MotionRegressor(model)
+        self._is_fast = is_fast
         self._ratios = model.velocity_map[self._regressor.places]  # of joints by body, (m, n)
         clouds, self.unread = link_clouds(model)
         if not clouds:
@@ -198,7 +204,8 @@ class Clearance:
             self.kept[k] = min(self.least, usual / 2)
             self.room[k] = usual - self.kept[k]
         self.built_near = self._listed(near, self.kept)
-        self.likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
+        apart = self.kept + np.minimum(_APART, self.room / 2)
+        self.likely = distance.min(axis=1, initial=np.inf) < apart
 
     def _listed(self, chosen: Array, distance: Array) -> list[str]:
         """Return the links of pairs and their least distances, in words, each two once."""
@@ -206,8 +213,10 @@ class Clearance:
         for k in np.flatnonzero(chosen).tolist():
             names = self.named[k]
             least[names] = min(least.get(names, np.inf), float(distance[k]))
-        said = {k: f"overlap by {-1e3 * d:.0f}" if d < 0 else f"{1e3 * d:.3g}" for k, d in least.items()}
-        return [f"{a} and {b} ({words} mm)" for (a, b), words in said.items()]
+        return [
+            f"{a} and {b} ({'overlap by ' * (d < 0)}{abs(1e3 * d):.0f} mm)"
+            for (a, b), d in least.items()
+        ]
 
     @cached_property
     def _supports(self) -> Array:
@@ -249,31 +258,24 @@ class Clearance:
         import coal
 
         chosen = self.likely if chosen is None else chosen
-        centres, turns = self._placed(poses)  # (hulls, N, 3), (hulls, N, 3, 3)
-        radii = np.array([hull.radius for hull in self._hulls])
-        i, j = self.pairs.T
-        bound = np.full((len(self.pairs), centres.shape[1]), np.inf)
-        gap = np.linalg.norm(centres[i[chosen]] - centres[j[chosen]], axis=2)
-        bound[chosen] = gap - (radii[i] + radii[j])[chosen, None]
+        bound = np.full((len(self.pairs), poses.p.shape[2]), np.inf)
         limit = np.broadcast_to(within, bound.shape)
+        bounds = self._bounds_fast if self._is_fast else self._bounds
+        bound[chosen] = bounds(poses, self.pairs[chosen], limit[chosen])
         pairs, samples = np.nonzero(bound < limit)
-        bound[pairs, samples] = self._box_bound(centres, turns, self.pairs[pairs], samples)
-        is_near = bound[pairs, samples] < limit[pairs, samples]
-        pairs, samples = pairs[is_near], samples[is_near]
-        witness = np.empty((2, len(pairs), 3))
-        normals, result = np.empty((len(pairs), 3)), coal.DistanceResult()
-        placed = {}
-        for k, (pair, sample) in enumerate(zip(pairs.tolist(), samples.tolist(), strict=True)):
-            two = []
-            for hull in self.pairs[pair].tolist():
-                at = hull, sample
-                if at not in placed:
-                    placed[at] = coal.Transform3s(turns[at], centres[at])
-                two += [self._hulls[hull].shape, placed[at]]
+        hulls = self.pairs[pairs].T  # (2, k)
+        centres, turns = self._placed(poses, hulls.ravel(), np.tile(samples, 2))
+        shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
+        placed = [coal.Transform3s(R, x) for R, x in zip(turns, centres, strict=True)]
+        count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
+        witness, normals = np.empty((2, count, 3)), np.empty((count, 3))
+        for k in range(count):
+            one, other = (shapes[k], placed[k]), (shapes[count + k], placed[count + k])
             result.clear()
-            bound[pair, sample] = coal.distance(*two, self._request, result)
+            exact[k] = coal.distance(*one, *other, self._request, result)
             witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
+        bound[pairs, samples] = exact
         gradient = self._gradient(poses, pairs, samples, witness, normals)
         return Nearness(bound, pairs, samples, gradient)
 
@@ -339,6 +341,44 @@ class Clearance:
                     body = int(tree.parents[body + 1]) - 1
         return out
 
+    def _bounds(self, poses: Poses, pairs: Array, limit: Array) -> Array:
+        """Return lower bounds of distances by spheres, and where those are too low by boxes.
+
+        Args:
+            poses: Where the bodies are.
+            pairs: Numbers of two hulls, shape (k, 2).
+            limit: What a bound need not exceed, shape (k, N) [m].
+        """
+        N, count = limit.shape[1], len(self._hulls)
+        every = np.repeat(np.arange(count), N), np.tile(np.arange(N), count)
+        placed = self._placed(poses, *every)
+        centres, turns = placed[0].reshape(count, N, 3), placed[1].reshape(count, N, 3, 3)
+        i, j = pairs.T
+        radii = np.array([hull.radius for hull in self._hulls])
+        bound: Array = np.linalg.norm(centres[i] - centres[j], axis=2)
+        bound -= (radii[i] + radii[j])[:, None]
+        k, samples = np.nonzero(bound < limit)
+        bound[k, samples] = self._box_bound(centres, turns, pairs[k], samples)
+        return bound
+
+    def _bounds_fast(self, poses: Poses, pairs: Array, limit: Array) -> Array:
+        """Return lower bounds of distances by compiled code; see ``_bounds``."""
+        from robotid.excitation.gaps import lower_bounds  # imports Numba
+
+        bound: Array = lower_bounds(
+            pairs, np.array(limit, order="C"), poses.R, poses.p, *self._corners
+        )
+        return bound
+
+    @cached_property
+    def _corners(self) -> tuple[Array, ...]:
+        """The hulls as ``lower_bounds`` takes them."""
+        hulls = self._hulls
+        starts = np.cumsum([0, *(len(hull.corners) for hull in hulls)])
+        of_each = zip(*[(h.body, h.centre, h.radius, h.half) for h in hulls], strict=True)
+        points = np.vstack([hull.corners for hull in hulls])
+        return *map(np.array, of_each), points, starts
+
     def _box_bound(self, centres: Array, turns: Array, pairs: Array, samples: Array) -> Array:
         """Return lower bounds of distances by the boxes around hulls, shape (k,) [m].
 
@@ -355,17 +395,15 @@ class Clearance:
         apart: Array = (np.abs(axes @ way[:, :, None])[..., 0] - shadow).max(axis=1)
         return apart
 
-    def _placed(self, poses: Poses) -> tuple[Array, Array]:
-        """Return where the centres of hulls are, and how they are turned."""
-        N = poses.p.shape[2]
-        centres, turns = np.empty((len(self._hulls), N, 3)), np.empty((len(self._hulls), N, 3, 3))
-        for k, hull in enumerate(self._hulls):
-            if hull.body < 0:
-                centres[k], turns[k] = hull.centre, np.eye(3)
-                continue
-            R = np.moveaxis(poses.R[:, :, hull.body], -1, 0)
-            centres[k], turns[k] = poses.p[:, hull.body].T + R @ hull.centre, R
-        return centres, turns
+    def _placed(self, poses: Poses, hulls: Array, samples: Array) -> tuple[Array, Array]:
+        """Return where centres of k hulls are at k instants, (k, 3), and how they are turned."""
+        bodies = np.array([hull.body for hull in self._hulls])[hulls]
+        middles = np.array([hull.centre for hull in self._hulls])[hulls]
+        turns = np.moveaxis(poses.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
+        centres = poses.p[:, bodies, samples].T + (turns @ middles[..., None])[..., 0]
+        stands = bodies < 0
+        turns = np.where(stands[:, None, None], np.eye(3), turns)
+        return np.where(stands[:, None], middles, centres), np.ascontiguousarray(turns)
 
     def _gradient(
         self, poses: Poses, pairs: Array, samples: Array, witness: Array, normals: Array
@@ -386,21 +424,24 @@ class Clearance:
 def _hull(name: str, body: int, points: Array) -> _Hull:
     """Return the convex hull of points; a flat one as the box around it."""
     import coal
+    from scipy.spatial import ConvexHull
 
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     about = points - centre
     radius = float(np.linalg.norm(about, axis=1).max())
     extent = np.ptp(about, axis=0)  # the centre is the middle of it
-    if np.linalg.matrix_rank(about, tol=_THINNEST) < 3:
-        extent = np.maximum(extent, _THINNEST)
-        return _Hull(name, body, centre, radius + _THINNEST, extent / 2, coal.Box(*extent))
-    if len(points) == 8 and np.allclose(np.abs(about), extent / 2):
-        return _Hull(name, body, centre, radius, extent / 2, coal.Box(*extent))
-    corners = coal.StdVec_Vec3s()
-    for corner in np.unique(np.round(about, 6), axis=0):
-        corners.append(corner)
-    shape = coal.ConvexBase.convexHull(corners, False, "Qt")
-    return _Hull(name, body, centre, radius, extent / 2, shape)
+    is_flat = np.linalg.matrix_rank(about, tol=_THINNEST) < 3
+    if is_flat or (len(points) == 8 and np.allclose(np.abs(about), extent / 2)):
+        extent, radius = np.maximum(extent, _THINNEST), radius + is_flat * _THINNEST
+        corners = _SIGNS * extent / 2
+        return _Hull(name, body, centre, radius, extent / 2, corners, coal.Box(*extent))
+    corners = np.unique(np.round(about, 6), axis=0)
+    corners = corners[ConvexHull(corners).vertices]
+    listed_ones = coal.StdVec_Vec3s()
+    for corner in corners:
+        listed_ones.append(corner)
+    shape = coal.ConvexBase.convexHull(listed_ones, False, "Qt")
+    return _Hull(name, body, centre, radius, extent / 2, corners, shape)
 
 
 def _corners(box: Box) -> Array:

@@ -132,6 +132,7 @@ class Designer:
         noise: Mapping[str, float] | None = None,
         correlation: float = CORRELATION,
         run: Run | None = None,
+        is_fast: bool = False,
     ) -> "Designer":
         """Return a designer that assumes of friction and noise what a preview does.
 
@@ -144,6 +145,7 @@ class Designer:
             noise: Standard deviation of the torque's noise by joint [N m or N].
             correlation: Time over which it is correlated [s].
             run: What was recorded before: the motion then tells what it did not.
+            is_fast: Whether compiled code is used, which needs the extra ``fast``.
 
         Raises:
             SettingsError: If a setting is unusable.
@@ -160,7 +162,7 @@ class Designer:
         if run is not None:
             told = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * told * spread
-        information = MotionInformation(model, mapping, mapping.to_base(pi))
+        information = MotionInformation(model, mapping, mapping.to_base(pi), is_fast)
         return cls(information, limits, basis, density, spread, given, name, clearance)
 
     @cached_property
@@ -343,7 +345,8 @@ class Designer:
         if self.clearance is None:
             return np.zeros((0, poses.p.shape[2]))
         kept = self.clearance.kept[:, None] + spare * self._spare
-        return self.clearance.near(poses, kept + _SEEN).distance - kept
+        seen = np.minimum(_SEEN, self.clearance.room[:, None] / 4)
+        return self.clearance.near(poses, kept + seen).distance - kept
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""

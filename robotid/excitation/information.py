@@ -51,18 +51,20 @@ class MotionInformation:
         model: The robot, with a fixed base.
         mapping: Its base parameters.
         beta: Base parameters that torques are reckoned by, shape (b,).
+        is_fast: Whether the rows are computed by compiled code, as of ``MotionRegressor``.
     """
 
     model: RobotModel
     mapping: BaseMapping
     beta: Array
+    is_fast: bool = False
     _regressor: MotionRegressor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         wanted = (len(self.mapping.independent),)
         if self.beta.shape != wanted:
             raise DataError(f"beta has shape {self.beta.shape}, wanted {wanted}")
-        object.__setattr__(self, "_regressor", MotionRegressor(self.model))
+        object.__setattr__(self, "_regressor", MotionRegressor(self.model, is_fast=self.is_fast))
 
     @cached_property
     def _gather(self) -> "csr_array":

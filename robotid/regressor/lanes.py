@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["LANES", "finish_rows", "inertial_rows", "state_size"]
+__all__ = ["LANES", "compiled", "finish_rows", "inertial_rows", "state_size"]
 
 LANES = 64
 _STATE = 12  # w, v, dw, a of a body
@@ -38,61 +38,61 @@ def state_size(bodies: int, depth: int) -> int:
     return LANES * (_SHARED + bodies * (_STATE + 6 * depth))
 
 
-def _compile(function: Any) -> Any:
+def compiled(function: Any) -> Any:
     """Compile without the interpreter's lock; contract: a b + c may be rounded once."""
     return njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")(function)
 
 
-@_compile
+@compiled
 def _get(x, at, k, lane):
     # an unsigned index spares Numba's look for negative ones, which would keep lanes apart
     return x[np.uintp(at + k * LANES + lane)]
 
 
-@_compile
+@compiled
 def _get3(x, at, k, lane):
     return _get(x, at, k, lane), _get(x, at, k + 1, lane), _get(x, at, k + 2, lane)
 
 
-@_compile
+@compiled
 def _put(x, at, k, lane, value):
     x[np.uintp(at + k * LANES + lane)] = value
 
 
-@_compile
+@compiled
 def _put3(x, at, k, lane, u):
     _put(x, at, k, lane, u[0])
     _put(x, at, k + 1, lane, u[1])
     _put(x, at, k + 2, lane, u[2])
 
 
-@_compile
+@compiled
 def _cross(u, v):
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@_compile
+@compiled
 def _add(u, v):
     return u[0] + v[0], u[1] + v[1], u[2] + v[2]
 
 
-@_compile
+@compiled
 def _scale(s, u):
     return s * u[0], s * u[1], s * u[2]
 
 
-@_compile
+@compiled
 def _dot(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@_compile
+@compiled
 def _into_child(X, Y, Z, u):
     """Return R^T u; X, Y, Z are the columns of R."""
     return _dot(X, u), _dot(Y, u), _dot(Z, u)
 
 
-@_compile
+@compiled
 def _cos_sin(angle):
     """Return cosine and sine: Cody and Waite's reduction, fdlibm's polynomials, no branch."""
     n = (angle * 0.6366197723675814 + _ROUND) - _ROUND  # quarter turns
@@ -112,7 +112,7 @@ def _cos_sin(angle):
     return (-x if (quarter == 1.0) | (quarter == 2.0) else x), (-y if quarter > 1.5 else y)
 
 
-@_compile
+@compiled
 def _load(work, joint, q, v, a, leader, first, last):
     """Write cos q, sin q, q, v, a of a joint that follows a coordinate; past the end, the last."""
     ratio, offset = joint[39], joint[40]
@@ -127,7 +127,7 @@ def _load(work, joint, q, v, a, leader, first, last):
         _put(work, 0, _MOTION + 1, lane, sine)
 
 
-@_compile
+@compiled
 def _place(work, joint):
     """Write R = A + B cos q + C sin q by columns and p = p0 + d q, the child in its parent."""
     A, B, C = joint[0:9], joint[9:18], joint[18:27]
@@ -142,7 +142,7 @@ def _place(work, joint):
             _put(work, 0, 9 + k, lane, p + d * _get(work, 0, _MOTION + 2, lane))
 
 
-@_compile
+@compiled
 def _move(work, joint, parent, own):
     """Write velocity and acceleration of a body from those of its parent."""
     axis_v, axis_w = (joint[33], joint[34], joint[35]), (joint[36], joint[37], joint[38])
@@ -163,7 +163,7 @@ def _move(work, joint, parent, own):
         _put3(work, own, 9, lane, _add(a, _add(_cross(v, turn), _cross(w, slide))))
 
 
-@_compile
+@compiled
 def _share(work, own):
     """Write d, B by columns, dw and the products of w, which all rows of a body share."""
     for lane in range(LANES):
@@ -179,7 +179,7 @@ def _share(work, own):
         _put3(work, 0, 27, lane, (xy, xz, yz))
 
 
-@_compile
+@compiled
 def _carry(work, parent, own):
     """Write an axis seen from the parent as seen from the child: v first, then w."""
     for lane in range(LANES):
@@ -190,7 +190,7 @@ def _carry(work, parent, own):
         _put3(work, own, 3, lane, _into_child(X, Y, Z, w))
 
 
-@_compile
+@compiled
 def _row(work, axis):
     """Write the ten columns of one body in one row: m, mc, and I as xx xy yy xz yz zz."""
     for lane in range(LANES):
@@ -209,7 +209,7 @@ def _row(work, axis):
         _put(work, 0, 39, lane, w[0] * yz - w[1] * xz + w[2] * dw[2])
 
 
-@_compile
+@compiled
 def _write(work, out, places, start, stride):
     """Copy those of the ten columns that are wanted to their places in the block."""
     for k in range(10):
@@ -219,7 +219,7 @@ def _write(work, out, places, start, stride):
                 out[np.uintp(to + lane)] = _get(work, 0, 30 + k, lane)
 
 
-@_compile
+@compiled
 def _join(work, at, joint):
     """Add the joint's own axis, times its ratio, to a row's axis."""
     for k in range(6):
@@ -228,7 +228,7 @@ def _join(work, at, joint):
             _put(work, at, k, lane, _get(work, at, k, lane) + value)
 
 
-@_compile
+@compiled
 def inertial_rows(parents, depths, slots, leaders, joints, places, q, v, a, base, work, out, span):
     """Write the inertial columns of a block of samples, row by row.
 
@@ -272,7 +272,7 @@ def inertial_rows(parents, depths, slots, leaders, joints, places, q, v, a, base
                 _write(work, columns, places[i, row], start - span[0], stride)
 
 
-@_compile
+@compiled
 def finish_rows(values, places, widths, weights, root, out, span):
     """Write drive columns and torques of a block, and weigh its rows.
 
