@@ -10,7 +10,7 @@ from robotid.findings import listed
 from robotid.logs.data import repeated, suggestion
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import LogSource
-from robotid.logs.table import prefixes
+from robotid.logs.table import prefixes, quantity_of
 
 __all__ = ["Conversion", "convert"]
 
@@ -81,26 +81,24 @@ def _standard_names(
     joint_of = {name: joint for joint, name in source.joints.items()}
     pairs = [("time", name) for name in names if name in ("time", "t")]
     by_joint: dict[str, list[str]] = {}
-    for kind, starts in prefixes(source.effort).items():
-        for name in names:
-            start = next((s for s in starts if name.startswith(s) and name != s), None)
-            if start is None:
-                continue
-            named = name[len(start) :]
-            joint = joint_of.get(named, named)
-            pairs.append((f"{kind}_{joint}", name))
-            by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
-    if twice := repeated([standard for standard, _ in pairs]):
-        both = [name for standard, name in pairs if standard == twice[0]]
+    quantities = [(name, quantity_of(name, source.effort)) for name in names]
+    for kind in prefixes(source.effort):
+        for name, found in quantities:
+            if found and found[0] == kind:
+                joint = joint_of.get(found[1], found[1])
+                pairs.append((f"{kind}_{joint}", name))
+                by_joint.setdefault(joint, []).append(f"{kind}_{joint}")
+    if twice := repeated([key for key, _ in pairs]):
+        both = [name for key, name in pairs if key == twice[0]]
         raise DataError(
             f"{where} has {listed(both)}, several names of {twice[0]!r}; remove all but one"
         )
-    found = dict(pairs)
-    if "time" not in found:
+    standard = dict(pairs)
+    if "time" not in standard:
         raise DataError(f"{where} has no column 'time'; columns found: {listed(names)}. Rename it")
     if not by_joint:
         raise DataError(
             f"{where} has no column of a joint, as 'q_<joint>'; columns found: {listed(names)}. "
             "Rename them"
         )
-    return found, by_joint
+    return standard, by_joint

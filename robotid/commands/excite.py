@@ -23,6 +23,7 @@ from robotid.excitation.routes import design_stands, design_sweeps
 from robotid.identification.previews import Preview, Run, preview_logs
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
+from robotid.regressor.compiled import is_installed, why_not
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
 _ROUTES = ("sweeps", "stands")
+_START = 2.0  # [s] of design from which compiled code pays
 _KINDS = ("fourier", "bspline", *_ROUTES)
 
 
@@ -157,15 +159,16 @@ def design_motion(
         jerk=settings.jerk,
         power=settings.power,
     )
-    clearance = None
+    clearance, is_fast = None, _pays(model, settings)
     if settings.clearance is not None:
         clearance = Clearance(
-            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
-        )
+            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes,
+            is_fast=is_fast,
+        )  # fmt: skip
     basis = settings.basis()
     designer = Designer.of_model(
         model, basis, limits, name=settings.criterion, clearance=clearance, noise=settings.noise,
-        run=run,
+        run=run, is_fast=is_fast,
     )  # fmt: skip
 
     def told(start: int, _: float) -> None:
@@ -192,6 +195,12 @@ def design_motion(
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
     return content
+
+
+def _pays(model: RobotModel, settings: MotionSettings) -> bool:
+    """Return whether compiled code can be used and pays its start of about half a second."""
+    is_long = settings.kind not in _ROUTES and settings.seconds > _START
+    return is_long and is_installed() and why_not(model) is None
 
 
 def _check_jerk(course: Course, joints: Sequence[str]) -> None:
@@ -243,11 +252,13 @@ def _content(
     if clearance is not None:
         contact = design.contact
         margins["collision"] = {
-            "margin": None if contact is None else contact.distance - clearance.least,
+            "margin": None if contact is None else contact.margin,
+            "kept": None if contact is None else contact.kept,
             "where": None if contact is None else f"{contact.first} and {contact.second}",
             "time": None if contact is None else contact.time,
             "unread": clearance.unread,
             "left_alone": clearance.made_to,
+            "built_near": clearance.built_near,
         }
     return {
         "robot": model.name,

@@ -67,6 +67,7 @@ _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--time-unit": ("units.time", {"metavar": "UNIT"}),
     "--angle-unit": ("units.angle", {"metavar": "UNIT"}),
     "--topic": ("log.topic", {"metavar": "NAME"}),
+    "--command-topic": ("log.command", {"metavar": "NAME"}),
     "--effort": ("log.effort", {"metavar": "MEANING"}),
     "--stamp": ("log.stamp", {"metavar": "CLOCK"}),
 }
@@ -85,7 +86,7 @@ _ONLINE = tuple(
     if flag in ("--rate", "--cutoff", "--min-velocity")
     or (flag in _LOG and not key.startswith("signals."))
 )
-_SOURCE = ("--topic", "--effort", "--stamp")
+_SOURCE = ("--topic", "--command-topic", "--effort", "--stamp")
 #: Flags that say which robot it is, and how a table is read.
 _ROBOT = ("--joints", "--lock", "--snap-angles", "--time-unit", "--angle-unit")
 #: Key of the file of a plant that each flag of "simulate" states.

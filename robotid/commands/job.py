@@ -13,7 +13,7 @@ from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings
 from robotid.logs.data import Log
-from robotid.logs.read import LogLayout, lay_out, read_log
+from robotid.logs.read import LogLayout, Needs, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
 from robotid.logs.table import Table
 from robotid.logs.transmission import Transmission, check_transmissions
@@ -254,34 +254,34 @@ class Job(Settings):
         }
         return {"*": everywhere, **stated}
 
-    def read(self, entry: LogEntry, model: "RobotModel", *, is_motion: bool = False) -> Log:
+    def read(self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque") -> Log:
         """Return one log of the job, of the model's joints in its order.
 
         Args:
             entry: Which log.
             model: The job's robot.
-            is_motion: Whether it is read for its motion alone.
+            needs: What is wanted beside positions, as of ``lay_out``.
 
         Raises:
             DataError: If the file cannot be used.
         """
         stated = self._reading(model) | {"start": entry.start, "end": entry.end}
-        return read_log(entry.path, is_motion=is_motion, **stated)
+        return read_log(entry.path, needs=needs, **stated)
 
     def lay_out(
-        self, entry: LogEntry, model: "RobotModel", *, is_motion: bool = False
+        self, entry: LogEntry, model: "RobotModel", *, needs: Needs = "torque"
     ) -> tuple[LogLayout, Table]:
         """Return which columns of a log's file are read, before any is, and the opened file.
 
         Args:
             entry: Which log.
             model: The job's robot.
-            is_motion: Whether it is read for its motion alone.
+            needs: What is wanted beside positions, as of ``lay_out``.
 
         Raises:
             DataError: If the file cannot be used.
         """
-        return lay_out(entry.path, is_motion=is_motion, **self._reading(model))
+        return lay_out(entry.path, needs=needs, **self._reading(model))
 
     def _reading(self, model: "RobotModel") -> dict[str, Any]:
         return {

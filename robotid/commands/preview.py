@@ -65,7 +65,7 @@ def _motions(job: Job, model: RobotModel, entries: Sequence[LogEntry]) -> list[S
     """Return motions in memory, read without their torques."""
     found = []
     for entry in entries:
-        layout, table = job.lay_out(entry, model, is_motion=True)
+        layout, table = job.lay_out(entry, model, needs="motion")
         window = entry.start, entry.end
         found.append(survey_log(layout, table, model, job.signals, window, length=None))
     return found

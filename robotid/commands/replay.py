@@ -123,13 +123,13 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     """
     model = job.model()
     (entry,) = job.identification
-    is_motion = not job.lay_out(entry, model, is_motion=True)[0].has_torque
-    motion = job.read(entry, model, is_motion=is_motion)
+    is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
+    motion = job.read(entry, model, needs="motion" if is_motion else "torque")
     robots = {label: stated_model(r, model) for label, r in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
     second = None
     if ghost is not None:
-        shadow = job.read(LogEntry(Path(ghost)), model, is_motion=True)
+        shadow = job.read(LogEntry(Path(ghost)), model, needs="motion")
         second = (Path(ghost).name, shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:

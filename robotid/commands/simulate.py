@@ -108,7 +108,7 @@ def simulate_log(
 
 
 def _motion(job: Job, model: RobotModel, files: SimulatedFiles) -> SampledMotion:
-    table = job.read(LogEntry(files.motion), model, is_motion=True)
+    table = job.read(LogEntry(files.motion), model, needs="motion")
     if files.cutoff is None:
         return SampledMotion(table.t, table.q, table.v, table.a)
     smooth = process(

@@ -282,7 +282,7 @@ def preview(
         logs = [hold_log(model, e.recording.log, e.recording.signals) for e in given.fitted]
         recordings = Recordings(model, given.mapping, logs)
         run = Run.of(recordings, given.standard, given.estimate.details)
-    read = read_logs(motions, model.joints, prismatic=model.layout.prismatic, is_motion=True)
+    read = read_logs(motions, model.joints, prismatic=model.layout.prismatic, needs="motion")
     held = [hold_log(model, motion, settings) for motion in read]
     return preview_logs(model, held, choice, noise=noise, run=run)
 

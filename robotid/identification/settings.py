@@ -23,6 +23,7 @@ __all__ = [
     "PRXSettings",
     "RLSSettings",
     "RecursiveSettings",
+    "SimulationSettings",
     "TLSSettings",
     "WLSSettings",
 ]
@@ -338,6 +339,29 @@ class GradientSettings(DescentSettings):
     )
 
 
+@dataclass(frozen=True)
+class SimulationSettings(EstimatorSettings):
+    """Output error: closed loops are rolled out on the commands, and fitted to the positions."""
+
+    name: str = _called(
+        "simulation",
+        "closed loops rolled out on the commands of logs and fitted to the positions; needs [controller]",
+    )
+    window: float = setting(2.5, "length of the windows that are rolled out [s]", within=_FINITE)
+    lead: float = setting(
+        0.6, "how long before each window its roll-out begins [s]", within=_NOT_NEGATIVE
+    )
+    step: float = setting(2e-3, "longest step of the integration [s]", within=_FINITE)
+    bodies: float = setting(
+        0.1,
+        "plausible relative error of the URDF's bodies, by which they may change; 0: they stay",
+        within=_NOT_NEGATIVE,
+    )
+    whiten: bool = setting(
+        True, "whether the correlation of the residuals is estimated and taken out"
+    )
+
+
 #: The settings of each estimator, by its name.
 ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
     kind.name: kind
@@ -351,5 +375,6 @@ ESTIMATORS: Mapping[str, type[EstimatorSettings]] = {
         KalmanSettings,
         PRXSettings,
         GradientSettings,
+        SimulationSettings,
     )
 }

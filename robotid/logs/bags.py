@@ -1,12 +1,13 @@
-"""Bags of ROS 1 and ROS 2, MCAP among them: joint states as a table of named columns.
+"""Bags of ROS 1 and ROS 2, MCAP among them: joint states and commands as a table of columns.
 
 The library rosbags reads all of them, without an installation of ROS.
 """
 
+import re
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,11 @@ from robotid.logs.table import Format, Table, choose
 
 __all__ = ["BagFormat"]
 
-_TYPE = "sensor_msgs/msg/JointState"
-_FIELDS = ("position", "velocity", "effort")
+_STATE = "sensor_msgs/msg/JointState"
+_CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+_MEASURED = ("position", "velocity", "effort")
+_COMMANDED = ("qref", "dqref", "tauref")
+_FIELDS = (*_MEASURED, *_COMMANDED)
 
 Layout = tuple[tuple[str, ...], tuple[str, ...]]  # names of joints, and the fields that are filled
 
@@ -44,37 +48,107 @@ class BagFormat(Format):
     ``effort_<joint>``. Each message may name its joints in another order. Messages that hold none
     of the columns that are read, as those of another publisher, are passed over; a message that
     does not fit together, or holds only some of what is read, is a ``DataError``.
+
+    A JointTrajectoryControllerState gives commands, too: what it put out to the drives, else its
+    reference (once called desired), as ``qref_<joint>`` and ``dqref_<joint>``, and the reference's
+    effort as ``tauref_<joint>``. Of joint states, commands are those of a second topic, each held
+    until the next one.
     """
 
     def open(self, path: Path, source: LogSource) -> Table:
-        blocks: dict[Layout, _Block] = {}
-        count = 0
         with _open(path) as (reader, decode):
-            topic = _choose_topic(path.name, reader, source.topic)
-            messages = _messages(path, reader, decode, topic)
-            for count, (logged, message) in enumerate(messages, start=1):
-                layout, values = _content(path.name, topic, count - 1, message)
-                block = blocks.setdefault(layout, _Block())
-                block.number.append(count - 1)
-                clock = message.header.stamp
-                by_header = source.stamp == "header"
-                block.stamp.append(clock.sec * 10**9 + clock.nanosec if by_header else logged)
-                for part in values:
-                    block.values.frombytes(part.tobytes())
-        where = f"{path.name}, topic {topic!r}"
-        if source.stamp == "header" and not any(any(block.stamp) for block in blocks.values()):
-            raise DataError(
-                f"{where}: the stamps in the headers of all {count} messages are 0. To use the "
-                'time of recording, state stamp = "log" (job file table [log], CLI --stamp log, '
-                'Python source=LogSource(stamp="log"))'
+            types = {c.topic: _full_name(c.msgtype) for c in reader.connections}
+            topic = _choose_topic(path.name, reader, types, source)
+            blocks = _blocks(path, reader, decode, topic, source, _MEASURED)
+            told: dict[Layout, _Block] = {}
+            if source.command is not None:
+                told = _blocks(path, reader, decode, source.command, source, _COMMANDED)
+        table = _table(f"{path.name}, topic {topic!r}", blocks)
+        if source.command is not None:
+            commands = _table(f"{path.name}, topic {source.command!r}", told)
+            return _with_commands(table, commands, (_stamps(blocks), _stamps(told)), source.command)
+        others = sorted(x for x, kind in types.items() if kind == _CONTROLLER)
+        if others and types[topic] != _CONTROLLER:
+            note = (
+                f"commands are in topics that are not read: {listed(others)}; topic = "
+                f'"{others[0]}" reads them and what was measured with them'
             )
-        names = list(dict.fromkeys(n for layout in blocks for n in _columns(layout)))
-        names.sort(key=lambda name: _FIELDS.index(name.partition("_")[0]))
-        return Table(["time", *names], partial(_read, where, blocks))
+            return replace(table, notes=(note,))
+        return table
+
+
+def _stamps(blocks: dict[Layout, _Block]) -> Array:
+    """Return the stamps of all messages of a topic, sorted [s]."""
+    return np.sort(np.concatenate([block.stamp for block in blocks.values()])) / 1e9
+
+
+def _table(where: str, blocks: dict[Layout, _Block]) -> Table:
+    """Return the table of the messages of a topic."""
+    names = list(dict.fromkeys(n for layout in blocks for n in _columns(layout)))
+    names.sort(key=lambda name: _FIELDS.index(name.partition("_")[0]))
+    return Table(["time", *names], partial(_read, where, blocks))
+
+
+def _blocks(
+    path: Path,
+    reader: Any,  # noqa: ANN401
+    decode: Callable[[bytes, str], Any],
+    topic: str,
+    source: LogSource,
+    fields: Sequence[str],
+) -> dict[Layout, _Block]:
+    """Return the messages of a topic; fields name what position, velocity and effort are."""
+    blocks: dict[Layout, _Block] = {}
+    count = 0
+    for count, (logged, message) in enumerate(_messages(path, reader, decode, topic), start=1):
+        layout, values = _content(path.name, topic, count - 1, message, fields)
+        block = blocks.setdefault(layout, _Block())
+        block.number.append(count - 1)
+        clock = message.header.stamp
+        by_header = source.stamp == "header"
+        block.stamp.append(clock.sec * 10**9 + clock.nanosec if by_header else logged)
+        for part in values:
+            block.values.frombytes(np.asarray(part, dtype=np.float64).tobytes())
+    if source.stamp == "header" and not any(any(block.stamp) for block in blocks.values()):
+        raise DataError(
+            f"{path.name}, topic {topic!r}: the stamps in the headers of all {count} messages are "
+            '0. To use the time of recording, state stamp = "log" (job file table [log], CLI '
+            '--stamp log, Python source=LogSource(stamp="log"))'
+        )
+    return blocks
+
+
+def _with_commands(
+    states: Table, commands: Table, stamps: tuple[Array, Array], topic: str
+) -> Table:
+    """Return states with the last command before each; rows before the first one are left out."""
+    measured, told = stamps
+    note = f"commands of topic {topic!r} are held until the next one"
+    if len(told) > 1:
+        note += f", {1e3 * float(np.median(np.diff(told))):.3g} ms later in the median"
+    if early := int(np.sum(measured < told[0])):
+        note += f"; {early} messages before the first one are left out"
+    if late := int(np.sum(measured > told[-1])):
+        note += f"; {late} messages come after the last one"
+
+    def read(wanted: Sequence[str]) -> dict[str, Array]:
+        mine = [name for name in wanted if name in states.names and name != "time"]
+        theirs = [name for name in wanted if name in commands.names and name != "time"]
+        rows = states.read(["time", *mine])
+        rows = {name: values[rows["time"] >= told[0]] for name, values in rows.items()}
+        for name in theirs:  # each by itself: joints may be commanded by messages of their own
+            held = commands.read(["time", name])
+            order = np.argsort(held["time"], kind="stable")
+            last = np.searchsorted(held["time"][order], rows["time"], side="right") - 1
+            rows[name] = np.where(last >= 0, held[name][order][np.maximum(last, 0)], np.nan)
+        return {name: rows[name] for name in wanted}
+
+    names = [*states.names, *commands.names[1:]]
+    return Table(names, read, (*states.notes, note))
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes], Any]]]:
+def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
     """Open a bag: its reader, and what decodes a message; ROS need not be installed."""
     try:
         from rosbags.rosbag1 import Reader as Reader1
@@ -97,7 +171,36 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes], Any]]]:
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise _broken(path, error) from error
     with closing(reader):
-        yield reader, lambda raw: deserialize(raw, _TYPE)
+        for connection in reader.connections:
+            if _full_name(connection.msgtype) == _CONTROLLER and _CONTROLLER not in types.types:
+                types.register(_definitions(path, connection.msgdef, types.types))
+
+        def decode(raw: bytes, kind: str) -> Any:  # noqa: ANN401
+            if kind not in types.types:
+                raise DataError(
+                    f"{path.name} does not hold the definition of {kind}, as .db3 files of before "
+                    "ROS 2 Iron do not; convert it to MCAP where control_msgs is installed: "
+                    "'ros2 bag convert'"
+                )
+            return deserialize(raw, kind)
+
+        yield reader, decode
+
+
+def _definitions(path: Path, definition: Any, known: Container[str]) -> dict[str, Any]:  # noqa: ANN401
+    """Return the types that a bag defines for its controllers' states, those not known."""
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    found: dict[str, Any] = {}
+    try:
+        if definition.format.name == "MSG":
+            found = dict(get_types_from_msg(definition.data, _CONTROLLER))
+        elif definition.format.name == "IDL":
+            for text in definition.data.split("=" * 80 + "\n"):
+                found |= get_types_from_idl(re.sub(r"^IDL: .*\n", "", text)) if text else {}
+    except Exception as error:  # a parser of foreign text fails in many ways
+        raise _broken(path, error) from error
+    return {name: fields for name, fields in found.items() if name not in known}
 
 
 def _broken(path: Path, error: Exception) -> DataError:
@@ -112,39 +215,58 @@ def _broken(path: Path, error: Exception) -> DataError:
 def _messages(
     path: Path,
     reader: Any,  # noqa: ANN401
-    decode: Callable[[bytes], Any],
+    decode: Callable[[bytes, str], Any],
     topic: str,
 ) -> Iterator[tuple[int, Any]]:
     """Yield time of recording [ns] and message; tell in our words where a bag breaks off."""
     chosen = [c for c in reader.connections if c.topic == topic]
     try:
-        for _, logged, raw in reader.messages(chosen):
-            yield logged, decode(raw)
+        for connection, logged, raw in reader.messages(chosen):
+            yield logged, decode(raw, _full_name(connection.msgtype))
+    except DataError:
+        raise
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise _broken(path, error) from error
 
 
-def _choose_topic(where: str, reader: Any, wanted: str | None) -> str:  # noqa: ANN401
-    """Return the topic to read: the one wanted, or the only one of joint states."""
-    types = {c.topic: _full_name(c.msgtype) for c in reader.connections}
+def _choose_topic(
+    where: str,
+    reader: Any,  # noqa: ANN401
+    types: Mapping[str, str],
+    source: LogSource,
+) -> str:
+    """Return the topic to read: the one wanted, or the only one of joint states or a controller's.
+
+    That of the commands must be another one, of joint states.
+    """
     filled = {c.topic for c in reader.connections if c.msgcount}
     listing = f"topics: {dict(sorted(types.items()))}"
-    if wanted is not None:
+    for wanted, kinds in ((source.topic, (_STATE, _CONTROLLER)), (source.command, (_STATE,))):
+        if wanted is None:
+            continue
         if wanted not in types:
             raise DataError(
                 f"{where} has no topic {wanted!r}; {listing}{suggestion(wanted, types)}"
             )
-        if types[wanted] != _TYPE:
+        if types[wanted] not in kinds:
             raise DataError(
-                f"{where}: topic {wanted!r} holds {types[wanted]}, wanted {_TYPE}; {listing}"
+                f"{where}: topic {wanted!r} holds {types[wanted]}, wanted {' or '.join(kinds)}; "
+                f"{listing}"
             )
         if wanted not in filled:
             raise DataError(f"{where}: topic {wanted!r} holds no message; {listing}")
-        return wanted
-    found = sorted(topic for topic in filled if types[topic] == _TYPE)
-    if not found:
-        raise DataError(f"{where} holds no message of {_TYPE}; {listing}")
-    return choose(where, found, f"topics of {_TYPE}", listing)
+    if source.command is not None and source.command == source.topic:
+        raise DataError(
+            f"{where}: topic and command are both {source.topic!r}; name the topic of what was "
+            "measured and that of what was commanded"
+        )
+    if source.topic is not None:
+        return source.topic
+    for kind in (_STATE, _CONTROLLER):
+        found = sorted(x for x in filled if types[x] == kind and x != source.command)
+        if found:
+            return choose(where, found, f"topics of {kind}", listing)
+    raise DataError(f"{where} holds no message of {_STATE}; {listing}")
 
 
 def _full_name(msgtype: str) -> str:
@@ -153,11 +275,20 @@ def _full_name(msgtype: str) -> str:
     return f"{package.removesuffix('/msg')}/msg/{name}"
 
 
-def _content(where: str, topic: str, number: int, message: Any) -> tuple[Layout, list[Array]]:  # noqa: ANN401
+def _content(
+    where: str,
+    topic: str,
+    number: int,
+    message: Any,  # noqa: ANN401
+    fields: Sequence[str],
+) -> tuple[Layout, list[Array]]:
     """Return what a message names, and the fields that it fills."""
-    names = tuple(message.name)
-    fields = {name: getattr(message, name) for name in _FIELDS}
-    for name, values in fields.items():
+    if hasattr(message, "joint_names"):
+        names, held = tuple(message.joint_names), _controlled(message)
+    else:
+        names = tuple(message.name)
+        held = dict(zip(fields, (message.position, message.velocity, message.effort), strict=True))
+    for name, values in held.items():
         if len(values) not in (0, len(names)):
             raise DataError(
                 f"{where}: message {number} on {topic!r} names {len(names)} joints but holds "
@@ -168,8 +299,29 @@ def _content(where: str, topic: str, number: int, message: Any) -> tuple[Layout,
             f"{where}: message {number} on {topic!r} names {listed(repeated(names))} twice; "
             "correct the recording"
         )
-    filled = {name: values for name, values in fields.items() if len(values)}
+    filled = {name: values for name, values in held.items() if len(values)}
     return (names, tuple(filled)), list(filled.values())
+
+
+def _controlled(message: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return what a controller's state holds; what is NaN throughout counts as empty.
+
+    Up to control_msgs 4 its points were called desired and actual.
+    """
+
+    def first(field: str, *points: str) -> Any:  # noqa: ANN401
+        found = (getattr(getattr(message, point, None), field, ()) for point in points)
+        return next((x for x in found if len(x) and not np.isnan(x).all()), ())
+
+    measured, wanted = ("feedback", "actual"), ("reference", "desired")
+    return {
+        "position": first("positions", *measured),
+        "velocity": first("velocities", *measured),
+        "effort": first("effort", *measured),
+        "qref": first("positions", "output", *wanted),
+        "dqref": first("velocities", "output", *wanted),
+        "tauref": first("effort", *wanted),
+    }
 
 
 def _columns(layout: Layout) -> list[str]:

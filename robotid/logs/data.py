@@ -17,8 +17,18 @@ from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
 
-__all__ = ["Log", "Trajectory"]
+__all__ = ["COLUMNS", "Log", "Trajectory"]
 
+#: Attributes of a `Log` with a column per joint, by the name of these columns in files.
+COLUMNS = {
+    "q": "q",
+    "dq": "v",
+    "ddq": "a",
+    "tau": "tau",
+    "qref": "q_ref",
+    "dqref": "v_ref",
+    "tauref": "tau_ref",
+}
 _LARGEST = 1e30  # in any unit; what is computed from it is still a number
 
 
@@ -29,12 +39,16 @@ class Log:
     Attributes:
         t: Time stamps, strictly increasing, shape (N,) [s].
         q: Joint positions, shape (N, n) [rad or m].
-        tau: Joint torques, shape (N, n) [N m or N].
+        tau: Joint torques, shape (N, n) [N m or N]; 0 without a torque.
         joints: Names of the n joints, in the order of the columns.
         v: Measured velocities, shape (N, n) [rad/s or m/s], or None.
         a: Measured accelerations, shape (N, n) [rad/s^2 or m/s^2], or None.
         path: The file it was read from; "" if it was made in memory.
         notes: What the reader should know, as columns that were ignored.
+        q_ref: Commanded positions, shape (N, n) [rad or m], or None.
+        v_ref: Commanded velocities, shape (N, n) [rad/s or m/s], or None.
+        tau_ref: Commanded feed-forward torques, shape (N, n) [N m or N], or None.
+        has_torque: Whether torques were recorded.
     """
 
     t: Array
@@ -45,10 +59,19 @@ class Log:
     a: Array | None = None
     path: str = ""
     notes: tuple[str, ...] = ()
+    q_ref: Array | None = None
+    v_ref: Array | None = None
+    tau_ref: Array | None = None
+    has_torque: bool = True
 
     def __post_init__(self) -> None:
         where = self.name
-        _settle(self, where, {"q": self.q, "dq": self.v, "ddq": self.a, "tau": self.tau})
+        _settle(self, where, {kind: getattr(self, name) for kind, name in COLUMNS.items()})
+        if not self.has_torque and self.tau.any():
+            raise DataError(
+                f"{where}: has_torque is False, but tau is not 0; leave has_torque out, or give "
+                "zeros"
+            )
         if len(self.t) < 2:
             raise DataError(f"{where} has {len(self.t)} rows, wanted at least 2")
         require_increasing(self.t, where)
@@ -103,7 +126,7 @@ class Log:
 
     def _arrays(self) -> dict[str, Any]:
         """Return the arrays with a column per joint, those that there are."""
-        arrays = {"q": self.q, "tau": self.tau, "v": self.v, "a": self.a}
+        arrays = {name: getattr(self, name) for name in COLUMNS.values()}
         return {name: x for name, x in arrays.items() if x is not None}
 
 
@@ -243,7 +266,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
                 f"for each time stamp, a column for each of the joints {listed(joints)}"
             )
         require_finite(array, t, [f"{name}_{joint}" for joint in joints], where)
-        settled[{"dq": "v", "ddq": "a"}.get(name, name)] = array
+        settled[COLUMNS.get(name, name)] = array
     for name, array in settled.items():
         object.__setattr__(owner, name, array)
     object.__setattr__(owner, "joints", joints)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from robotid._files import missing_file, written_whole
 from robotid._typing import Array
-from robotid.exceptions import DataError
+from robotid.exceptions import DataError, SettingsError
 from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
 from robotid.logs.bags import BagFormat
 from robotid.logs.csv_files import CsvFormat
@@ -41,8 +41,14 @@ def open_table(path: Path, source: LogSource) -> Table:
     Raises:
         DataError: If the file is missing, of another suffix or broken, or its table is not found.
         MissingDependencyError: If a package that reads it is not installed.
+        SettingsError: If the source names the commands' topic, and the file is no bag.
     """
     form = _format_of(path)
+    if source.command is not None and not isinstance(form, BagFormat):
+        raise SettingsError(
+            f"log.command is {source.command!r}, the topic of a bag, but {path.name} is none; its "
+            "commands are columns, as qref_<joint>"
+        )
     table = form.open(path, source)
     if isinstance(form, CsvFormat | ParquetFormat):  # which have no places in them
         table = with_own_names(table, path.name, f"{path.suffix} files", source)

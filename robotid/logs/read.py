@@ -1,7 +1,8 @@
 """Log files of every format: one row per sample and one column per quantity and joint.
 
 Columns are `time` [s], and for each joint `q_<joint>` [rad or m], optionally `dq_<joint>` and
-`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]. Aliases are read, too. With a
+`ddq_<joint>`, and `tau_<joint>` [N m or N] or `current_<joint>` [A]; and what was commanded,
+`qref_<joint>`, optionally `dqref_<joint>` and `tauref_<joint>`. Aliases are read, too. With a
 transmission, `qm_<motor>`, `taum_<motor>` [N m] and the like of the motors stand for those.
 """
 
@@ -9,27 +10,47 @@ import difflib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
-from robotid.logs.data import Log, repeated, require_finite, require_increasing, suggestion
+from robotid.logs.data import (
+    COLUMNS,
+    Log,
+    repeated,
+    require_finite,
+    require_increasing,
+    suggestion,
+)
 from robotid.logs.foreign_tables import Frame, is_frame, open_frame, with_own_names
 from robotid.logs.formats import open_table, write_columns
 from robotid.logs.settings import PER_SECOND, LogSource, LogUnits
-from robotid.logs.table import Table, prefixes
+from robotid.logs.table import Table, prefixes, quantity_of
 from robotid.logs.transmission import Transmission, check_transmissions
 from robotid.logs.units import check_units
 
-__all__ = ["LogLayout", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
+__all__ = ["LogLayout", "Needs", "Readable", "lay_out", "read_log", "read_logs", "write_log"]
 
 #: What is a log, or holds one: a file or a DataFrame with the columns of a log.
 Readable = Log | str | Path | Frame
 
-_NOUNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque or current"}
+#: What a log is read for beside its positions, as of ``lay_out``.
+Needs: TypeAlias = Literal["torque", "motion", "commands"]
+
+_NOUNS = {
+    "q": "position",
+    "dq": "velocity",
+    "ddq": "acceleration",
+    "tau": "torque or current",
+    "qref": "commanded position",
+    "dqref": "commanded velocity",
+    "tauref": "commanded torque",
+}
+_TORQUES = ("tau", "tauref")
+_SIZES = ("loadsize_", "load_size_")  # of loads without their sign, as bus servos give them
 _SI = LogUnits()
 _WHOLE = LogSource()
 
@@ -46,7 +67,7 @@ def read_log(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
-    is_motion: bool = False,
+    needs: Needs = "torque",
 ) -> Log:
     """Return the log in a file or a DataFrame, in SI units; its notes tell what was ignored.
 
@@ -63,7 +84,7 @@ def read_log(
         prismatic: Names of joints that slide; the others turn. Names that are not read are ignored.
         source: Which topic of a bag or group of a file, names of joints in it, meaning of effort.
         transmissions: The motors and gears, where the file has columns of motors.
-        is_motion: Whether it is read for its motion alone, as of ``lay_out``.
+        needs: What is wanted beside positions, as of ``lay_out``.
 
     Raises:
         DataError: If the file does not hold what is wanted, or looks like other units.
@@ -72,7 +93,7 @@ def read_log(
     """
     layout, table = lay_out(
         path, joints, gains=gains, columns=columns, units=units, prismatic=prismatic,
-        source=source, transmissions=transmissions, is_motion=is_motion,
+        source=source, transmissions=transmissions, needs=needs,
     )  # fmt: skip
     log = layout.to_log(table.read(layout.wanted))
     check_units(log, units, prismatic)
@@ -84,7 +105,7 @@ def read_logs(
     joints: Sequence[str],
     *,
     prismatic: Collection[str] = (),
-    is_motion: bool = False,
+    needs: Needs = "torque",
 ) -> tuple[Log, ...]:
     """Return the logs that a user gives, one or several, each read if it is not a ``Log``.
 
@@ -92,7 +113,7 @@ def read_logs(
         given: A log that has these joints, a path, a DataFrame, or a sequence of these.
         joints: Names of the joints wanted, in the order wanted.
         prismatic: Names of joints that slide; the others turn.
-        is_motion: Whether they are read for their motion alone, as of ``lay_out``.
+        needs: What is wanted beside positions, as of ``lay_out``.
 
     Raises:
         DataError: If it is something else, or does not hold what is wanted.
@@ -105,15 +126,22 @@ def read_logs(
     else:
         raise _no_log(given)
     return tuple(
-        _of_joints(log, joints)
+        _of_joints(log, joints, needs)
         if isinstance(log, Log)
-        else read_log(log, joints, prismatic=prismatic, is_motion=is_motion)
+        else read_log(log, joints, prismatic=prismatic, needs=needs)
         for log in logs
     )
 
 
-def _of_joints(log: Log, joints: Sequence[str]) -> Log:
-    """Return a log with its columns in the order of some joints, all of which it must have."""
+def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
+    """Return a log with its columns in the order of some joints, with all that is needed."""
+    if needs == "torque" and not log.has_torque:
+        raise DataError(f"{log.name} has no torque. {_without_torque(log.q_ref is not None)}")
+    if needs == "commands" and log.q_ref is None:
+        raise DataError(
+            f"{log.name} has no commanded positions; give them as Log(..., q_ref=...), an array "
+            "like q"
+        )
     absent = [joint for joint in joints if joint not in log.joints]
     if absent:
         held = ", ".join(f"{joint!r}: 0.0" for joint in absent)
@@ -123,6 +151,15 @@ def _of_joints(log: Log, joints: Sequence[str]) -> Log:
             f"RobotModel.from_urdf(..., locked={{{held}}})"
         )
     return log if log.joints == tuple(joints) else log.select(joints)
+
+
+def _without_torque(is_commanded: bool) -> str:
+    """Return what a log without any torque can do."""
+    begin = "Its commands are" if is_commanded else "Commanded positions, qref_<joint>, would be"
+    return (
+        f'{begin} enough for [estimator] name = "simulation" with a [controller] table; all other '
+        "estimators need tau_<joint> or current_<joint>"
+    )
 
 
 def _no_log(thing: object) -> DataError:
@@ -181,7 +218,7 @@ class LogLayout:
         for kind, is_motor in self.motors.items():
             if kind not in values:
                 continue
-            if self.units.angle == "deg" and kind != "tau":
+            if self.units.angle == "deg" and kind not in _TORQUES:
                 is_length = slides & ~np.array(is_motor)
                 values[kind] = values[kind] * np.where(is_length, 1.0, np.pi / 180)
             values[kind] = self._of_joints(kind, values[kind])
@@ -191,16 +228,14 @@ class LogLayout:
             require_finite(array, t, names, where, first)
             array.flags.writeable = False  # so that the log need not copy it
         require_increasing(t, where, first)
+        has_torque = "tau" in values
+        if not has_torque:
+            values["tau"] = np.zeros_like(values["q"])
+        arrays = {name: values[kind] for kind, name in COLUMNS.items() if kind in values}
         return Log(
-            t=t,
-            q=values["q"],
-            v=values.get("dq"),
-            a=values.get("ddq"),
-            tau=values.get("tau", np.zeros_like(values["q"])),
-            joints=self.joints,
-            path=self.path,
-            notes=self.notes,
-        )
+            t=t, joints=self.joints, path=self.path, notes=self.notes, has_torque=has_torque,
+            **arrays,
+        )  # fmt: skip
 
     def _of_joints(self, kind: str, values: Array) -> Array:
         """Return values of joints: those of motors, in their places, through their gears."""
@@ -212,8 +247,8 @@ class LogLayout:
             if not self.motors[kind][places[0]]:
                 continue
             own = values[:, places].T
-            moved = gear.to_torque @ own if kind == "tau" else np.linalg.solve(gear.T, own)
-            if kind == "q" and gear.offset:
+            moved = gear.to_torque @ own if kind in _TORQUES else np.linalg.solve(gear.T, own)
+            if kind in ("q", "qref") and gear.offset:
                 moved += np.array(gear.offset)[:, None]
             values[:, places] = moved.T
         return values
@@ -229,7 +264,7 @@ def lay_out(
     prismatic: Collection[str] = (),
     source: LogSource = _WHOLE,
     transmissions: Sequence[Transmission] = (),
-    is_motion: bool = False,
+    needs: Needs = "torque",
 ) -> tuple[LogLayout, Table]:
     """Return which columns of a file make up a log, before any is read, and its opened table.
 
@@ -242,14 +277,17 @@ def lay_out(
         prismatic: As of ``read_log``.
         source: As of ``read_log``.
         transmissions: As of ``read_log``.
-        is_motion: Whether the file is read for its motion alone: its torques, if it has any, are
-            ignored, and those of the log are 0.
+        needs: What is wanted beside positions: "torque", of every joint; "motion", nothing;
+            "commands", a commanded position of every joint, and torques and further commands if
+            every joint has them. What is not wanted is ignored; torques not read are 0.
 
     Raises:
         DataError: If the file does not hold what is wanted.
         SettingsError: If gains, columns or the source name what is not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
+    if needs not in get_args(Needs):
+        raise SettingsError(f"needs is {needs!r}, wanted one of {listed(get_args(Needs))}")
     if isinstance(joints, str) or not joints:
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
     if isinstance(path, str | Path):
@@ -262,7 +300,7 @@ def lay_out(
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
     finder = _Finder(
-        where, opened.names, stated, tuple(joints), gains or {}, source, gears, is_motion,
+        where, opened.names, stated, tuple(joints), gains or {}, source, gears, needs,
         [*opened.notes],
     )  # fmt: skip
     found = finder.find_all()  # names of columns by kind
@@ -297,8 +335,9 @@ def write_log(log: Log, path: str | Path) -> None:
         OSError: If the folder cannot be written to.
     """
     table = {"time": log.t}
-    for kind, values in (("q", log.q), ("dq", log.v), ("ddq", log.a), ("tau", log.tau)):
-        if values is not None:
+    for kind, name in COLUMNS.items():
+        values = getattr(log, name)
+        if values is not None and (kind != "tau" or log.has_torque):
             table |= {f"{kind}_{joint}": values[:, j] for j, joint in enumerate(log.joints)}
     write_columns(table, Path(path))
 
@@ -314,26 +353,28 @@ class _Finder:
     gains: Mapping[str, float]
     source: LogSource
     gears: tuple[Transmission, ...]
-    is_motion: bool = False
+    needs: Needs = "torque"
     notes: list[str] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # read, or named in a note of their own
 
     def find_all(self) -> dict[str, list[str]]:
-        """Return the names of the columns to read: of time, q, tau, and dq and ddq if complete.
-
-        Of a motion there is no tau.
-        """
+        """Return the names of the columns to read: of time, q, what is needed, what is complete."""
         self._check_arguments()
         found = {
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
             "q": [column or self._missing(*at) for at, column in self._each("q")],
         }
-        if not self.is_motion:
+        optional = ["dq", "ddq"]
+        if self.needs == "commands":
+            found["qref"] = self._find_commands()
+            optional += ["dqref", "tauref"]
+        if self.needs == "torque" or (self.needs == "commands" and self._is_torque_whole()):
             found["tau"] = [
                 self._find_torque(self.joints[j], is_motor)
                 for j, is_motor in enumerate(self.of_motors("tau"))
             ]
-        found |= {kind: names for kind in ("dq", "ddq") if (names := self._find_optional(kind))}
+        found |= {kind: names for kind in optional if (names := self._find_optional(kind))}
+        self._note_sizes()
         extra = [name for name in self.names if name not in self.seen]
         if extra:
             self.notes.append(f"columns ignored: {listed(extra)}")
@@ -469,6 +510,52 @@ class _Finder:
             raise self._no_gain(joint, current)
         return tau or current or self._missing(f"tau{m}", joint)
 
+    def _is_torque_whole(self) -> bool:
+        """Return whether every joint has a torque, or a current with its gain; note it if few."""
+        without = []
+        for joint, is_motor in zip(self.joints, self.of_motors("tau"), strict=True):
+            m, name = ("m", self.motors[joint]) if is_motor else ("", joint)
+            has_gain = name in self.gains
+            if not (self._has(f"tau{m}", name) or (has_gain and self._has(f"current{m}", name))):
+                without.append(joint)
+        if without and any(self.has_torque(joint) for joint in self.joints):
+            self.notes.append(
+                f"torques ignored: {listed(without)} have none, nor a current with a gain"
+            )
+        return not without
+
+    def _find_commands(self) -> list[str]:
+        """Return the columns of the commanded position of every joint."""
+        found = self._each("qref")
+        without = [joint for (_, joint), column in found if column is None]
+        if not without:
+            return [column for _, column in found if column]
+        known = [name for name in self.names if (quantity_of(name) or ("",))[0] == "qref"]
+        if len(without) == len(found):
+            raise DataError(
+                f"{self.where} has no commanded position, as 'qref_{self.joints[0]}', of any joint "
+                f"read; columns of commanded positions found: {listed(known)}. Record what the "
+                "controller was told, rename the columns, or pass columns={'qref_<joint>': ...}"
+                + "".join(f"; {note}" for note in self.notes),
+                code="missing_column",
+            )
+        raise DataError(
+            f"{self.where} has commanded positions, but none of {listed(without)}: no column "
+            f"'qref_{self._named(without[0])}'; found: {listed(known)}. Record or rename what is "
+            "missing, pass columns={'qref_<joint>': ...}, or lock joints that stood still",
+            code="missing_column",
+        )
+
+    def _note_sizes(self) -> None:
+        """Note loads without their sign, which nothing reads."""
+        sizes = [name for name in self.names if name.startswith(_SIZES) and name not in self.seen]
+        self.seen.update(sizes)
+        if sizes:
+            self.notes.append(
+                f"{listed(sizes)} ignored: the size of a load without its sign is no torque; it "
+                "does not tell a drive that pushes from one that brakes"
+            )
+
     def _no_gain(self, joint: str, current: str) -> DataError:
         """Return the error of a current without a gain, with all that the others lack, too."""
         without = [joint]
@@ -508,15 +595,15 @@ class _Finder:
         """Refuse a file without a column, naming those of its kind and the nearest."""
         standard = f"{kind}_{joint}" if joint else kind
         noun = f"{_NOUNS[kind.removesuffix('m')]} columns" if joint else "columns"
-        known, named = prefixes(self.source.effort), self._named(joint)
-        starts = (*known.get(kind, ("",)), *(known["current"] if kind == "tau" else ()))
+        kinds, named = (kind, "current") if kind == "tau" else (kind,), self._named(joint)
         others = {self._named(other) for other in self.joints}
         found, ends = [], {}  # columns; and by the joint that they name, if it is not another's
         for name in self.names:
-            for prefix in [prefix for prefix in starts if name.startswith(prefix)]:
+            quantity, end = quantity_of(name, self.source.effort) or ("", name)
+            if quantity in kinds or not joint:
                 found.append(name)
-                if name[len(prefix) :] not in others:
-                    ends[name[len(prefix) :]] = name
+                if end not in others:
+                    ends[end] = name
         nearest = difflib.get_close_matches(named or kind, ends, n=1)
         near = repr(ends[nearest[0]]) if nearest else "..."
         hint = f"Did you mean {near}? " if nearest else ""
@@ -530,6 +617,9 @@ class _Finder:
                 f". Columns of motors, as {at_motors[0]}, need the gears: [[transmission]] with "
                 "joints and matrix"
             )
+        if kind == "tau" and not any(self.has_torque(other) for other in self.joints):
+            is_commanded = all(self._has("qref", other) for other in self.joints)
+            stood = f". {_without_torque(is_commanded)}"
         raise DataError(
             f"{self.where} has no column {sought!r}; {noun} found: {listed(found)}. {hint}"
             f"Rename it, or pass columns={{{standard!r}: {near}}}{stood}",
@@ -550,8 +640,13 @@ class _Finder:
         )
 
     def _is_logged(self, joint: str) -> bool:
-        """Return whether the file has a position, and a torque or a current, of a joint."""
-        return self._has("q", joint) and (self.is_motion or self.has_torque(joint))
+        """Return whether the file has what is needed of a joint."""
+        is_there = {
+            "torque": self.has_torque(joint),
+            "motion": True,
+            "commands": self._has("qref", joint),
+        }
+        return self._has("q", joint) and is_there[self.needs]
 
     def has_torque(self, joint: str) -> bool:
         """Return whether the file has a torque or a current of a joint."""

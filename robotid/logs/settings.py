@@ -114,6 +114,11 @@ class LogSource(Settings):
         "the topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; not needed if "
         "there is only one",
     )
+    command: str | None = setting(
+        None,
+        "the topic of a bag with joint states that were commanded, if its measured ones have "
+        "another",
+    )
     joints: Mapping[str, str] = setting({}, "name in the file by joint, where they differ")
     effort: str = setting(
         "torque",

@@ -45,6 +45,7 @@ def check_units(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     if units.angle is None:
         check_reach(log, units, prismatic)
         _check_degrees(log, np.where(turns, factor, np.nan))
+        _check_commands(log, turns)
     for j in np.flatnonzero(_is_near(factor, -1.0)):
         raise DataError(
             f"{log.name}: dq_{log.joints[j]} has the opposite sign of d(q)/dt of "
@@ -95,13 +96,34 @@ def check_reach(log: Log, units: LogUnits, prismatic: Collection[str] = ()) -> N
     if units.angle is not None:
         return
     turns = np.array([name not in prismatic for name in log.joints])
-    reach = np.where(turns, np.abs(log.q).max(axis=0), 0.0)  # (n,)
-    j = int(np.argmax(reach))
-    if reach[j] > _FARTHEST:
+    for kind, values in (("q", log.q), ("qref", log.q_ref)):
+        if values is None:
+            continue
+        reach = np.where(turns, np.abs(values).max(axis=0), 0.0)  # (n,)
+        j = int(np.argmax(reach))
+        if reach[j] > _FARTHEST:
+            raise DataError(
+                f"{log.name}: {kind}_{log.joints[j]} reaches {reach[j]:.4g}, which "
+                f"looks like degrees (in radians {reach[j] / (2 * np.pi):.1f} turns). "
+                f"{_how_to_state('angle', 'deg', 'rad')}",
+                code="angle_unit",
+            )
+
+
+def _check_commands(log: Log, turns: Array) -> None:
+    """Refuse joints of which only one of position and commanded position is in degrees."""
+    if log.q_ref is None:
+        return
+    q, wanted = log.q - log.q.mean(axis=0), log.q_ref - log.q_ref.mean(axis=0)
+    both = np.einsum("kj,kj->j", q, wanted)
+    sizes = np.linalg.norm(q, axis=0), np.linalg.norm(wanted, axis=0)
+    follows = turns & (both > _ALIKE * sizes[0] * sizes[1])
+    factor = sizes[1] / np.where(follows, sizes[0], np.nan)
+    for j in np.flatnonzero(_is_near(factor, _DEGREES) | _is_near(factor, 1 / _DEGREES)):
         raise DataError(
-            f"{log.name}: q_{log.joints[j]} reaches {reach[j]:.4g}, which "
-            f"looks like degrees (in radians {reach[j] / (2 * np.pi):.1f} turns). "
-            f"{_how_to_state('angle', 'deg', 'rad')}",
+            f"{log.name}: qref_{log.joints[j]} moves {factor[j]:.3g} times as far as "
+            f"q_{log.joints[j]}: one of them looks like degrees, the other like radians. Convert "
+            f"one of them in the recording. {_how_to_state('angle', 'deg', 'rad', both=True)}",
             code="angle_unit",
         )
 

@@ -6,7 +6,7 @@ step by step, body after body and pair after pair, with the instants in the inne
 
 import numpy as np
 
-from robotid.regressor.lanes import compiled
+from robotid.regressor.lanes import add, compiled, cross, dot, scale
 
 __all__ = ["gradient_along", "rows_along"]
 
@@ -26,26 +26,6 @@ def _gain(x, k, n, u):
     x[0, k, n] += u[0]
     x[1, k, n] += u[1]
     x[2, k, n] += u[2]
-
-
-@compiled
-def _cross(u, v):
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-
-
-@compiled
-def _dot(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-@compiled
-def _plus(u, v):
-    return u[0] + v[0], u[1] + v[1], u[2] + v[2]
-
-
-@compiled
-def _times(s, u):
-    return s * u[0], s * u[1], s * u[2]
 
 
 @compiled
@@ -86,22 +66,22 @@ def _place(parent, i, joint, slides, q, R, p, screw):
     for n in range(q.shape[1]):
         cosine, sine = np.cos(q[i, n]), np.sin(q[i, n])
         at = _get3(joint, 27)
-        at = _plus(at, _times(q[i, n], _get3(joint, 30)))
+        at = add(at, scale(q[i, n], _get3(joint, 30)))
         for c in range(3):
-            column = _plus(_get3(joint, 3 * c), _times(cosine, _get3(joint, 9 + 3 * c)))
-            column = _plus(column, _times(sine, _get3(joint, 18 + 3 * c)))
+            column = add(_get3(joint, 3 * c), scale(cosine, _get3(joint, 9 + 3 * c)))
+            column = add(column, scale(sine, _get3(joint, 18 + 3 * c)))
             if parent >= 0:
                 column = _out(R, parent, n, column)
             R[0, c, i, n], R[1, c, i, n], R[2, c, i, n] = column
         if parent >= 0:
-            at = _plus(_get(p, parent, n), _out(R, parent, n, at))
+            at = add(_get(p, parent, n), _out(R, parent, n, at))
         _put(p, i, n, at)
         if slides:
             _put(screw[0], i, n, _out(R, i, n, _get3(joint, 33)))
             _put(screw[1], i, n, (0.0, 0.0, 0.0))
         else:
             axis = _out(R, i, n, _get3(joint, 36))
-            _put(screw[0], i, n, _cross(at, axis))
+            _put(screw[0], i, n, cross(at, axis))
             _put(screw[1], i, n, axis)
 
 
@@ -120,10 +100,10 @@ def _move(parent, i, v, a, gravity, screw, velocity, acceleration):
             linear, angular = _get(velocity[0], parent, n), _get(velocity[1], parent, n)
             d, dw = _get(acceleration[0], parent, n), _get(acceleration[1], parent, n)
         s, e = _get(screw[0], i, n), _get(screw[1], i, n)
-        linear, angular = _plus(linear, _times(v[i, n], s)), _plus(angular, _times(v[i, n], e))
-        turned = _plus(_cross(angular, s), _cross(linear, e))
-        d = _plus(d, _plus(_times(a[i, n], s), _times(v[i, n], turned)))
-        dw = _plus(dw, _plus(_times(a[i, n], e), _times(v[i, n], _cross(angular, e))))
+        linear, angular = add(linear, scale(v[i, n], s)), add(angular, scale(v[i, n], e))
+        turned = add(cross(angular, s), cross(linear, e))
+        d = add(d, add(scale(a[i, n], s), scale(v[i, n], turned)))
+        dw = add(dw, add(scale(a[i, n], e), scale(v[i, n], cross(angular, e))))
         _put(velocity[0], i, n, linear)
         _put(velocity[1], i, n, angular)
         _put(acceleration[0], i, n, d)
@@ -135,7 +115,7 @@ def _see(R, p, to, i, what, k, out):
     """Write motions of the world as body i sees them: entry ``k`` of ``what`` to ``to``."""
     for n in range(p.shape[2]):
         linear, angular = _get(what[0], k, n), _get(what[1], k, n)
-        linear = _plus(linear, _cross(angular, _get(p, i, n)))
+        linear = add(linear, cross(angular, _get(p, i, n)))
         _put(out[0], to, n, _into(R, i, n, linear))
         _put(out[1], to, n, _into(R, i, n, angular))
 
@@ -146,11 +126,11 @@ def _row(k, i, own_velocity, own_acceleration, seen, rows):
     for n in range(rows.shape[2]):
         u, e = _get(seen[0], k, n), _get(seen[1], k, n)
         w, dw = _get(own_velocity[1], i, n), _get(own_acceleration[1], i, n)
-        d = _plus(_get(own_acceleration[0], i, n), _cross(w, _get(own_velocity[0], i, n)))
-        f = _cross(e, w)
-        first = _plus(_cross(u, dw), _cross(d, e))
-        first = _plus(first, _plus(_times(_dot(w, u), w), _times(-_dot(w, w), u)))
-        rows[k, 0, n] = _dot(u, d)
+        d = add(_get(own_acceleration[0], i, n), cross(w, _get(own_velocity[0], i, n)))
+        f = cross(e, w)
+        first = add(cross(u, dw), cross(d, e))
+        first = add(first, add(scale(dot(w, u), w), scale(-dot(w, w), u)))
+        rows[k, 0, n] = dot(u, d)
         rows[k, 1, n], rows[k, 2, n], rows[k, 3, n] = first
         rows[k, 4, n] = e[0] * dw[0] + f[0] * w[0]
         rows[k, 5, n] = e[0] * dw[1] + f[0] * w[1] + e[1] * dw[0] + f[1] * w[0]
@@ -200,7 +180,7 @@ def rows_along(parents, joints, slides, gravity, pairs, q, v, a):
 @compiled
 def _turn(y, g):
     """Return g^T (y x) as a force, y and g as (linear, angular)."""
-    return _cross(g[0], y[1]), _plus(_cross(g[0], y[0]), _cross(g[1], y[1]))
+    return cross(g[0], y[1]), add(cross(g[0], y[0]), cross(g[1], y[1]))
 
 
 @compiled
@@ -209,19 +189,19 @@ def _pull_pair(k, i, j, weights, R, p, screw, own_velocity, own_acceleration, se
     for n in range(weights.shape[2]):
         u, e = _get(seen[0], k, n), _get(seen[1], k, n)
         w, dw = _get(own_velocity[1], i, n), _get(own_acceleration[1], i, n)
-        d = _plus(_get(own_acceleration[0], i, n), _cross(w, _get(own_velocity[0], i, n)))
+        d = add(_get(own_acceleration[0], i, n), cross(w, _get(own_velocity[0], i, n)))
         mass, h = weights[k, 0, n], (weights[k, 1, n], weights[k, 2, n], weights[k, 3, n])
-        wh, wu, Mw = _dot(w, h), _dot(w, u), _symmetric(weights, k, n, w)
-        to_u = _plus(_plus(_times(mass, d), _cross(dw, h)), _times(wh, w))
-        to_u = _plus(to_u, _times(-_dot(w, w), h))
-        to_e = _plus(_plus(_cross(h, d), _symmetric(weights, k, n, dw)), _cross(w, Mw))
-        to_w = _plus(_plus(_times(wu, h), _times(wh, u)), _times(-2.0 * _dot(h, u), w))
-        to_w = _plus(to_w, _plus(_cross(Mw, e), _symmetric(weights, k, n, _cross(e, w))))
-        _gain(work[0], i, n, _plus(_times(mass, u), _cross(e, h)))
-        _gain(work[1], i, n, _plus(_cross(h, u), _symmetric(weights, k, n, e)))
+        wh, wu, Mw = dot(w, h), dot(w, u), _symmetric(weights, k, n, w)
+        to_u = add(add(scale(mass, d), cross(dw, h)), scale(wh, w))
+        to_u = add(to_u, scale(-dot(w, w), h))
+        to_e = add(add(cross(h, d), _symmetric(weights, k, n, dw)), cross(w, Mw))
+        to_w = add(add(scale(wu, h), scale(wh, u)), scale(-2.0 * dot(h, u), w))
+        to_w = add(to_w, add(cross(Mw, e), _symmetric(weights, k, n, cross(e, w))))
+        _gain(work[0], i, n, add(scale(mass, u), cross(e, h)))
+        _gain(work[1], i, n, add(cross(h, u), _symmetric(weights, k, n, e)))
         _gain(work[2], i, n, to_w)
         linear = _out(R, i, n, to_u)
-        angular = _plus(_out(R, i, n, to_e), _cross(_get(p, i, n), linear))
+        angular = add(_out(R, i, n, to_e), cross(_get(p, i, n), linear))
         turn = _turn((_get(screw[0], j, n), _get(screw[1], j, n)), (linear, angular))
         _gain(work[3], i, n, turn[0])
         _gain(work[4], i, n, turn[1])
@@ -234,16 +214,16 @@ def _pull_body(i, R, p, velocity, acceleration, own_velocity, work):
     """Turn what is pulled at body i, seen by it, to what is at its motion in the world."""
     for n in range(p.shape[2]):
         to_d, to_dw, w = _get(work[0], i, n), _get(work[1], i, n), _get(own_velocity[1], i, n)
-        to_w = _plus(_get(work[2], i, n), _cross(_get(own_velocity[0], i, n), to_d))
+        to_w = add(_get(work[2], i, n), cross(_get(own_velocity[0], i, n), to_d))
         place = _get(p, i, n)
         linear = _out(R, i, n, to_d)
-        by_a = linear, _plus(_out(R, i, n, to_dw), _cross(place, linear))
-        linear = _out(R, i, n, _cross(to_d, w))
-        by_v = linear, _plus(_out(R, i, n, to_w), _cross(place, linear))
+        by_a = linear, add(_out(R, i, n, to_dw), cross(place, linear))
+        linear = _out(R, i, n, cross(to_d, w))
+        by_v = linear, add(_out(R, i, n, to_w), cross(place, linear))
         one = _turn((_get(velocity[0], i, n), _get(velocity[1], i, n)), by_v)
         other = _turn((_get(acceleration[0], i, n), _get(acceleration[1], i, n)), by_a)
-        _gain(work[3], i, n, _plus(one[0], other[0]))
-        _gain(work[4], i, n, _plus(one[1], other[1]))
+        _gain(work[3], i, n, add(one[0], other[0]))
+        _gain(work[4], i, n, add(one[1], other[1]))
         _put(work[0], i, n, by_a[0])
         _put(work[1], i, n, by_a[1])
         _put(work[2], i, n, by_v[0])
@@ -257,26 +237,26 @@ def _pull_joint(i, parent, v, a, screw, velocity, work, out):
         s = _get(screw[0], i, n), _get(screw[1], i, n)
         V = _get(velocity[0], i, n), _get(velocity[1], i, n)
         S_A = _get(work[0], i, n), _get(work[1], i, n)
-        c = _plus(_cross(V[1], s[0]), _cross(V[0], s[1])), _cross(V[1], s[1])
+        c = add(cross(V[1], s[0]), cross(V[0], s[1])), cross(V[1], s[1])
         bent, back = _turn(V, S_A), _turn(s, S_A)
         S_V = (
-            _plus(_get(work[2], i, n), _times(-v[i, n], back[0])),
-            _plus(_get(work[7], i, n), _times(-v[i, n], back[1])),
+            add(_get(work[2], i, n), scale(-v[i, n], back[0])),
+            add(_get(work[7], i, n), scale(-v[i, n], back[1])),
         )
         by_s = (
-            _plus(_get(work[5], i, n), _plus(_times(a[i, n], S_A[0]), _times(v[i, n], bent[0]))),
-            _plus(_get(work[6], i, n), _plus(_times(a[i, n], S_A[1]), _times(v[i, n], bent[1]))),
+            add(_get(work[5], i, n), add(scale(a[i, n], S_A[0]), scale(v[i, n], bent[0]))),
+            add(_get(work[6], i, n), add(scale(a[i, n], S_A[1]), scale(v[i, n], bent[1]))),
         )
-        by_s = (_plus(by_s[0], _times(v[i, n], S_V[0])), _plus(by_s[1], _times(v[i, n], S_V[1])))
+        by_s = (add(by_s[0], scale(v[i, n], S_V[0])), add(by_s[1], scale(v[i, n], S_V[1])))
         own = _turn(s, by_s)
         turn = (
-            _plus(_get(work[3], i, n), _times(-1.0, own[0])),
-            _plus(_get(work[4], i, n), _times(-1.0, own[1])),
+            add(_get(work[3], i, n), scale(-1.0, own[0])),
+            add(_get(work[4], i, n), scale(-1.0, own[1])),
         )
-        out[0, i, n] = _dot(s[0], turn[0]) + _dot(s[1], turn[1])
-        out[1, i, n] = _dot(c[0], S_A[0]) + _dot(c[1], S_A[1])
-        out[1, i, n] += _dot(s[0], S_V[0]) + _dot(s[1], S_V[1])
-        out[2, i, n] = _dot(s[0], S_A[0]) + _dot(s[1], S_A[1])
+        out[0, i, n] = dot(s[0], turn[0]) + dot(s[1], turn[1])
+        out[1, i, n] = dot(c[0], S_A[0]) + dot(c[1], S_A[1])
+        out[1, i, n] += dot(s[0], S_V[0]) + dot(s[1], S_V[1])
+        out[2, i, n] = dot(s[0], S_A[0]) + dot(s[1], S_A[1])
         if parent >= 0:
             _gain(work[0], parent, n, S_A[0])
             _gain(work[1], parent, n, S_A[1])

@@ -18,7 +18,19 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["LANES", "compiled", "finish_rows", "inertial_rows", "state_size"]
+__all__ = [
+    "LANES",
+    "add",
+    "compiled",
+    "cos_sin",
+    "cross",
+    "dot",
+    "finish_rows",
+    "inertial_rows",
+    "into_child",
+    "scale",
+    "state_size",
+]
 
 LANES = 64
 _STATE = 12  # w, v, dw, a of a body
@@ -67,33 +79,33 @@ def _put3(x, at, k, lane, u):
 
 
 @compiled
-def _cross(u, v):
+def cross(u, v):
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 @compiled
-def _add(u, v):
+def add(u, v):
     return u[0] + v[0], u[1] + v[1], u[2] + v[2]
 
 
 @compiled
-def _scale(s, u):
+def scale(s, u):
     return s * u[0], s * u[1], s * u[2]
 
 
 @compiled
-def _dot(u, v):
+def dot(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
 @compiled
-def _into_child(X, Y, Z, u):
+def into_child(X, Y, Z, u):
     """Return R^T u; X, Y, Z are the columns of R."""
-    return _dot(X, u), _dot(Y, u), _dot(Z, u)
+    return dot(X, u), dot(Y, u), dot(Z, u)
 
 
 @compiled
-def _cos_sin(angle):
+def cos_sin(angle):
     """Return cosine and sine: Cody and Waite's reduction, fdlibm's polynomials, no branch."""
     n = (angle * 0.6366197723675814 + _ROUND) - _ROUND  # quarter turns
     r = ((angle - n * _HALF_PI[0]) - n * _HALF_PI[1]) - n * _HALF_PI[2]
@@ -122,7 +134,7 @@ def _load(work, joint, q, v, a, leader, first, last):
         _put(work, 0, _MOTION + 3, lane, ratio * v[k, leader])
         _put(work, 0, _MOTION + 4, lane, ratio * a[k, leader])
     for lane in range(LANES):
-        cosine, sine = _cos_sin(_get(work, 0, _MOTION + 2, lane))
+        cosine, sine = cos_sin(_get(work, 0, _MOTION + 2, lane))
         _put(work, 0, _MOTION, lane, cosine)
         _put(work, 0, _MOTION + 1, lane, sine)
 
@@ -152,15 +164,15 @@ def _move(work, joint, parent, own):
         w0, v0 = _get3(work, parent, 0, lane), _get3(work, parent, 3, lane)
         dw0, a0 = _get3(work, parent, 6, lane), _get3(work, parent, 9, lane)
         rate, change = _get(work, 0, _MOTION + 3, lane), _get(work, 0, _MOTION + 4, lane)
-        turn, slide = _scale(rate, axis_w), _scale(rate, axis_v)
-        w = _add(_into_child(X, Y, Z, w0), turn)
-        v = _add(_into_child(X, Y, Z, _add(v0, _cross(w0, p))), slide)
-        dw = _add(_into_child(X, Y, Z, dw0), _add(_scale(change, axis_w), _cross(w, turn)))
-        a = _add(_into_child(X, Y, Z, _add(a0, _cross(dw0, p))), _scale(change, axis_v))
+        turn, slide = scale(rate, axis_w), scale(rate, axis_v)
+        w = add(into_child(X, Y, Z, w0), turn)
+        v = add(into_child(X, Y, Z, add(v0, cross(w0, p))), slide)
+        dw = add(into_child(X, Y, Z, dw0), add(scale(change, axis_w), cross(w, turn)))
+        a = add(into_child(X, Y, Z, add(a0, cross(dw0, p))), scale(change, axis_v))
         _put3(work, own, 0, lane, w)
         _put3(work, own, 3, lane, v)
         _put3(work, own, 6, lane, dw)
-        _put3(work, own, 9, lane, _add(a, _add(_cross(v, turn), _cross(w, slide))))
+        _put3(work, own, 9, lane, add(a, add(cross(v, turn), cross(w, slide))))
 
 
 @compiled
@@ -171,7 +183,7 @@ def _share(work, own):
         dw, a = _get3(work, own, 6, lane), _get3(work, own, 9, lane)
         xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
         xy, xz, yz = w[0] * w[1], w[0] * w[2], w[1] * w[2]
-        _put3(work, 0, 12, lane, _add(a, _cross(w, v)))
+        _put3(work, 0, 12, lane, add(a, cross(w, v)))
         _put3(work, 0, 15, lane, (-(yy + zz), xy + dw[2], xz - dw[1]))
         _put3(work, 0, 18, lane, (xy - dw[2], -(xx + zz), yz + dw[0]))
         _put3(work, 0, 21, lane, (xz + dw[1], yz - dw[0], -(xx + yy)))
@@ -186,8 +198,8 @@ def _carry(work, parent, own):
         X, Y, Z = _get3(work, 0, 0, lane), _get3(work, 0, 3, lane), _get3(work, 0, 6, lane)
         p = _get3(work, 0, 9, lane)
         v, w = _get3(work, parent, 0, lane), _get3(work, parent, 3, lane)
-        _put3(work, own, 0, lane, _into_child(X, Y, Z, _add(v, _cross(w, p))))
-        _put3(work, own, 3, lane, _into_child(X, Y, Z, w))
+        _put3(work, own, 0, lane, into_child(X, Y, Z, add(v, cross(w, p))))
+        _put3(work, own, 3, lane, into_child(X, Y, Z, w))
 
 
 @compiled
@@ -199,8 +211,8 @@ def _row(work, axis):
         X, Y, Z = _get3(work, 0, 15, lane), _get3(work, 0, 18, lane), _get3(work, 0, 21, lane)
         dw = _get3(work, 0, 24, lane)
         xy, xz, yz = _get3(work, 0, 27, lane)
-        _put(work, 0, 30, lane, _dot(v, d))
-        _put3(work, 0, 31, lane, _add(_into_child(X, Y, Z, v), _cross(d, w)))
+        _put(work, 0, 30, lane, dot(v, d))
+        _put3(work, 0, 31, lane, add(into_child(X, Y, Z, v), cross(d, w)))
         _put(work, 0, 34, lane, w[0] * dw[0] + w[1] * xz - w[2] * xy)
         _put(work, 0, 35, lane, -w[0] * X[2] + w[1] * Y[2] + w[2] * (X[0] - Y[1]))
         _put(work, 0, 36, lane, -w[0] * yz + w[1] * dw[1] + w[2] * xy)

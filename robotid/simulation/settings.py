@@ -16,6 +16,8 @@ from robotid.findings import listed
 from robotid.logs.data import suggestion
 
 __all__ = [
+    "GAIN",
+    "LEVEL",
     "Actuator",
     "Controller",
     "Noise",
@@ -49,11 +51,11 @@ def _all_of(is_right: Any) -> Any:  # noqa: ANN401
 
 
 _NUMBERS = "a number, or a table of numbers by joint"
-_LEVEL: Mapping[str, Any] = {
+LEVEL: Mapping[str, Any] = {
     "reads": (int, float, dict),
     "within": Range(f"0 or positive: {_NUMBERS}", _all_of(lambda x: x >= 0)),
 }
-_GAIN: Mapping[str, Any] = {
+GAIN: Mapping[str, Any] = {
     "reads": (int, float, dict),
     "within": Range(f"positive: {_NUMBERS}", _all_of(lambda x: x > 0)),
 }
@@ -108,8 +110,8 @@ class Controller(Settings):
         "inertia of the joint [rad/s]",
         within=POSITIVE,
     )
-    kp: PerJoint | None = setting(None, "torque per error [N m/rad or N/m]", **_GAIN)
-    kd: PerJoint | None = setting(None, "torque per speed's error [N m s/rad or N s/m]", **_GAIN)
+    kp: PerJoint | None = setting(None, "torque per error [N m/rad or N/m]", **GAIN)
+    kd: PerJoint | None = setting(None, "torque per speed's error [N m s/rad or N s/m]", **GAIN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -140,10 +142,10 @@ class Actuator(Settings):
         within=Range("positive numbers by joint", _all_of(lambda x: x > 0)),
     )
     stiffness: PerJoint | None = setting(
-        None, "of elastic gears [N m/rad or N/m]; rigid if not stated", **_GAIN
+        None, "of elastic gears [N m/rad or N/m]; rigid if not stated", **GAIN
     )
-    damping: PerJoint = setting(0.0, "of elastic gears [N m s/rad or N s/m]", **_LEVEL)
-    backlash: PerJoint = setting(0.0, "play of elastic gears, from end to end [rad or m]", **_LEVEL)
+    damping: PerJoint = setting(0.0, "of elastic gears [N m s/rad or N s/m]", **LEVEL)
+    backlash: PerJoint = setting(0.0, "play of elastic gears, from end to end [rad or m]", **LEVEL)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -166,12 +168,12 @@ class Noise(Settings):
 
     _table: ClassVar[str] = "sensors.noise"
 
-    q: PerJoint = setting(0.0, "of positions [rad or m]", **_LEVEL)
-    v: PerJoint = setting(0.0, "of velocities [rad/s or m/s]", **_LEVEL)
+    q: PerJoint = setting(0.0, "of positions [rad or m]", **LEVEL)
+    v: PerJoint = setting(0.0, "of velocities [rad/s or m/s]", **LEVEL)
     tau: PerJoint = setting(
-        0.0, "of torques, share of the joint's root mean square torque [-]", **_LEVEL
+        0.0, "of torques, share of the joint's root mean square torque [-]", **LEVEL
     )
-    torque: PerJoint = setting(0.0, "of torques, beside that share [N m or N]", **_LEVEL)
+    torque: PerJoint = setting(0.0, "of torques, beside that share [N m or N]", **LEVEL)
 
 
 @dataclass(frozen=True)
@@ -180,9 +182,9 @@ class Steps(Settings):
 
     _table: ClassVar[str] = "sensors.step"
 
-    q: PerJoint = setting(0.0, "of positions [rad or m]", **_LEVEL)
-    v: PerJoint = setting(0.0, "of velocities [rad/s or m/s]", **_LEVEL)
-    tau: PerJoint = setting(0.0, "of torques [N m or N]", **_LEVEL)
+    q: PerJoint = setting(0.0, "of positions [rad or m]", **LEVEL)
+    v: PerJoint = setting(0.0, "of velocities [rad/s or m/s]", **LEVEL)
+    tau: PerJoint = setting(0.0, "of torques [N m or N]", **LEVEL)
 
 
 @dataclass(frozen=True)

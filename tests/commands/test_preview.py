@@ -128,9 +128,9 @@ def test_wrong_words_are_answered(files, capsys):
 
 
 def test_a_motion_read_as_a_log_has_no_torque(files, ur5):
-    log = read_log(files / "log_motion.csv", ur5.joints, is_motion=True)
+    log = read_log(files / "log_motion.csv", ur5.joints, needs="motion")
     assert not log.tau.any()
-    full = read_log(files / "log.csv", ur5.joints, is_motion=True)
+    full = read_log(files / "log.csv", ur5.joints, needs="motion")
     np.testing.assert_array_equal(log.q, full.q)
     assert not full.tau.any()
     assert any("columns ignored: tau_shoulder_pan_joint" in note for note in full.notes)

@@ -3,11 +3,14 @@
 import hdf5storage
 import numpy as np
 import scipy.io
+from mcap.writer import Writer as McapLibraryWriter
 from mcap_ros2.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from robotid.logs.data import COLUMNS
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FIELDS = {"position": "q", "velocity": "v", "effort": "tau"}
@@ -109,4 +112,85 @@ def write_mat73(path, content):
 
 def write_mat5(path, content):
     scipy.io.savemat(path, content)
+    return path
+
+
+CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+#: Names of the points of what was measured, wanted and put out, before control_msgs 4 and since.
+POINTS = {"old": ("actual", "desired", None), "new": ("feedback", "reference", "output")}
+
+
+def controller_types(era, store):
+    """Return a store that knows the controller's state as control_msgs of an era defines it."""
+    types = get_typestore(store)
+    lines = ["std_msgs/Header header", "string[] joint_names"]
+    lines += [f"trajectory_msgs/JointTrajectoryPoint {name}" for name in POINTS[era] if name]
+    lines += ["trajectory_msgs/JointTrajectoryPoint error"]
+    types.register(get_types_from_msg("\n".join(lines), CONTROLLER))
+    return types
+
+
+def controller_state(types, era, log, k, *, output=None):
+    """Return row k of a log as a controller tells it; output: positions that it put out."""
+    header = joint_state(types, to_ns(log.t[k]), [], [], [], []).header
+    rows = {name: () if (x := getattr(log, name)) is None else x[k] for name in COLUMNS.values()}
+    duration = types.types["builtin_interfaces/msg/Duration"](0, 0)
+
+    def point(q=(), v=(), tau=()):
+        arrays = [np.asarray(x, dtype=np.float64) for x in (q, v, (), tau)]
+        return types.types[POINT](*arrays, duration)
+
+    torque = rows["tau"] if log.has_torque else np.full(len(log.joints), np.nan)
+    points = {
+        POINTS[era][0]: point(rows["q"], rows["v"], torque),
+        POINTS[era][1]: point(rows["q_ref"], rows["v_ref"], rows["tau_ref"]),
+        POINTS[era][2]: point(() if output is None else output[k]),
+        "error": point(rows["q_ref"] - rows["q"]),
+    }
+    points.pop(None, None)
+    return types.types[CONTROLLER](header=header, joint_names=list(log.joints), **points)
+
+
+def write_controller(path, log, era, *, states=(), output=None, plugin=StoragePlugin.MCAP):
+    """Write a controller's states as .bag, or as a folder; and joint states."""
+    is_ros1 = path.suffix == ".bag"
+    types = controller_types(era, Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    folder = {"version": 9, "storage_plugin": plugin}
+    serialize = types.serialize_ros1 if is_ros1 else types.serialize_cdr
+    with Bag1Writer(path) if is_ros1 else Bag2Writer(path, **folder) as bag:
+        connection = bag.add_connection("/arm_controller/state", CONTROLLER, typestore=types)
+        for k, t in enumerate(log.t):
+            message = controller_state(types, era, log, k, output=output)
+            bag.write(connection, to_ns(t), serialize(message, CONTROLLER))
+        if states:
+            other = bag.add_connection("/joint_states", JOINT_STATE, typestore=types)
+            for message in states:
+                state = joint_state(types, to_ns(message[0]), *message[1:])
+                bag.write(other, to_ns(message[0]), serialize(state, JOINT_STATE))
+    return path
+
+
+def write_idl_controller(path, log):
+    """Write a controller's states as an MCAP whose types are defined in IDL."""
+    types = controller_types("new", Stores.ROS2_HUMBLE)
+    points = "".join(
+        f"      trajectory_msgs::msg::JointTrajectoryPoint {x};\n" for x in POINTS["new"]
+    )
+    idl = (
+        f"{'=' * 80}\nIDL: {CONTROLLER}\n"
+        "module control_msgs {\n  module msg {\n    struct JointTrajectoryControllerState {\n"
+        "      std_msgs::msg::Header header;\n      sequence<string> joint_names;\n"
+        f"{points}      trajectory_msgs::msg::JointTrajectoryPoint error;\n"
+        "    };\n  };\n};\n"
+    )
+    with path.open("wb") as file:
+        writer = McapLibraryWriter(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(CONTROLLER, "ros2idl", idl.encode())
+        channel = writer.register_channel("/controller_state", "cdr", schema)
+        for k, t in enumerate(log.t):
+            raw = types.serialize_cdr(controller_state(types, "new", log, k), CONTROLLER)
+            writer.add_message(channel, to_ns(t), bytes(raw), to_ns(t))
+        writer.finish()
     return path

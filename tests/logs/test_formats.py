@@ -220,7 +220,8 @@ def test_the_topic_must_be_stated_if_several_would_do(tmp_path):
     assert_same(read_log(path, JOINTS, source=LogSource(topic="/arm")), log)
     with refused(f"bag has no topic '/arn'; {listing}. Did you mean '/arm'?"):
         read_log(path, JOINTS, source=LogSource(topic="/arn"))
-    with refused(f"bag: topic '/chatter' holds std_msgs/msg/String, wanted {STATE}; {listing}"):
+    kinds = f"{STATE} or control_msgs/msg/JointTrajectoryControllerState"
+    with refused(f"bag: topic '/chatter' holds std_msgs/msg/String, wanted {kinds}; {listing}"):
         read_log(path, JOINTS, source=LogSource(topic="/chatter"))
 
 
@@ -268,8 +269,9 @@ def test_a_bag_without_efforts_is_refused_as_any_log(tmp_path):
     with refused(
         "run.mcap has no column 'tau_shoulder'; torque or current columns found: none. Rename it, "
         "or "
-        "pass columns={'tau_shoulder': ...}; if 'shoulder' stood still, leave it out of joints and "
-        "lock it"
+        "pass columns={'tau_shoulder': ...}. Commanded positions, qref_<joint>, would be enough "
+        'for [estimator] name = "simulation" with a [controller] table; all other estimators need '
+        "tau_<joint> or current_<joint>"
     ):
         read_log(path, JOINTS)
 
@@ -425,8 +427,9 @@ def test_one_joint_needs_no_second_axis(tmp_path):
             {"tau": np.array([None] * 60)},
             "run.npz has no column 'tau_shoulder'; torque or current columns found: none. Rename "
             "it, "
-            "or pass columns={'tau_shoulder': ...}; if 'shoulder' stood still, leave it out of "
-            "joints and lock it",
+            "or pass columns={'tau_shoulder': ...}. Commanded positions, qref_<joint>, would be "
+            'enough for [estimator] name = "simulation" with a [controller] table; all other '
+            "estimators need tau_<joint> or current_<joint>",
         ),
     ],
 )

@@ -1,0 +1,1 @@
+"""What drives and bodies are, from commands and positions: closed loops rolled out and fitted."""

@@ -1,0 +1,296 @@
+"""From logs of commands and positions to drives, loops and bodies: the stages of the fit."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.second_order import SecondOrder, fit_second_order
+from robotid.commanded.settings import LoopSettings, groups_of
+from robotid.commanded.term_choice import Tried, candidates, choose
+from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
+from robotid.estimators.estimator import Estimate
+from robotid.estimators.output_error import OutputError
+from robotid.identification.settings import SimulationSettings
+from robotid.logs.data import Log
+from robotid.robot.mass_matrix import joint_mass_matrices
+from robotid.robot.drives import DriveTerm, Viscous
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
+from robotid.simulation.settings import PerJoint, by_joint
+
+__all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
+
+#: What the fit of a job does, from files to files.
+STAGES = (
+    "reading logs", "trying plain loops", "fitting loops", "trying friction", "testing", "writing"
+)  # fmt: skip
+
+
+_WIDE = 10.0  # spreads of drives are so many times their usual size: they bind nothing
+_SHARE = 0.5  # of the loop's inertia by which gains are unknown, that bodies have to begin with
+_SLOWEST = 0.1  # [s] spread of a delay
+_TURN = 0.3  # [rad or m] spread of an encoder's zero about where it was found
+_POSES = 50  # that the bodies' inertia is looked at in
+_LEAST = 0.05  # of a usual size, that an inertia begins with, or a gain keeps
+_PASSES = 2  # of choosing terms and fitting again
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What the fit found.
+
+    Attributes:
+        simulator: The robot with its unknowns, and the windows.
+        estimate: The unknowns' values.
+        plain: The plain model, joint by joint.
+        stated: What was stated of the loops, over the URDF's bodies.
+        tried: Which terms were tried, and what they gained.
+        groups: The group of each joint.
+    """
+
+    simulator: LoopSimulator
+    estimate: Estimate
+    plain: SecondOrder
+    stated: Loops
+    tried: tuple[Tried, ...]
+    groups: tuple[str, ...]
+
+    @property
+    def loops(self) -> Loops:
+        """Bodies, drives and loops as they were found."""
+        return self.simulator.loops(self.estimate.theta)
+
+
+def fit_loops(
+    model: RobotModel,
+    logs: Sequence[Log],
+    loop: LoopSettings,
+    settings: SimulationSettings,
+    *,
+    chooses: bool = True,
+    progress: ProgressCallback = ignore_progress,
+) -> Fitted:
+    """Fit drives, loops and bodies to logs of commands and positions.
+
+    Args:
+        model: The robot; its drive terms are those that are found.
+        logs: The logs, of its joints in its order, with commands.
+        loop: What is known of the loops.
+        settings: Windows, spread of bodies, whitening.
+        chooses: Whether further friction terms are tried.
+        progress: Told of the stages.
+
+    Raises:
+        MissingDependencyError: If Numba is not installed.
+        NotConvergedError: If nothing that is tried can be rolled out.
+        SettingsError: If a setting does not fit the robot.
+    """
+    robot = LoopedRobot(model, step=settings.step)
+    windows = tuple(w for log in logs for w in cut_windows(log, settings.window, settings.lead))
+    stated = stated_loops(model, loop)
+    report_stage(progress, "trying plain loops", STAGES)
+    plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
+    groups = groups_of(loop, model.joints, _likeness(model))
+    has_gain = _is_stated(loop.kp, model)
+    usual = _usual(robot, plain, windows, has_gain)
+    base = _begin(model, stated, plain, usual)
+    has_speeds = all(log.v_ref is not None for log in logs)
+    unknowns = _unknowns(model, loop, groups, base, usual, has_speeds=has_speeds)
+    unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
+    estimator = OutputError(whitens=settings.whiten, progress=progress)
+    simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
+    report_stage(progress, "fitting loops", STAGES)
+    estimate = estimator.fit(simulator, simulator.prior)
+    tried: list[Tried] = []
+    for _ in range(_PASSES if chooses else 0):
+        report_stage(progress, "trying friction", STAGES)
+        offered = [
+            set_
+            for set_ in candidates(simulator, usual.torque)
+            if set_[0].name not in simulator.names
+        ]
+        wide, theta = _with(simulator, estimate.theta, offered)
+        tried = choose(wide, theta, offered, estimator)
+        taken = [set_ for set_, t in zip(offered, tried, strict=True) if t.is_chosen]
+        if not taken:
+            break
+        report_stage(progress, "fitting loops", STAGES)
+        simulator, theta = _with(simulator, estimate.theta, taken)
+        estimate = estimator.fit(simulator, theta)
+    return Fitted(simulator, estimate, plain, stated, tuple(tried), tuple(groups))
+
+
+def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
+    """Return what is stated of loops, with the URDF's bodies; a gain of the position counts as 1.
+
+    Args:
+        model: The robot.
+        loop: What is known of the loops.
+
+    Raises:
+        SettingsError: If a joint is named that is not there.
+    """
+    n, joints = len(model.joints), model.joints
+    limit = None if loop.limit == "find" else loop.limit
+    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
+    return Loops(
+        bodies=bodies,
+        armature=np.zeros(n),
+        kp=by_joint(loop.kp, joints, "controller: kp", 1.0),
+        kd=by_joint(loop.kd, joints, "controller: kd", 0.0),
+        limit=by_joint(limit, joints, "controller: limit", np.inf),
+        delay=by_joint(loop.delay, joints, "controller: delay", 0.0),
+        zero=np.zeros(n),
+        terms=((),) * n,
+        values=np.zeros(0),
+    )
+
+
+def _likeness(model: RobotModel) -> list[tuple[object, ...]]:
+    """Return what makes joints alike: their limits, and mass and moments of their bodies."""
+    bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
+    sizes = np.column_stack([bodies[:, 0], bodies[:, [4, 6, 9]]])
+    found: list[tuple[object, ...]] = []
+    for body, joint in zip(sizes, model.limits, strict=True):
+        digits = tuple(f"{x:.2g}" for x in body)
+        found.append((joint.type, f"{joint.effort:.3g}", f"{joint.velocity:.3g}", digits))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Usual:
+    """Usual sizes, joint by joint, shape (n,): where unknowns begin, and how far they may be."""
+
+    inertia: Array  # [kg m^2 or kg] of the whole loop
+    bodies: Array  # of the URDF's bodies in it
+    torque: Array  # [N m or N]
+    speed: Array  # [rad/s or m/s]
+    scale: Array  # torques over those of the plain model
+
+
+def _usual(
+    robot: LoopedRobot, plain: SecondOrder, windows: Sequence[Window], has_gain: Array
+) -> _Usual:
+    """Return usual sizes; where a gain is unknown, the bodies' inertia measures all torques."""
+    model = robot.model
+    q = np.concatenate([w.log.q[w.counted] for w in windows])
+    steps = np.concatenate([np.diff(w.log.q[w.counted], axis=0) for w in windows])
+    dt = float(np.median(np.diff(windows[0].log.t)))
+    poses = q[:: max(1, len(q) // _POSES)]
+    M = joint_mass_matrices(model, model.standard_parameters(), poses)
+    bodies = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
+    scale = np.where(has_gain, 1.0, bodies / _SHARE / plain.inertia)
+    speed = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
+    return _Usual(plain.inertia * scale, bodies, plain.torque * scale, speed, scale)
+
+
+def _begin(model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual) -> Loops:
+    """Return the loops that the fit begins with."""
+    friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
+    none = np.zeros(len(usual.scale))
+    terms = tuple(
+        tuple(
+            term
+            for d, term in model.layout.drive_parameters
+            if model.layout.drives[d].name == joint and not term.is_inertia
+        )
+        for joint in model.joints
+    )
+    values = [friction.get(t.name, none)[j] for j, own in enumerate(terms) for t in own]
+    return replace(
+        stated,
+        kp=stated.kp * usual.scale,
+        armature=np.maximum(usual.inertia - usual.bodies, _LEAST * usual.inertia),
+        delay=plain.loops.delay,
+        terms=terms,
+        values=np.array(values),
+    )
+
+
+def _unknowns(
+    model: RobotModel,
+    loop: LoopSettings,
+    groups: Sequence[str],
+    base: Loops,
+    usual: _Usual,
+    *,
+    has_speeds: bool,
+) -> list[Unknown]:
+    """Return what is unknown of drives and loops, beginning with what the loops have."""
+    members: dict[str, list[int]] = {}
+    for j, group in enumerate(groups):
+        members.setdefault(group, []).append(j)
+    open_ = {
+        "armature": np.full(len(groups), "armature" in model.layout.terms),
+        "kp": ~_is_stated(loop.kp, model),
+        "kd": ~_is_stated(loop.kd, model) & has_speeds,
+        "limit": np.full(len(groups), loop.limit == "find"),
+    }
+    spread = {
+        "armature": usual.inertia,
+        "kp": base.kp,
+        "kd": usual.torque / usual.speed,
+        "limit": usual.torque,
+    }
+    found = []
+    for what, is_open in open_.items():
+        for group, joints in members.items():
+            own = tuple(j for j in joints if is_open[j])
+            if own:
+                begin = float(np.median(getattr(base, what)[list(own)]))
+                wide = _WIDE * float(np.median(spread[what][list(own)]))
+                lowest = _LEAST * begin if what in ("kp", "limit") else 0.0
+                found.append(Unknown(f"{group}.{what}", what, own, begin, wide, lowest))
+    for group, joints in members.items():
+        for term in {t: None for j in joints for t in base.terms[j]}:
+            own = [j for j in joints if term in base.terms[j]]
+            # what wears and what leans differ from drive to drive, grease and motor do not
+            for sharing in [own] if isinstance(term, Viscous) else [[j] for j in own]:
+                name = group if len(sharing) > 1 else model.joints[sharing[0]]
+                found.append(_term(name, term, sharing, base, usual))
+    if not _is_stated(loop.delay, model).any():
+        begin = float(np.median(base.delay))
+        found.append(Unknown("delay", "delay", tuple(range(len(groups))), begin, _SLOWEST, 0.0))
+    return found
+
+
+def _term(
+    owner: str, term: DriveTerm, joints: Sequence[int], base: Loops, usual: _Usual
+) -> Unknown:
+    """Return the unknown of a term of one joint, or of several that share it."""
+    begin = float(np.median([base.values[base.place(j, term)] for j in joints]))
+    size = usual.torque / (usual.speed if isinstance(term, Viscous) else 1.0)
+    wide = _WIDE * float(np.median(size[list(joints)]))
+    lowest = 0.0 if term.is_nonnegative else -np.inf
+    return Unknown(f"{owner}.{term.name}", "term", tuple(joints), begin, wide, lowest, term=term)
+
+
+def _is_stated(value: PerJoint | None, model: RobotModel) -> Array:
+    """Return for which joints a number is stated, shape (n,), bool."""
+    named = [
+        value is not None and (not isinstance(value, Mapping) or joint in value)
+        for joint in model.joints
+    ]
+    return np.array(named)
+
+
+def _with(
+    simulator: LoopSimulator, theta: Array, sets: Sequence[tuple[Unknown, ...]]
+) -> tuple[LoopSimulator, Array]:
+    """Return the simulator with further terms, which are 0, and its parameters."""
+    further = [unknown for unknowns in sets for unknown in unknowns]
+    loops = simulator.base
+    terms = [list(own) for own in loops.terms]
+    for unknown in further:
+        if unknown.term is not None:
+            terms[unknown.joints[0]].append(unknown.term)
+    values = [
+        loops.values[loops.place(j, term)] if term in loops.terms[j] else 0.0
+        for j, own in enumerate(terms)
+        for term in own
+    ]
+    base = replace(loops, terms=tuple(map(tuple, terms)), values=np.array(values))
+    wide = replace(simulator, base=base, unknowns=(*simulator.unknowns, *further))
+    return wide, np.concatenate([theta, np.zeros(len(further))])

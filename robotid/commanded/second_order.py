@@ -1,0 +1,162 @@
+"""The plain model of a commanded joint: by itself, of second order, with Coulomb friction.
+
+Every joint alone: J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v). It is what
+a fit with bodies begins with, and what it has to beat.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.estimators.output_error import OutputError
+from robotid.exceptions import NotConvergedError
+from robotid.robot.drives import TERMS
+from robotid.simulation.loops import LoopedRobot, Loops, Window
+
+__all__ = ["SecondOrder", "fit_second_order"]
+
+_FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # [rad/s] of the loop, that are tried
+_DAMPINGS = (0.5, 1.5)  # of critical
+_FRICTIONS = (0.05, 0.5)  # of the loop's usual torque
+_DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # [s]
+_TRIED = 8  # windows that the tries look at
+_LEAST = 1e-6  # of the usual inertia, that a joint must have
+_TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
+_STEPS = 12  # of the fit
+
+
+@dataclass(frozen=True, eq=False)
+class SecondOrder:
+    """The plain model of every joint; arrays of shape (n,).
+
+    Attributes:
+        simulator: What it rolls out with.
+        theta: Its parameters.
+        loops: The same as loops without bodies.
+        torque: Usual torque of the loop, kp rms(q_ref - q) [N m or N].
+    """
+
+    simulator: LoopSimulator
+    theta: Array
+    loops: Loops
+    torque: Array
+
+    @property
+    def inertia(self) -> Array:
+        """Inertia J of each joint [kg m^2 or kg]."""
+        return self.loops.armature
+
+    def friction(self, name: str) -> Array:
+        """Return "viscous", "coulomb" or "offset" of each joint.
+
+        Args:
+            name: Which one.
+        """
+        which = [term.name for term in _TERMS].index(name)
+        found: Array = self.loops.values[which :: len(_TERMS)]
+        return found
+
+
+def fit_second_order(
+    robot: LoopedRobot, windows: tuple[Window, ...], stated: Loops, *, finds_delay: bool
+) -> SecondOrder:
+    """Fit the plain model to windows: a coarse grid of every joint, then least squares.
+
+    Args:
+        robot: The robot, whose bodies are left out.
+        windows: Windows of its logs.
+        stated: Gains and delay, as far as they are known; a gain of the position that is not
+            counts as 1.
+        finds_delay: Whether the delay is found, joint by joint.
+
+    Raises:
+        NotConvergedError: If nothing that is tried can be rolled out.
+    """
+    n = len(stated.kp)
+    error = np.concatenate([w.log.q_ref[w.counted] - w.log.q[w.counted] for w in windows])  # type: ignore[index]
+    torque = stated.kp * np.maximum(np.sqrt(np.mean(error**2, axis=0)), 1e-6)
+    bare = replace(
+        stated,
+        bodies=np.zeros_like(stated.bodies),
+        zero=np.zeros(n),
+        limit=np.full(n, np.inf),
+        terms=(_TERMS,) * n,
+        values=np.zeros(n * len(_TERMS)),
+    )
+    start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay)
+    unknowns = _unknowns(robot, start, torque, finds_delay)
+    simulator = LoopSimulator(robot, windows, start, unknowns)
+    theta = OutputError(whitens=False, steps=_STEPS).fit(simulator, simulator.prior).theta
+    return SecondOrder(simulator, theta, simulator.loops(theta), torque)
+
+
+def _unknowns(
+    robot: LoopedRobot, start: Loops, torque: Array, finds_delay: bool
+) -> tuple[Unknown, ...]:
+    """Return inertia, friction, offset and delay of each joint as unknowns that begin there."""
+    found = []
+    for j, joint in enumerate(robot.model.joints):
+        J = start.armature[j]
+        found.append(Unknown(f"{joint}.armature", "armature", (j,), J, 10 * J, _LEAST * J))
+        for k, term in enumerate(_TERMS):
+            value = float(start.values[len(_TERMS) * j + k])
+            spread = 100 * torque[j] * (10.0 if term.name == "viscous" else 1.0)
+            lowest = 0.0 if term.is_nonnegative else -np.inf
+            name = f"{joint}.{term.name}"
+            found.append(Unknown(name, "term", (j,), value, spread, lowest, term=term))
+        if finds_delay:
+            found.append(Unknown(f"{joint}.delay", "delay", (j,), float(start.delay[j]), 0.1, 0.0))
+    return tuple(found)
+
+
+def _coarse(
+    robot: LoopedRobot,
+    windows: tuple[Window, ...],
+    bare: Loops,
+    torque: Array,
+    finds_delay: bool,
+) -> Loops:
+    """Return the best of a grid, joint by joint: none moves another without bodies."""
+    n = len(bare.kp)
+    best, found = np.full(n, np.inf), bare
+    delays = np.array(_DELAYS) if finds_delay else np.zeros(1)
+    first = float(delays[min(1, len(delays) - 1)])
+    tries = [(w, z, f, first) for w, z, f in product(_FREQUENCIES, _DAMPINGS, _FRICTIONS)]
+    for w, z, f, delay in tries:
+        J = bare.kp / w**2
+        viscous = np.maximum(2 * z * w * J - bare.kd, 0.0)
+        values = np.column_stack([viscous, f * torque, np.zeros(n)]).reshape(-1)
+        late = np.full(n, delay) if finds_delay else bare.delay
+        trial = replace(bare, armature=J, values=values, delay=late)
+        best, found = _better(robot, windows, trial, best, found)
+    for delay in delays if finds_delay else ():
+        best, found = _better(robot, windows, replace(found, delay=np.full(n, delay)), best, found)
+    if not np.isfinite(best).all():
+        raise NotConvergedError(
+            "no plain loop that was tried can be rolled out; state gains in [controller]",
+            "no start",
+        )
+    return found
+
+
+def _better(
+    robot: LoopedRobot, windows: tuple[Window, ...], trial: Loops, best: Array, found: Loops
+) -> tuple[Array, Loops]:
+    """Return the squares and loops of the joints, those of the trial where it is better."""
+    try:
+        outs = robot.roll_out(trial, windows)
+    except NotConvergedError:
+        return best, found  # this try cannot be rolled out; others can
+    cost = sum(((out.window.log.q[out.window.counted] - out.q) ** 2).sum(axis=0) for out in outs)
+    better = cost < best
+    k = len(_TERMS)
+    values = np.where(np.repeat(better, k), trial.values, found.values)
+    return np.where(better, cost, best), replace(
+        found,
+        armature=np.where(better, trial.armature, found.armature),
+        delay=np.where(better, trial.delay, found.delay),
+        values=values,
+    )

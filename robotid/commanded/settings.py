@@ -1,0 +1,97 @@
+"""The loop of the drives as a job states it: what is known of it, and what is to be found."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from robotid._settings import Range, Settings, setting
+from robotid.exceptions import SettingsError
+from robotid.findings import listed
+from robotid.logs.data import suggestion
+from robotid.simulation.settings import GAIN, LEVEL, PerJoint
+
+__all__ = ["LoopSettings", "groups_of"]
+
+
+@dataclass(frozen=True)
+class LoopSettings(Settings):
+    """The controller of logs with commands, torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref."""
+
+    _table: ClassVar[str] = "controller"
+
+    kind: str = setting("pd", "how the loop is closed", among=("pd",))
+    kp: PerJoint | None = setting(
+        None, "gain of the position [N m/rad or N/m], for all joints or by joint; found if not "
+        "stated, with the bodies' gravity and inertia as its measure", **GAIN,
+    )  # fmt: skip
+    kd: PerJoint | None = setting(
+        None, "gain of the speed [N m s/rad or N s/m], likewise; one with the viscous friction, and "
+        "counted as that, if not stated", **LEVEL,
+    )  # fmt: skip
+    limit: PerJoint | str | None = setting(
+        None, "largest torque of the drive [N m or N], likewise; none if not stated, and found if "
+        "it is 'find'",
+        reads=(int, float, dict, str),
+        within=Range(
+            "positive numbers, or 'find'", lambda x: x == "find" or GAIN["within"].holds(x)
+        ),
+    )  # fmt: skip
+    delay: PerJoint | None = setting(
+        None, "how late the command acts [s], likewise; found, one for all joints, if not stated",
+        **LEVEL,
+    )  # fmt: skip
+    gravity_compensation: bool = setting(
+        False, "whether the controller adds the torque of gravity by the URDF"
+    )
+    groups: Mapping[str, Sequence[str]] = setting(
+        {}, "joints with equal drives, by a name for each group, which share gains, armature and "
+        "viscous friction; joints that are alike in the URDF if not stated",
+        reads=(dict,),
+    )  # fmt: skip
+    zeros: str = setting(
+        "urdf", "urdf: encoders have the URDF's zero and sign; find: both are found, from gravity",
+        among=("urdf", "find"),
+    )  # fmt: skip
+
+
+def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any]) -> list[str]:
+    """Return the group of each joint.
+
+    Args:
+        settings: The stated groups; none: joints that are alike form one.
+        joints: Names of the n joints.
+        alike: What two joints of a group have in common, n entries.
+
+    Raises:
+        SettingsError: If a group names a joint that is not there, or one twice.
+    """
+    found: dict[str, str] = {}
+    for group, members in settings.groups.items():
+        for joint in members:
+            if joint not in joints:
+                raise SettingsError(
+                    f"controller: groups.{group} has {joint!r}, which is not among the joints that "
+                    f"move: {listed(joints)}{suggestion(joint, joints)}"
+                )
+            if joint in found:
+                raise SettingsError(
+                    f"controller: joint {joint!r} is in the groups {found[joint]} and {group}; "
+                    "name it once"
+                )
+            found[joint] = group
+    if settings.groups:
+        return [found.get(joint, joint) for joint in joints]
+    first: dict[Any, str] = {}
+    named = [first.setdefault(key, joint) for key, joint in zip(alike, joints, strict=True)]
+    return [
+        joint if named.count(name) == 1 else _common(name, joints, named)
+        for name, joint in zip(named, joints, strict=True)
+    ]
+
+
+def _common(name: str, joints: Sequence[str], named: Sequence[str]) -> str:
+    """Return a name for a group: the words that the names of its joints share, or its first."""
+    members = [joint for joint, first in zip(joints, named, strict=True) if first == name]
+    shared = [word for word in members[0].split("_") if all(word in m.split("_") for m in members)]
+    shared = [word for word in shared if word != "joint"]
+    return "_".join(shared) or members[0]

@@ -1,0 +1,213 @@
+"""What is unknown of drives, loops and bodies, and the simulator that an estimator asks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators.output_error import Residual
+from robotid.robot.drives import DriveTerm
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.simulation.loops import LoopedRobot, Loops, RollOut, Window
+
+__all__ = ["LoopSimulator", "Unknown", "body_unknowns"]
+
+_POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
+#: Entries of the triangle that a body changes by: logarithms of the diagonal, then the rest.
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """One number that is to be found, of one joint or of several that share it.
+
+    Attributes:
+        name: As ``"elbow.armature"``; of several joints, ``"calf.armature"``.
+        what: "armature", "kp", "kd", "limit", "delay", "zero", "term", or "body": a coordinate of
+            how a body differs from the URDF's.
+        joints: Rows of the joints.
+        prior: What it is before any data.
+        spread: How far from that it may plausibly be; inf where nothing is known.
+        lowest: Smallest value that it may have.
+        term: The term of friction.
+        coordinate: Number of a body's coordinate, 0 to 9.
+    """
+
+    name: str
+    what: str
+    joints: tuple[int, ...]
+    prior: float
+    spread: float
+    lowest: float = -np.inf
+    term: DriveTerm | None = None
+    coordinate: int = 0
+
+
+def body_unknowns(robot: LoopedRobot, spread: float) -> list[Unknown]:
+    """Return how bodies may differ from the URDF's, ten coordinates each, 0 before any data.
+
+    J' = U T T' U' with U U' the URDF's pseudo-inertia and T an upper triangle with exponentials on
+    its diagonal: every value is a body that can be.
+
+    Args:
+        robot: The robot.
+        spread: Plausible size of each coordinate [-]; 0.1 is some 20 % of the mass, and a centre
+            of mass off by a tenth of the radius of gyration.
+
+    References:
+        Rucker, Wensing (2022), Smooth parameterization of rigid-body inertia, (12)-(14).
+    """
+    model = robot.model
+    J = pseudo_inertia(model.standard_parameters()[: model.layout.n_inertial])
+    values = np.linalg.eigvalsh(J)
+    found = []
+    for body, joint in enumerate(robot.joint_of_body):
+        if values[body, 0] <= _POSSIBLE * values[body, -1]:
+            continue  # a massless frame, or a body that the URDF makes impossible: it stays
+        name = model.layout.bodies[body]
+        found += [
+            Unknown(f"{name}.{k}", "body", (joint,), 0.0, spread, coordinate=k) for k in range(10)
+        ]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSimulator:
+    """A looped robot with unknowns, beside windows of logs: what an estimator asks.
+
+    Attributes:
+        robot: The robot.
+        windows: Windows of its logs.
+        base: All that is known; unknowns stand over it.
+        unknowns: What is to be found.
+    """
+
+    robot: LoopedRobot
+    windows: tuple[Window, ...]
+    base: Loops
+    unknowns: tuple[Unknown, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(unknown.name for unknown in self.unknowns)
+
+    @cached_property
+    def prior(self) -> Array:
+        return np.array([unknown.prior for unknown in self.unknowns])
+
+    @cached_property
+    def prior_std(self) -> Array:
+        return np.array([unknown.spread for unknown in self.unknowns])
+
+    @cached_property
+    def lowest(self) -> Array:
+        return np.array([unknown.lowest for unknown in self.unknowns])
+
+    def loops(self, theta: Array) -> Loops:
+        """Return bodies, drives and loops with the unknowns at some values.
+
+        Args:
+            theta: Their values, shape (c,).
+        """
+        base = self.base
+        changed = {
+            name: getattr(base, name).copy()
+            for name in ("armature", "kp", "kd", "limit", "delay", "zero", "values")
+        }
+        for unknown, value in zip(self.unknowns, theta, strict=True):
+            if unknown.term is not None:
+                places = [base.place(j, unknown.term) for j in unknown.joints]
+                changed["values"][places] = value
+            elif unknown.what != "body":
+                changed[unknown.what][list(unknown.joints)] = value
+        return replace(base, bodies=self._bodies(theta)[0], **changed)
+
+    def roll_out(self, theta: Array, windows: Sequence[Window] | None = None) -> list[RollOut]:
+        """Return what windows come out as.
+
+        Args:
+            theta: Values of the unknowns, shape (c,).
+            windows: Which windows; all if None.
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
+
+    def residuals(self, theta: Array, *, with_slopes: bool) -> list[Residual]:
+        """Return what is measured less what comes out, window by window; see ``Simulator``.
+
+        Args:
+            theta: Values of the unknowns, shape (c,).
+            with_slopes: Whether derivatives are wanted.
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        everything = np.arange(len(self.base.kp))
+        none = np.array([], dtype=int)
+        if not with_slopes:
+            return [Residual(_error(out), None, everything, none) for out in self.roll_out(theta)]
+        loops, (_, directions) = self.loops(theta), self._bodies(theta)
+        columns, owners = self._columns(loops)
+        found = []
+        for out in self.robot.roll_out(loops, self.windows, columns, directions):
+            error = _error(out)
+            for joints, places, slopes in out.slopes:
+                own = np.unique(owners[places])
+                shared = np.zeros((len(places), len(own)))  # a column of each joint that shares it
+                shared[np.arange(len(places)), np.searchsorted(own, owners[places])] = 1.0
+                found.append(Residual(error[:, joints], slopes @ shared, joints, own))
+        return found
+
+    def _columns(self, loops: Loops) -> tuple[list[tuple[int, int, int]], Array]:
+        """Return what to differentiate by, and the unknown that each column is of."""
+        kinds = self.robot.kinds
+        columns, owners, body = [], [], 0
+        for k, unknown in enumerate(self.unknowns):
+            for j in unknown.joints:
+                index = 0
+                if unknown.term is not None:
+                    index = loops.place(j, unknown.term)
+                elif unknown.what == "body":
+                    index, body = body, body + 1
+                columns.append((kinds[unknown.what], j, index))
+                owners.append(k)
+        return columns, np.array(owners, dtype=int)
+
+    @cached_property
+    def _roots(self) -> Array:
+        """A root U of each body's pseudo-inertia, shape (n, 4, 4)."""
+        J = pseudo_inertia(self.base.bodies.reshape(-1))
+        values, axes = np.linalg.eigh(J)
+        roots: Array = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :] @ axes.transpose(0, 2, 1)
+        return roots
+
+    def _bodies(self, theta: Array) -> tuple[Array, Array]:
+        """Return the bodies, (n, 10), and how each coordinate changes its body, (D, 10)."""
+        bodies, directions = self.base.bodies.copy(), []
+        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
+        by_body: dict[int, list[int]] = {}
+        for k, unknown in enumerate(self.unknowns):
+            if unknown.what == "body":
+                by_body.setdefault(body_of[unknown.joints[0]], []).append(k)
+        for body, places in by_body.items():
+            U, T = self._roots[body], np.eye(4)
+            for k in places:
+                row, column = _ENTRIES[self.unknowns[k].coordinate]
+                T[row, column] = np.exp(theta[k]) if row == column else theta[k]
+            bodies[body] = inertial_from_pseudo_inertia(U @ T @ T.T @ U.T)
+            for k in places:
+                row, column = _ENTRIES[self.unknowns[k].coordinate]
+                change = np.zeros((4, 4))
+                change[row, column] = T[row, column] if row == column else 1.0
+                half = U @ change @ T.T @ U.T
+                directions.append(inertial_from_pseudo_inertia(half + half.T))
+        return bodies, np.array(directions).reshape(-1, 10)
+
+
+def _error(out: RollOut) -> Array:
+    error: Array = out.window.log.q[out.window.counted] - out.q
+    return error

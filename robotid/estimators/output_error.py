@@ -1,0 +1,337 @@
+"""Output error: parameters by which a simulator comes out as what was measured.
+
+The closed loop is simulated over windows and its outputs are compared, so nothing is
+differentiated, and neither torque nor acceleration need be measured. The residual of a simulation
+is correlated; it is whitened, e_t - rho e_(t-1), by joint, else what acts fast, a delay, is lost
+beside what drifts.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.linalg
+
+from robotid._typing import Array, ProgressCallback, ignore_progress
+from robotid.estimators.estimator import Estimate
+from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
+from robotid.exceptions import DataError, NotConvergedError
+from robotid.regressor.factors import Factors, triangle_of
+
+__all__ = ["OutputError", "Residual", "Simulator", "linearised"]
+
+_STEPS = 25  # of the damped Gauss-Newton method in a round
+_ROUNDS = 6  # of whitening and noise levels ...
+_SETTLED = 5e-3  # ... until they change by less than that
+_ROUGH, _CLOSE = 1e-3, 1e-6  # relative decrease that ends a round, and the last one
+_TOO_STIFF = 1e10  # damping at which no step lowers the cost any more
+_MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
+_STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
+_LOST = 1e-6  # share of its prior's variance, below which a direction's gain in knowledge is none
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Measured less simulated, over one window, of joints that move together.
+
+    Attributes:
+        e: Shape (N, k) [rad or m].
+        slopes: Derivatives of the simulated output, shape (N, k, c'); None if not asked for.
+        joints: Which joints, shape (k,).
+        columns: Which parameters, shape (c',).
+    """
+
+    e: Array
+    slopes: Array | None
+    joints: Array
+    columns: Array
+
+
+class Simulator(Protocol):
+    """What rolls out, and which parameters it has.
+
+    Attributes:
+        names: Of the c parameters.
+        prior: What they are before any data, shape (c,).
+        prior_std: How far from it they may plausibly be, shape (c,); infinite where nothing is
+            known.
+        lowest: Smallest value that each may have, shape (c,); -inf without.
+    """
+
+    names: tuple[str, ...]
+    prior: Array
+    prior_std: Array
+    lowest: Array
+
+    def residuals(self, theta: Array, *, with_slopes: bool) -> Sequence[Residual]:
+        """Return what is measured less what is simulated, window by window.
+
+        Args:
+            theta: Parameters, shape (c,).
+            with_slopes: Whether derivatives are wanted.
+
+        Raises:
+            NotConvergedError: If it cannot be simulated with these parameters.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class _Weights:
+    """How residuals weigh, by joint."""
+
+    rho: Array  # correlation of one sample with the next [-]
+    sigma: Array  # noise level of the whitened residual
+
+    def whiten(self, x: Array, joints: Array) -> Array:
+        rho, sigma = self.rho[joints], self.sigma[joints]
+        if x.ndim == 3:
+            rho, sigma = rho[:, None], sigma[:, None]
+        whitened: Array = (x[1:] - rho * x[:-1]) / sigma
+        return whitened
+
+
+@dataclass(frozen=True, eq=False)
+class OutputError:
+    """Least squares of a simulator's whitened residuals, with priors and bounds.
+
+    A damped Gauss-Newton method (Levenberg, Marquardt) in rounds: weights of the residuals so far,
+    then parameters by these weights, until both have settled.
+
+    Attributes:
+        whitens: Whether the residual's correlation is estimated and taken out.
+        rows: Further rows [A b] that A theta = b should fit, unit weight, shape (m, c + 1), as
+            those of torques; none if None.
+        steps: Most steps in a round.
+        progress: Told of the steps.
+
+    References:
+        Ljung (1999), System identification, 4.3 and 10.2; Janot, Vandanjon, Gautier (2014), A
+        generic instrumental variable approach for industrial robot identification, for DIDIM.
+    """
+
+    whitens: bool = True
+    rows: Array | None = None
+    steps: int = _STEPS
+    progress: ProgressCallback = field(default=ignore_progress)
+
+    def fit(self, simulator: Simulator, start: Array) -> Estimate:
+        """Estimate the parameters.
+
+        Args:
+            simulator: What rolls out.
+            start: Where to begin, shape (c,).
+
+        Raises:
+            DataError: If there are fewer samples than parameters.
+            NotConvergedError: If it cannot be simulated where it begins.
+        """
+        theta = np.maximum(np.array(start, dtype=float), simulator.lowest)
+        weights, rounds, count, converged = self.weights(simulator, theta), 0, 0, False
+        for rounds in range(1, _ROUNDS + 1):
+            close = _ROUGH if rounds == 1 else _CLOSE
+            theta, steps, converged = self._descend(simulator, weights, theta, close)
+            count += steps
+            before, weights = weights, self.weights(simulator, theta)
+            change = np.abs(weights.sigma / before.sigma - 1.0).max()
+            if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
+                break
+            converged = False
+        return self._estimate(simulator, weights, theta, converged, count, rounds)
+
+    def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
+        """Return correlation and level of the residuals, which they are weighed by.
+
+        Args:
+            simulator: What rolls out.
+            theta: Parameters, shape (c,).
+        """
+        found = simulator.residuals(theta, with_slopes=False)
+        n = 1 + max(int(r.joints.max()) for r in found)
+        rho, sigma = np.zeros(n), np.ones(n)
+        for j in range(n):
+            own = [r.e[:, k] for r in found for k in np.flatnonzero(r.joints == j)]
+            if self.whitens:
+                along = sum(float(x[1:] @ x[:-1]) for x in own)
+                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, _MOST_RHO)
+            size = sum(len(x) - 1 for x in own)
+            level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
+            sigma[j] = max(level, 1e-12)
+        return _Weights(rho, sigma)
+
+    def _cost(self, simulator: Simulator, weights: _Weights, theta: Array) -> float:
+        """Return the cost; infinite where it cannot be simulated."""
+        try:
+            found = simulator.residuals(theta, with_slopes=False)
+        except NotConvergedError:
+            return np.inf  # a step that leads there is too long
+        cost = _squares(weights.whiten(r.e, r.joints) for r in found)
+        cost += float(np.sum(((theta - simulator.prior) / simulator.prior_std) ** 2))
+        if self.rows is not None:
+            cost += float(np.sum((self.rows[:, -1] - self.rows[:, :-1] @ theta) ** 2))
+        return cost if np.isfinite(cost) else np.inf
+
+    def _normal(self, simulator: Simulator, weights: _Weights, theta: Array) -> tuple[Array, Array]:
+        """Return H = A'A and A'b of the linearised problem, prior included."""
+        tau = 1.0 / simulator.prior_std**2
+        H, g = np.diag(tau), tau * (simulator.prior - theta)
+        for A, b, columns in linearised(simulator, weights, theta):
+            H[np.ix_(columns, columns)] += A.T @ A
+            g[columns] += A.T @ b
+        if self.rows is not None:
+            A, b = self.rows[:, :-1], self.rows[:, -1] - self.rows[:, :-1] @ theta
+            H += A.T @ A
+            g += A.T @ b
+        return H, g
+
+    def _descend(
+        self, simulator: Simulator, weights: _Weights, theta: Array, close: float
+    ) -> tuple[Array, int, bool]:
+        """Minimise with given weights; return where it ends, its steps, and whether it settled."""
+        damping, cost = 1e-3, self._cost(simulator, weights, theta)
+        if not np.isfinite(cost):
+            raise NotConvergedError(
+                "the loop cannot be simulated with the parameters that the fit begins with; state "
+                "gains nearer to the drive's in [controller]",
+                "no start",
+            )
+        for step in range(1, self.steps + 1):
+            self.progress("fitting loops", step, self.steps, "steps")
+            H, g = self._normal(simulator, weights, theta)
+            while True:
+                trial = _bounded_step(H, g, theta, simulator.lowest, damping)
+                new = self._cost(simulator, weights, trial)
+                if new < cost or damping > _TOO_STIFF:
+                    break
+                damping *= 6.0
+            if not new < cost:
+                return theta, step, True  # no step lowers it: it is the minimum to rounding
+            decrease, theta, cost = (cost - new) / cost, trial, new
+            damping = max(damping / 6.0, 1e-9)
+            if decrease < close:
+                return theta, step, True
+        return theta, self.steps, False
+
+    def _estimate(
+        self,
+        simulator: Simulator,
+        weights: _Weights,
+        theta: Array,
+        converged: bool,
+        steps: int,
+        rounds: int,
+    ) -> Estimate:
+        """Return the estimate, its errors from how much the scores of stretches scatter."""
+        H, _ = self._normal(simulator, weights, theta)
+        known = 1.0 / simulator.prior_std**2
+        scale = 1.0 / np.sqrt(np.diag(H))
+        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+        bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
+        stretches = _stretches(simulator, weights, theta)
+        meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
+        if len(stretches) >= FEWEST_STRETCHES:
+            found = scatter(stretches, np.zeros(len(theta)), np.ones(1), bread)
+            meat, inflation, freedom = found.meat, found.inflation, found.freedom()
+        if self.rows is not None:
+            meat = meat + self.rows[:, :-1].T @ self.rows[:, :-1]
+        covariance = bread @ (meat + np.diag(known)) @ bread
+        # never better known than independent rows would make it
+        spread = np.sqrt(np.maximum(np.diag(covariance), np.diag(bread)))
+        correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+        covariance = correlation * np.outer(spread, spread)
+        gained = 1.0 - np.diag(bread) * known  # of each parameter's prior variance
+        undetermined = tuple(
+            name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
+        )
+        rows = sum(r.e.size for r in simulator.residuals(theta, with_slopes=False))
+        if rows < len(theta):
+            raise DataError(
+                f"{rows} samples of position for {len(theta)} parameters; record a longer motion"
+            )
+        state = "settled" if converged else "not settled"
+        return Estimate(
+            theta=theta,
+            covariance=covariance,
+            names=simulator.names,
+            sigma=weights.sigma,
+            rank=len(theta) - len(undetermined),
+            condition=float(np.sqrt(values[-1] / max(values[0], 1e-300))),
+            undetermined=undetermined,
+            converged=converged,
+            n_iter=steps,
+            message=f"output error, {steps} steps in {rounds} rounds, {state}",
+            prior_std=simulator.prior_std,
+            details={
+                "correlation": weights.rho,
+                "inflation": inflation,
+                "freedom": freedom,
+                "at_bound": tuple(
+                    name
+                    for name, x, low in zip(simulator.names, theta, simulator.lowest, strict=True)
+                    if x <= low
+                ),
+            },
+        )
+
+
+def _squares(arrays: Iterable[Array]) -> float:
+    return float(sum((x * x).sum() for x in arrays))
+
+
+def _rho_change(before: _Weights, after: _Weights) -> float:
+    return float(np.abs(after.rho - before.rho).max())
+
+
+def linearised(
+    simulator: Simulator, weights: _Weights, theta: Array
+) -> Iterable[tuple[Array, Array, Array]]:
+    """Yield rows A, b and their columns, whitened, window by window and part by part.
+
+    Args:
+        simulator: What rolls out.
+        weights: As of ``OutputError.weights``.
+        theta: Parameters, shape (c,).
+    """
+    for r in simulator.residuals(theta, with_slopes=True):
+        b = weights.whiten(r.e, r.joints)
+        A = weights.whiten(_given(r), r.joints)
+        yield A.reshape(b.size, -1), b.reshape(-1), r.columns
+
+
+def _given(r: Residual) -> Array:
+    if r.slopes is None:
+        raise DataError("the simulator gave no derivatives")
+    return r.slopes
+
+
+def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: float) -> Array:
+    """Return where a damped step leads; parameters that it would push below a bound stay there."""
+    H = H + damping * np.diag(np.diag(H))
+    free = (theta > lowest) | (g > 0)
+    trial = theta.copy()
+    while free.any():
+        step = scipy.linalg.solve(H[np.ix_(free, free)], g[free], assume_a="pos")
+        trial[free] = theta[free] + step
+        below = free & (trial < lowest)
+        if not below.any():
+            break
+        trial[below] = lowest[below]
+        g = g - H[:, below] @ (lowest[below] - theta[below])
+        free = free & ~below
+    return trial
+
+
+def _stretches(simulator: Simulator, weights: _Weights, theta: Array) -> list[Factors]:
+    """Return the factors of the whitened rows, stretch by stretch."""
+    found = list(linearised(simulator, weights, theta))
+    c, total = len(theta), sum(len(b) for _, b, _ in found)
+    stretches: list[Factors] = []
+    for A, b, columns in found:
+        for rows in np.array_split(np.arange(len(b)), max(1, round(_STRETCHES * len(b) / total))):
+            triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
+            stretches.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
+    return stretches
+
+
+def _names(count: int) -> tuple[str, ...]:
+    return tuple(map(str, range(count)))

@@ -1,0 +1,413 @@
+"""Roll-outs: what a robot does on command, its drives closing their loops, beside its logs.
+
+A robot with a fixed base falls into parts that the base alone joins, as the legs of a quadruped;
+each is rolled out by itself. Windows of logs go side by side in the lanes of the compiled code.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from os import cpu_count
+from types import ModuleType
+from typing import TypeAlias
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
+from robotid.findings import listed
+from robotid.logs.data import Log
+from robotid.regressor.compiled import Tree, flatten, is_installed, why_not
+from robotid.robot.drives import (
+    Asymmetric,
+    Coulomb,
+    Cubic,
+    DriveTerm,
+    Harmonic,
+    LoadFriction,
+    Offset,
+    PositionCoulomb,
+    Stribeck,
+    Tanh,
+    Viscous,
+)
+from robotid.robot.model import RobotModel
+
+__all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows"]
+
+#: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
+Column: TypeAlias = tuple[int, int, int]
+
+_GAP = 3.0  # median steps: across a longer one nothing is rolled out
+_AROUND = 0.03  # [s] about the first sample, whose slope is the speed a roll-out starts with
+_FEWEST = 2  # samples on each side for it
+_SHORT = 0.5  # of a window: a rest of that size joins the window before it
+_CODES: dict[type[DriveTerm], int] = {
+    Viscous: 0, Coulomb: 1, Offset: 2, PositionCoulomb: 3, Stribeck: 4, Asymmetric: 5, Cubic: 6,
+    Tanh: 7, Harmonic: 8, LoadFriction: 9,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """What bodies and drives are, and how the drives close their loops.
+
+    torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, the commands ``delay``
+    late; position 0 of a joint's encoder is position ``zero`` of the URDF.
+
+    Attributes:
+        bodies: Ten inertial parameters of each body, shape (n, 10), in the order of the layout.
+        armature: Shape (n,) [kg m^2 or kg].
+        kp: Shape (n,) [N m/rad or N/m].
+        kd: Shape (n,) [N m s/rad or N s/m].
+        limit: Largest torque, shape (n,) [N m or N]; infinite without one.
+        delay: Shape (n,) [s].
+        zero: Shape (n,) [rad or m].
+        terms: Friction and offset of each joint.
+        values: Their parameters, joint by joint, shape (T,).
+    """
+
+    bodies: Array
+    armature: Array
+    kp: Array
+    kd: Array
+    limit: Array
+    delay: Array
+    zero: Array
+    terms: tuple[tuple[DriveTerm, ...], ...]
+    values: Array
+
+    def place(self, joint: int, term: DriveTerm) -> int:
+        """Return where the parameter of a joint's term stands in ``values``.
+
+        Args:
+            joint: Number of the joint.
+            term: One of its terms.
+        """
+        return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A stretch of a log of commands that is rolled out from what was measured where it begins.
+
+    Attributes:
+        log: The log, with commands.
+        begin: Sample at which the roll-out begins.
+        first: First sample that counts; those before let what is wrong at the start die away.
+        stop: Sample after the last one.
+    """
+
+    log: Log
+    begin: int
+    first: int
+    stop: int
+
+    @property
+    def counted(self) -> slice:
+        """The samples that count."""
+        return slice(self.first, self.stop)
+
+    @cached_property
+    def start(self) -> Array:
+        """Position and speed where it begins, shape (2, n)."""
+        t, q, k = self.log.t, self.log.q, self.begin
+        dt = float(np.median(np.diff(t)))
+        wide = max(_FEWEST, round(_AROUND / dt))
+        near = slice(max(k - wide, 0), min(k + wide + 1, len(t)))
+        along, order = t[near] - t[k], min(2, len(t[near]) - 1)
+        fit = np.polynomial.polynomial.polyfit(along, q[near], order)
+        return np.stack([q[k], fit[1]])
+
+
+def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
+    """Return the windows of a log, stretch by stretch between its gaps.
+
+    Args:
+        log: The log, with commands.
+        length: Their length [s]; infinite for whole stretches.
+        lead: How long before what counts a roll-out begins, where the stretch has that [s].
+    """
+    steps = np.diff(log.t)
+    dt = float(np.median(steps))
+    edges = [0, *(np.flatnonzero(steps > _GAP * dt) + 1), len(log.t)]
+    ahead = round(lead / dt)
+    windows = []
+    for start, stop in zip(edges, edges[1:], strict=False):
+        size = stop - start if math.isinf(length) else max(2, round(length / dt))
+        firsts = list(range(start, stop, size))
+        if len(firsts) > 1 and stop - firsts[-1] < _SHORT * size:
+            firsts.pop()
+        ends = [*firsts[1:], stop]
+        windows += [
+            Window(log, max(start, first - ahead), first, end)
+            for first, end in zip(firsts, ends, strict=True)
+            if end - first > 1
+        ]
+    return tuple(windows)
+
+
+@dataclass(frozen=True, eq=False)
+class RollOut:
+    """What a window came out as.
+
+    Attributes:
+        window: Which one.
+        q: Positions of the samples that count, shape (N, n) [rad or m].
+        v: Speeds, likewise.
+        slopes: For each part of the robot its joints, shape (k,), the columns that move them, shape
+            (c,), and the derivatives of their positions, shape (N, k, c).
+    """
+
+    window: Window
+    q: Array
+    v: Array
+    slopes: tuple[tuple[Array, Array, Array], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part of the robot that the base alone joins to others, as the compiled code takes it."""
+
+    joints: Array  # rows of its joints in the model, (k,)
+    bodies: Array  # their bodies in the layout, (k,)
+    parents: Array
+    constants: Array
+    is_below: Array
+
+
+class LoopedRobot:
+    """A robot whose drives close their loops, to be rolled out."""
+
+    def __init__(self, model: RobotModel, *, step: float = 2e-3) -> None:
+        """Flatten a robot.
+
+        Args:
+            model: The robot.
+            step: Longest step of the integration [s].
+
+        Raises:
+            MissingDependencyError: If Numba is not installed.
+            SettingsError: If the robot floats, a drive turns with several joints, or a joint is of
+                a kind that is not compiled.
+        """
+        if not is_installed():
+            raise MissingDependencyError("rolling out closed loops", "numba", "fast")
+        if model.free_flyer or model.layout.couplings or model.mimic == "coupled":
+            raise SettingsError(
+                f"{model.name}: a floating base, drives that turn with several joints and coupled "
+                "mimic joints cannot be rolled out; fix the base, leave out [[coupling]], and set "
+                "mimic = 'independent'"
+            )
+        if (why := why_not(model)) is not None:
+            raise SettingsError(f"{model.name} cannot be rolled out: {why}")
+        self.model, self.step = model, step
+        self._parts = _parts(flatten(model))
+        self._gravity = np.array(model.pin_model.gravity.linear)
+
+    @property
+    def kinds(self) -> dict[str, int]:
+        """What a roll-out is differentiated by, as columns number it."""
+        lanes = _lanes()
+        return {
+            "armature": lanes.ARMATURE,
+            "kp": lanes.KP,
+            "kd": lanes.KD,
+            "limit": lanes.LIMIT,
+            "term": lanes.TERM,
+            "delay": lanes.LATE,
+            "zero": lanes.ZERO,
+            "body": lanes.INERTIAL,
+        }
+
+    @property
+    def joint_of_body(self) -> tuple[int, ...]:
+        """The joint that moves each body of the layout."""
+        found = {
+            int(body): int(joint)
+            for part in self._parts
+            for body, joint in zip(part.bodies, part.joints, strict=True)
+        }
+        return tuple(found[body] for body in range(len(found)))
+
+    def roll_out(
+        self,
+        loops: Loops,
+        windows: Sequence[Window],
+        columns: Sequence[Column] = (),
+        directions: Array | None = None,
+    ) -> list[RollOut]:
+        """Return what windows come out as.
+
+        Args:
+            loops: Bodies, drives and loops.
+            windows: The windows.
+            columns: What to differentiate by: kind, joint, and index of a term or a direction.
+            directions: Changes of a body's ten parameters, shape (D, 10).
+
+        Raises:
+            NotConvergedError: If a step has no solution, as where friction falls below 0.
+        """
+        wanted = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
+        lanes = _lanes()
+        blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
+        work = [(part, block) for block in blocks for part in self._parts]
+        with ThreadPoolExecutor(max_workers=min(len(work), cpu_count() or 1) or 1) as pool:
+            done = list(pool.map(lambda w: self._block(*w, loops, wanted, along), work))
+        n, each = len(self.model.joints), len(self._parts)
+        found = []
+        for b, block in enumerate(blocks):
+            parts = list(zip(self._parts, done[b * each : (b + 1) * each], strict=True))
+            for lane, window in enumerate(block):
+                kept = slice(window.first - window.begin, window.stop - window.begin)
+                q, v = np.empty((2, kept.stop - kept.start, n))
+                slopes = []
+                for part, (columns_of, q_part, v_part, S) in parts:
+                    q[:, part.joints], v[:, part.joints] = (
+                        q_part[kept, :, lane],
+                        v_part[kept, :, lane],
+                    )
+                    slopes.append((part.joints, columns_of, S[kept, :, :, lane]))
+                found.append(RollOut(window, q, v, tuple(slopes) if len(wanted) else ()))
+        return found
+
+    def _block(
+        self, part: _Part, windows: Sequence[Window], loops: Loops, wanted: Array, along: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return columns, positions, speeds and derivatives of one part in a block of windows."""
+        lanes = _lanes()
+        own, n = part.joints, len(part.joints)
+        columns_of = np.flatnonzero(np.isin(wanted[:, 1], own))
+        columns = wanted[columns_of]
+        columns[:, 1] = [np.flatnonzero(own == j)[0] for j in columns[:, 1]]
+        terms = [term for j in own for term in loops.terms[j]]
+        first = np.cumsum([0, *(len(loops.terms[j]) for j in own)])
+        begins = np.cumsum([0, *map(len, loops.terms)])
+        places = np.concatenate([np.arange(begins[j], begins[j + 1]) for j in own]).astype(int)
+        is_term = columns[:, 0] == lanes.TERM
+        columns[is_term, 2] = [np.flatnonzero(places == k)[0] for k in columns[is_term, 2]]
+        coded = [_coded(term) for term in terms]
+        codes = np.array([code for code, *_ in coded], dtype=np.int64)
+        shapes = np.array([shape for _, *shape in coded]).reshape(-1, 4)
+        drives = np.column_stack(
+            [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
+        )
+        command, steps, every, start = self._commands(part, windows, loops)
+        samples = len(steps) // every + 1
+        q, v = np.zeros((2, samples, n, lanes.LANES))
+        S = np.zeros((samples, n, len(columns), lanes.LANES))
+        q[0], v[0] = start
+        failed = lanes.roll_out(
+            part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],
+            part.is_below, self._gravity, drives, codes, shapes, loops.values[places],
+            first, columns, along, command, steps, every, start, q, v, S,
+            np.zeros(lanes.work_size(n, len(columns))),
+        )  # fmt: skip
+        if failed >= 0 or not np.isfinite(q).all():
+            names = listed(self.model.joints[j] for j in own)
+            raise NotConvergedError(
+                f"the roll-out of {names} has no solution: friction below 0, or gains too high for "
+                f"steps of {self.step:g} s",
+                f"step {failed} of {len(steps)}",
+            )
+        return columns_of, q, v, S
+
+    def _commands(
+        self, part: _Part, windows: Sequence[Window], loops: Loops
+    ) -> tuple[Array, Array, int, Array]:
+        """Return commands by step and lane, lengths of steps, steps a sample, and the start."""
+        lanes = _lanes()
+        every = max(
+            1, *(math.ceil(float(np.median(np.diff(w.log.t))) / self.step - 1e-9) for w in windows)
+        )
+        samples = max(window.stop - window.begin for window in windows)
+        size, n = (samples - 1) * every, len(part.joints)
+        command = np.zeros((size, n, 5, lanes.LANES))
+        steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
+        mean, change = np.empty(size), np.empty(size)
+        for lane in range(lanes.LANES):
+            if lane >= len(windows):  # lanes that nobody asked for do what the first one does
+                command[..., lane], steps[:, lane] = command[..., 0], steps[:, 0]
+                start[..., lane] = start[..., 0]
+                continue
+            window = windows[lane]
+            log, times = window.log, _times(window, samples, every)
+            steps[:, lane], start[..., lane] = np.diff(times), window.start[:, part.joints]
+            for values, places in ((log.q_ref, (0, 1)), (log.v_ref, (2, 4)), (log.tau_ref, (3,))):
+                if values is None:
+                    continue
+                for i, j in enumerate(part.joints):
+                    told = np.ascontiguousarray(values[:, j])
+                    lanes.average_command(log.t, told, times, loops.delay[j], mean, change)
+                    for place, found in zip(places, (mean, change), strict=False):
+                        command[:, i, place, lane] = found
+        return command, steps, every, start
+
+
+def _times(window: Window, samples: int, every: int) -> Array:
+    """Return where steps begin and end: those of the log, and after it as long as its median."""
+    t = window.log.t[window.begin : window.stop]
+    beyond = samples - len(t)
+    dt = float(np.median(np.diff(window.log.t)))
+    stamps = np.concatenate([t, t[-1] + dt * np.arange(1, beyond + 1)])
+    return np.interp(np.arange((samples - 1) * every + 1) / every, np.arange(samples), stamps)
+
+
+def _parts(tree: Tree) -> list[_Part]:
+    """Return the parts of a robot that the world alone joins."""
+    parents, rows = tree.parents[1:] - 1, tree.leaders[1:]
+    root: list[int] = []
+    for i, parent in enumerate(parents):
+        root.append(i if parent < 0 else root[parent])
+    parts = []
+    for r in sorted(set(root)):
+        bodies = [i for i, own in enumerate(root) if own == r]
+        place = {body: k for k, body in enumerate(bodies)}
+        above = np.array([place.get(int(parents[i]), -1) for i in bodies], dtype=np.int64)
+        is_below = np.eye(len(bodies), dtype=bool)
+        for k, parent in enumerate(above):
+            if parent >= 0:
+                is_below[k] |= is_below[parent]
+        constants = np.ascontiguousarray(tree.joints[1:][bodies])
+        parts.append(_Part(rows[bodies], np.array(bodies), above, constants, is_below))
+    return parts
+
+
+def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
+    """Return code, two numbers of its shape, and the range seen of a term."""
+    code = _CODES.get(type(term))
+    if code is None:
+        known = listed(kind.__name__ for kind in _CODES)
+        raise SettingsError(
+            f"the term {type(term).__name__} has no place in roll-outs; they have {known}"
+        )
+    shape = (0.0, 0.0)
+    if isinstance(term, PositionCoulomb):
+        shape = float(term.order), term.centre
+    elif isinstance(term, Stribeck | Tanh):
+        shape = term.speed, 0.0
+    elif isinstance(term, Harmonic):
+        shape = term.order, math.pi / 2 if term.is_sine else 0.0
+    return code, *shape, *term.seen
+
+
+def checked_terms(terms: Iterable[DriveTerm]) -> None:
+    """Refuse terms that roll-outs do not have.
+
+    Args:
+        terms: Terms of drives.
+
+    Raises:
+        SettingsError: If there is one.
+    """
+    for term in terms:
+        _coded(term)
+
+
+def _lanes() -> ModuleType:
+    import robotid.simulation.loop_lanes  # imports Numba
+
+    return robotid.simulation.loop_lanes
