@@ -69,6 +69,8 @@ class Design:
     Attributes:
         motion: The motion.
         duration: Its length [s].
+        intervals: Into how many equal ones it is divided by the instants at which its limits were
+            checked.
         objective: Its criterion, the smaller the better.
         condition: Condition number of the base problem, columns in units of what the URDF leaves
             open.
@@ -83,6 +85,7 @@ class Design:
 
     motion: Motion
     duration: float
+    intervals: int
     objective: float
     condition: float
     used: Array
@@ -248,11 +251,11 @@ class Designer:
             duration: Its length [s].
             rate: Instants per second at which it is looked at [Hz].
         """
-        t = np.arange(round(duration * rate) + 1) / rate
-        q, v, a = motion.evaluate(t)
+        count = round(duration * rate)
+        q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
-        scale = np.sqrt(1.0 / rate / self.noise)[:, None, None] * self.spread[:, None]
+        scale = np.sqrt(duration / count / self.noise)[:, None, None] * self.spread[:, None]
         flat = (scale * rows.W).swapaxes(0, 1).reshape(len(self.spread), -1)
         contact = None
         if self.clearance is not None:
@@ -271,6 +274,7 @@ class Designer:
         return Design(
             motion=motion,
             duration=duration,
+            intervals=used.shape[1] - 1,
             objective=criterion(self.name, information)[0],
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
             used=np.abs(used).max(axis=1),
@@ -428,14 +432,18 @@ class Designer:
             q = self._drawn(rng, _AT_ONCE)
             kept: Array = q[self.can_rest(q)]
             if len(kept):
-                return kept[0]
-        return self.postures(rng)[0]
+                break
+        else:
+            kept = self.postures(rng)
+        first: Array = kept[0]
+        return first
 
     def _drawn(self, rng: np.random.Generator, count: int) -> Array:
         """Return random postures, shape (count, n) [rad or m]."""
         reach = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
         reach[:, self.limits.sizes[0] > 2.0] *= 0.6
-        return self.limits.middle + reach * self.limits.sizes[0]
+        q: Array = self.limits.middle + reach * self.limits.sizes[0]
+        return q
 
     def can_rest(self, q: Array) -> Array:
         """Return whether postures keep limits and distances at rest, shape (N,), bool.
