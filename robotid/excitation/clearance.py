@@ -246,7 +246,13 @@ class Clearance:
         G, shift = self._model.velocity_map, self._model.position_offset
         return self._regressor.poses(q @ G.T + shift)
 
-    def near(self, poses: Poses, within: float | Array, chosen: Array | None = None) -> Nearness:
+    def near(
+        self,
+        poses: Poses,
+        within: float | Array,
+        chosen: Array | None = None,
+        hints: Array | None = None,
+    ) -> Nearness:
         """Return the distances of pairs along a motion, exact where they are near.
 
         Args:
@@ -254,14 +260,24 @@ class Clearance:
             within: Distance from which a lower bound will do, one, or one per pair and instant,
                 shape (pairs, N) or one that broadcasts to it [m].
             chosen: Which pairs to look at, shape (pairs,), bool; those that may meet if None.
+            hints: Directions that parted the hulls before, shape (pairs, N, 3), 0 at first; the
+                better they are, the faster it goes. Those found are written to it.
         """
         import coal
 
         chosen = self.likely if chosen is None else chosen
         bound = np.full((len(self.pairs), poses.p.shape[2]), np.inf)
         limit = np.broadcast_to(within, bound.shape)
-        bounds = self._bounds_fast if self._is_fast else self._bounds
-        bound[chosen] = bounds(poses, self.pairs[chosen], limit[chosen])
+        hints = np.zeros((*bound.shape, 3)) if hints is None else hints
+        if self._is_fast:
+            from robotid.excitation.gap_lanes import lower_bounds  # imports Numba
+
+            numbers, enough = np.flatnonzero(chosen), np.array(limit, order="C")
+            lower_bounds(
+                numbers, self.pairs, enough, hints, bound, poses.R, poses.p, *self._corners
+            )
+        else:
+            bound[chosen] = self._bounds(poses, self.pairs[chosen], limit[chosen], hints[chosen])
         pairs, samples = np.nonzero(bound < limit)
         hulls = self.pairs[pairs].T  # (2, k)
         centres, turns = self._placed(poses, hulls.ravel(), np.tile(samples, 2))
@@ -275,7 +291,7 @@ class Clearance:
             exact[k] = coal.distance(*one, *other, self._request, result)
             witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
-        bound[pairs, samples] = exact
+        bound[pairs, samples], hints[pairs, samples] = exact, normals
         gradient = self._gradient(poses, pairs, samples, witness, normals)
         return Nearness(bound, pairs, samples, gradient)
 
@@ -341,13 +357,14 @@ class Clearance:
                     body = int(tree.parents[body + 1]) - 1
         return out
 
-    def _bounds(self, poses: Poses, pairs: Array, limit: Array) -> Array:
-        """Return lower bounds of distances by spheres, and where those are too low by boxes.
+    def _bounds(self, poses: Poses, pairs: Array, limit: Array, hints: Array) -> Array:
+        """Return lower bounds of distances by spheres, where too low by boxes, then by hints.
 
         Args:
             poses: Where the bodies are.
             pairs: Numbers of two hulls, shape (k, 2).
             limit: What a bound need not exceed, shape (k, N) [m].
+            hints: Directions that may part the hulls, shape (k, N, 3).
         """
         N, count = limit.shape[1], len(self._hulls)
         every = np.repeat(np.arange(count), N), np.tile(np.arange(N), count)
@@ -359,16 +376,22 @@ class Clearance:
         bound -= (radii[i] + radii[j])[:, None]
         k, samples = np.nonzero(bound < limit)
         bound[k, samples] = self._box_bound(centres, turns, pairs[k], samples)
+        k, samples = np.nonzero((bound < limit) & hints.any(axis=2))
+        way = hints[k, samples]  # from the first hull to the second
+        i, j = pairs[k].T
+        gap = np.einsum("kc,kc->k", way, centres[j, samples] - centres[i, samples])
+        gap -= self._reach(i, turns[i, samples], way) + self._reach(j, turns[j, samples], -way)
+        bound[k, samples] = np.maximum(bound[k, samples], gap)
         return bound
 
-    def _bounds_fast(self, poses: Poses, pairs: Array, limit: Array) -> Array:
-        """Return lower bounds of distances by compiled code; see ``_bounds``."""
-        from robotid.excitation.gap_lanes import lower_bounds  # imports Numba
-
-        bound: Array = lower_bounds(
-            pairs, np.array(limit, order="C"), poses.R, poses.p, *self._corners
-        )
-        return bound
+    def _reach(self, hulls: Array, turns: Array, ways: Array) -> Array:
+        """Return how far k hulls reach from their middles along directions, shape (k,) [m]."""
+        own = np.einsum("kba,kb->ka", turns, ways)
+        out = np.empty(len(hulls))
+        for hull in np.unique(hulls):
+            rows = hulls == hull
+            out[rows] = (own[rows] @ self._hulls[hull].corners.T).max(axis=1)
+        return out
 
     @cached_property
     def _corners(self) -> tuple[Array, ...]:

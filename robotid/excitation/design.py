@@ -326,6 +326,13 @@ class Designer:
         return F
 
     @cached_property
+    def _hints(self) -> Array | None:
+        """Directions that parted hulls of the motion looked at last, shape (pairs, N, 3)."""
+        if self.clearance is None:
+            return None
+        return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
+
+    @cached_property
     def _spare(self) -> Array:
         """What is left of distances for what lies between instants, shape (pairs, 1) [m]."""
         if self.clearance is None:
@@ -350,7 +357,8 @@ class Designer:
             return np.zeros((0, poses.p.shape[2]))
         kept = self.clearance.kept[:, None] + spare * self._spare
         seen = np.minimum(_SEEN, self.clearance.room[:, None] / 4)
-        return self.clearance.near(poses, kept + seen).distance - kept
+        hints = self._hints if poses.p.shape[2] == self._functions.shape[1] else None
+        return self.clearance.near(poses, kept + seen, hints=hints).distance - kept
 
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""
@@ -377,7 +385,7 @@ class Designer:
         value += cost
         if self.clearance is not None:
             aim = self._aim
-            near = self.clearance.near(rows.state, multipliers.reach(aim))
+            near = self.clearance.near(rows.state, multipliers.reach(aim), hints=self._hints)
             cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
             along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
@@ -570,7 +578,8 @@ class Designer:
         held = state.multipliers
         distance = None
         if self.clearance is not None:
-            distance = self.clearance.near(rows.state, held.reach(self._aim)).distance
+            reach = held.reach(self._aim)
+            distance = self.clearance.near(rows.state, reach, hints=self._hints).distance
         kept = self._feasible(C, 1.0 - _SPARE)
         objective = self._objective(kept)
         if objective > state.objective - settled:

@@ -2,8 +2,9 @@
 
 Imported only where the extra ``fast`` is installed and a motion is designed. Along any direction
 two hulls are at least as far apart as the points of each that reach farthest towards the other.
-The sides of the boxes around them are tried first, then directions that come from Frank and Wolfe's way to the point of B - A that is nearest to 0; it ends where
-the bound suffices, or where that point shows that the hulls are nearer than asked for.
+The sides of the boxes around them are tried first, then the direction that was best before, then
+those of Frank and Wolfe's way to the point of B - A that is nearest to 0. It ends where a bound
+suffices, or where that point shows that the hulls are nearer than asked for.
 
 References:
     Gilbert, Johnson, Keerthi (1988), A fast procedure for computing the distance between complex
@@ -79,8 +80,25 @@ def _boxes(i, j, n, bound, R, centres, bodies, half):
 
 
 @compiled
-def _bound(i, j, n, enough, bound, R, centres, bodies, points, starts):
-    """Return a lower bound of the distance of two hulls at one instant, ``bound`` at the least."""
+def _along(i, j, n, x, y, z, R, centres, bodies, points, starts):
+    """Return the point of B - A that is the lowest along a direction."""
+    a = _support(i, n, R, centres, bodies, points, starts, x, y, z)
+    b = _support(j, n, R, centres, bodies, points, starts, -x, -y, -z)
+    return b[0] - a[0], b[1] - a[1], b[2] - a[2]
+
+
+@compiled
+def _bound(i, j, n, enough, bound, hint, R, centres, bodies, points, starts):
+    """Return a lower bound of the distance of two hulls at one instant, ``bound`` at the least.
+
+    ``hint`` is a direction that may be good; it is replaced by the best.
+    """
+    hulls = R, centres, bodies, points, starts
+    if hint[0] != 0.0 or hint[1] != 0.0 or hint[2] != 0.0:
+        w = _along(i, j, n, hint[0], hint[1], hint[2], *hulls)
+        bound = max(bound, w[0] * hint[0] + w[1] * hint[1] + w[2] * hint[2])
+        if bound >= enough:
+            return bound
     x = centres[0, j, n] - centres[0, i, n]
     y = centres[1, j, n] - centres[1, i, n]
     z = centres[2, j, n] - centres[2, i, n]
@@ -88,12 +106,13 @@ def _bound(i, j, n, enough, bound, R, centres, bodies, points, starts):
         size = np.sqrt(x * x + y * y + z * z)
         if size < 1e-9:
             return bound
-        x1, y1, z1 = x / size, y / size, z / size
-        a = _support(i, n, R, centres, bodies, points, starts, x1, y1, z1)
-        b = _support(j, n, R, centres, bodies, points, starts, -x1, -y1, -z1)
-        wx, wy, wz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        bound = max(bound, wx * x1 + wy * y1 + wz * z1)
-        dx, dy, dz = wx - x, wy - y, wz - z
+        u, v, t = x / size, y / size, z / size
+        w = _along(i, j, n, u, v, t, *hulls)
+        apart = w[0] * u + w[1] * v + w[2] * t
+        if apart > bound:
+            bound = apart
+            hint[0], hint[1], hint[2] = u, v, t
+        dx, dy, dz = w[0] - x, w[1] - y, w[2] - z
         step = dx * dx + dy * dy + dz * dz
         if bound >= enough or step < 1e-18:
             return bound
@@ -105,12 +124,31 @@ def _bound(i, j, n, enough, bound, R, centres, bodies, points, starts):
 
 
 @compiled
-def lower_bounds(pairs, enough, R, p, bodies, middles, radii, half, points, starts):
-    """Return lower bounds of the distances of pairs of hulls, shape (pairs, N) [m].
+def _centres(R, p, bodies, middles):
+    """Return the middles of hulls in the world, shape (3, h, N)."""
+    N = p.shape[2]
+    centres = np.empty((3, len(bodies), N))
+    for h in range(len(bodies)):
+        i, x, y, z = bodies[h], middles[h, 0], middles[h, 1], middles[h, 2]
+        for c in range(3):
+            for n in range(N):
+                centres[c, h, n] = middles[h, c]
+                if i >= 0:
+                    turned = R[c, 0, i, n] * x + R[c, 1, i, n] * y + R[c, 2, i, n] * z
+                    centres[c, h, n] = p[c, i, n] + turned
+    return centres
+
+
+@compiled
+def lower_bounds(chosen, pairs, enough, hints, out, R, p, bodies, middles, radii, half, points, starts):
+    """Write lower bounds of the distances of pairs of hulls [m].
 
     Args:
+        chosen: Which pairs are looked at, int.
         pairs: Numbers of two hulls, shape (pairs, 2), int.
         enough: What a bound need not exceed, shape (pairs, N) [m].
+        hints: Directions that may part the hulls, shape (pairs, N, 3); better ones are written.
+        out: The bounds, shape (pairs, N); written.
         R: Rotations of the m bodies at N instants, shape (3, 3, m, N).
         p: Origins of the bodies, shape (3, m, N) [m].
         bodies: Body of each of h hulls, shape (h,), int; -1: it stands still.
@@ -120,22 +158,10 @@ def lower_bounds(pairs, enough, R, p, bodies, middles, radii, half, points, star
         points: Corners of all hulls about their middles, shape (k, 3) [m].
         starts: Where those of each begin, and the last end, shape (h + 1,), int.
     """
-    N = p.shape[2]
-    centres = np.empty((3, len(bodies), N))
-    for h in range(len(bodies)):
-        for c in range(3):
-            for n in range(N):
-                centres[c, h, n] = middles[h, c]
-        if bodies[h] >= 0:
-            i, (x, y, z) = bodies[h], (middles[h, 0], middles[h, 1], middles[h, 2])
-            for c in range(3):
-                for n in range(N):
-                    turned = R[c, 0, i, n] * x + R[c, 1, i, n] * y + R[c, 2, i, n] * z
-                    centres[c, h, n] = p[c, i, n] + turned
-    out = np.empty((len(pairs), N))
-    for k in range(len(pairs)):
+    centres = _centres(R, p, bodies, middles)
+    for k in chosen:
         i, j = pairs[k, 0], pairs[k, 1]
-        for n in range(N):
+        for n in range(p.shape[2]):
             x = centres[0, j, n] - centres[0, i, n]
             y = centres[1, j, n] - centres[1, i, n]
             z = centres[2, j, n] - centres[2, i, n]
@@ -144,7 +170,6 @@ def lower_bounds(pairs, enough, R, p, bodies, middles, radii, half, points, star
                 apart = _boxes(i, j, n, apart, R, centres, bodies, half)
             if apart < enough[k, n]:
                 apart = _bound(
-                    i, j, n, enough[k, n], apart, R, centres, bodies, points, starts
+                    i, j, n, enough[k, n], apart, hints[k, n], R, centres, bodies, points, starts
                 )  # fmt: skip
             out[k, n] = apart
-    return out
