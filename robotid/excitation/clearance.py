@@ -436,9 +436,9 @@ class Clearance:
         bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
         out = np.zeros((len(pairs), linear.shape[1]))
         for side, sign in ((0, -1.0), (1, 1.0)):
-            x = witness[side]  # (k, 3)
-            velocity = linear + np.cross(angular, x.T[:, None], axis=0)
-            along = np.einsum("cjk,kc->kj", velocity, normals)
+            turning = np.cross(witness[side], normals)  # n . (w x p) = w . (p x n)
+            along = np.einsum("cjk,kc->kj", linear, normals)
+            along += np.einsum("cjk,kc->kj", angular, turning)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
         by_joint: Array = out @ self._ratios
         return by_joint

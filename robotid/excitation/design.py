@@ -36,9 +36,9 @@ from robotid.simulation.motions import Motion
 
 __all__ = ["Design", "Designer"]
 
-_PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
-_POLISHED = 2  # times as many that its last rounds look at ...
-_FINER = 10  # ... and at which its limits are checked in the end
+_PER_PERIOD = 14  # instants within the shortest period of a basis that a design looks at
+_POLISHED = 3  # times as many that its last rounds look at ...
+_FINER = 15  # ... and at which its limits are checked in the end
 _ROUNDS = 14  # of the augmented Lagrangian ...
 _LAST_ROUNDS = 8  # ... and on the finer grid
 _STEPS = 20  # of L-BFGS in each
@@ -182,7 +182,7 @@ class Designer:
         seconds: float = np.inf,
         progress: Callable[[int, float], None] | None = None,
     ) -> Design:
-        """Return the best motion that was found, checked on a ten times finer grid.
+        """Return the best motion that was found, checked on a grid 15 times as fine as at first.
 
         Args:
             rng: Source of the starts.

@@ -159,19 +159,44 @@ def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
     assert ((distance >= clearance.kept[:, None]).all(axis=0)).any()  # there are postures to be in
 
 
-@pytest.mark.parametrize("name", ["panda", "ur10_robot"])
-def test_compiled_bounds_are_below_the_distances_and_tighter_than_boxes(name):
-    pytest.importorskip("numba")
-    model = RobotModel.from_urdf(example_urdf(f"{name}.urdf"))
-    plain, fast = (Clearance(model, floor=-0.05, is_fast=is_fast) for is_fast in (False, True))
+@pytest.fixture(scope="module", params=["panda", "ur10_robot"])
+def scattered(request):
+    """A robot at random, its distances, and how far they are looked at."""
+    model = RobotModel.from_urdf(example_urdf(f"{request.param}.urdf"))
     low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
     q = np.random.default_rng(2).uniform(low, high, (60, len(low)))
-    poses = plain.poses(q)
-    limit = np.full((len(plain.pairs), 60), 0.05)
-    exact = plain.near(poses, np.inf, plain.everything).distance
-    found = fast.near(poses, limit, fast.everything)
-    np.testing.assert_array_equal(found.distance[exact < limit], exact[exact < limit])
-    assert (found.distance[exact >= limit] >= 0.05).all()
-    boxes, tight = (x(poses, x.__self__.pairs, limit) for x in (plain._bounds, fast._bounds_fast))
-    assert (tight <= exact + 1e-6).all()
-    assert (tight[exact >= limit] < 0.05).sum() < 0.2 * (boxes[exact >= limit] < 0.05).sum()
+    clearance = Clearance(model, floor=-0.05)
+    poses = clearance.poses(q)
+    return model, clearance, poses, clearance.near(poses, np.inf, clearance.everything).distance
+
+
+def test_hulls_that_are_far_apart_are_left_out_by_compiled_code(scattered):
+    pytest.importorskip("numba")
+    model, plain, poses, exact = scattered
+    fast = Clearance(model, floor=-0.05, is_fast=True)
+    found, usual = (x.near(poses, 0.05, x.everything) for x in (fast, plain))
+    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+    assert (found.distance[exact >= 0.05] >= 0.05).all()
+    assert (found.distance <= exact + 1e-6).all()
+    needed = int((exact < 0.05).sum())
+    assert len(found.pairs) - needed < 0.3 * (len(usual.pairs) - needed)
+
+
+@pytest.mark.parametrize("is_fast", [False, True])
+def test_directions_that_parted_hulls_before_spare_their_distances(scattered, is_fast):
+    if is_fast:
+        pytest.importorskip("numba")
+    model, _, poses, exact = scattered
+    clearance = Clearance(model, floor=-0.05, is_fast=is_fast)
+    hints = np.zeros((*exact.shape, 3))
+    first, again = (clearance.near(poses, 0.05, clearance.everything, hints) for _ in range(2))
+    needed = int((exact < 0.05).sum())
+    assert len(first.pairs) > needed + 1
+    assert len(again.pairs) <= needed + 1
+    for found in (first, again):
+        np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+        assert (found.distance <= exact + 1e-6).all()
+    wrong = np.random.default_rng(0).standard_normal(hints.shape)
+    wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
+    found = clearance.near(poses, 0.05, clearance.everything, wrong)
+    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])

@@ -35,13 +35,13 @@ def design(designer):
 
 def test_the_information_is_that_of_the_regressor(wrist, designer, rng):
     C = designer.random(rng)
-    step = 4.0 / 60  # twenty instants within a third of 4 s
-    t = step * np.arange(61)
+    step = 4.0 / 42  # 14 instants within a third of 4 s
+    t = step * np.arange(43)
     q, v, a, _ = designer.basis.derivatives(t, 3) @ C
     signs = np.tanh(v / 0.01)
     W = joint_torque_regressor(wrist, q, v, a, signs)[:, designer.information.mapping.independent]
     density = 0.1 * (np.array([0.01 * 54.0, 0.7, 0.01 * 54.0])) ** 2  # 1 % of 54 N m, for 0.1 s
-    weights = np.tile(step / density, 61)[:, None]
+    weights = np.tile(step / density, 43)[:, None]
     S = designer.spread
     expected = S[:, None] * (W.T @ (weights * W)) * S + np.eye(len(S))
     rows = designer.information.rows(q, v, a)
@@ -53,8 +53,8 @@ def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, 
     around = Clearance(wrist, least=0.05, boxes=[Box("post", (0.9, 0.2, -0.5), (1.0, 0.4, 0.5))])
     designer = replace(designer, name=name, clearance=around)
     C, D = 1.5 * designer.random(rng), rng.standard_normal((5, 3))
-    shape = (len(LIMITS), 61, 3)
-    pairs = (len(around.pairs), 61)
+    shape = (len(LIMITS), 43, 3)
+    pairs = (len(around.pairs), 43)
     held = rng.uniform(0.0, 0.05, shape), rng.uniform(0.0, 0.1, pairs) * (rng.random(pairs) < 0.3)
     multipliers, h = _Multipliers(0.2, *held), 1e-6
     up, down = (designer._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
@@ -166,7 +166,7 @@ def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, de
     near, rng = replace(designer, clearance=around), np.random.default_rng(2)
     C = near.random(rng)
     _, _, rows = near._kept(C)
-    pairs = len(around.pairs), 61
+    pairs = len(around.pairs), 43
     held = _Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
     aim = near._aim
     some, every = (
