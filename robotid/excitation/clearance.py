@@ -191,8 +191,8 @@ class Clearance:
         q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
         distance = self.near(self.poses(q), self.least + _APART, self.everything).distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
-        are_links: Array = is_link[self.pairs].all(axis=1)
-        touch: Array = distance < _TOUCH
+        are_links = np.all(is_link[self.pairs], axis=1)
+        touch = np.less(distance, _TOUCH)
         always = are_links & touch[:, 0] & (touch.mean(axis=1) > _ALMOST_ALL)
         self.made_to = self._listed(always, distance.min(axis=1))
         self.pairs, distance, touch = self.pairs[~always], distance[~always], touch[~always]

@@ -18,7 +18,7 @@ from robotid.estimators.determination import base_spread
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact
-from robotid.excitation.information import MotionInformation, MotionRows, criterion
+from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.identification.previews import (
     CORRELATION,
@@ -59,6 +59,7 @@ _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
 _TRIED = 200  # random postures until one is found that the robot can rest in ...
 _AT_ONCE = 10  # ... so many at a time
+_WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
 _STARTED = 10  # random motions of which the best is a start
 
 
@@ -107,10 +108,14 @@ class Designer:
         noise: Density of each joint's noise, variance times the time over which it is correlated,
             shape (n,) [(N m)^2 s or N^2 s].
         spread: How far base parameters may be from what is known, shape (b,).
+        standard_spread: The same of the standard parameters, shape (p,).
         given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
         name: The criterion, as of ``criterion``.
         clearance: What keeps it from collisions; None: they are not looked at.
         finer: How many times finer than usual the grid of instants is.
+        aim: What is asked for, if not the base parameters; nothing is known of them then.
+        moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
+            begins, and tell nothing, for friction holds them.
     """
 
     information: MotionInformation
@@ -118,10 +123,13 @@ class Designer:
     basis: Basis
     noise: Array
     spread: Array
+    standard_spread: Array
     given: Array | None = None
     name: str = "D"
     clearance: Clearance | None = None
     finer: int = 1
+    aim: Aim | None = None
+    moving: Array | None = None
 
     @classmethod
     def of_model(
@@ -160,13 +168,16 @@ class Designer:
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
         usual = _USUAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
-        spread = base_spread(mapping.K, prior_spread(model, usual**2, 1))
+        standard_spread = prior_spread(model, usual**2, 1)
+        spread = base_spread(mapping.K, standard_spread)
         given = None
         if run is not None:
             told = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * told * spread
         information = MotionInformation(model, mapping, mapping.to_base(pi), is_fast)
-        return cls(information, limits, basis, density, spread, given, name, clearance)
+        return cls(
+            information, limits, basis, density, spread, standard_spread, given, name, clearance
+        )
 
     @cached_property
     def _functions(self) -> Array:
@@ -251,16 +262,25 @@ class Designer:
             duration: Its length [s].
             rate: Instants per second at which it is looked at [Hz].
         """
+        used, information = self.used_and_told(motion, duration, rate)
+        contact = None
+        if self.clearance is not None:
+            contact = self.clearance.nearest(motion, duration)
+        return self._weighed(motion, duration, information, used, contact)
+
+    def used_and_told(self, motion: Motion, duration: float, rate: float) -> tuple[Array, Array]:
+        """Return what a motion uses of limits but jerk, (6, N, n), and its information, (b, b).
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+            rate: Instants per second at which it is looked at [Hz].
+        """
         count = round(duration * rate)
         q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
-        scale = np.sqrt(duration / count / self.noise)[:, None, None] * self.spread[:, None]
-        flat = (scale * rows.W).swapaxes(0, 1).reshape(len(self.spread), -1)
-        contact = None
-        if self.clearance is not None:
-            contact = self.clearance.nearest(motion, duration)
-        return self._weighed(motion, duration, flat @ flat.T + self.known, used, contact)
+        return used, self._informed(rows, duration / count)
 
     def _weighed(
         self,
@@ -270,12 +290,14 @@ class Designer:
         used: Array,
         contact: Contact | None,
     ) -> Design:
-        low, *_, high = np.linalg.eigvalsh(information - self.known)
+        own = information - self.known
+        own = own if self.aim is None else self.aim.information(own)[0]
+        low, *_, high = np.linalg.eigvalsh(own)
         return Design(
             motion=motion,
             duration=duration,
             intervals=used.shape[1] - 1,
-            objective=criterion(self.name, information)[0],
+            objective=self.judged(information)[0],
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
             used=np.abs(used).max(axis=1),
             contact=contact,
@@ -303,15 +325,45 @@ class Designer:
     @property
     def known(self) -> Array:
         """Information that is there already, in units of the spread, shape (b, b)."""
+        if self.aim is not None:
+            return np.zeros((len(self.spread), len(self.spread)))
         known: Array = np.eye(len(self.spread)) if self.given is None else self.given
         return known
 
     @cached_property
-    def _scale(self) -> Array:
-        """What rows are multiplied by, so that their squares are information, (n, b, 1)."""
-        step = self.basis.duration / (self._functions.shape[1] - 1)
-        scale: Array = np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
+    def widest(self) -> Array:
+        """The quarter of base parameters that are known the least already, shape (k,)."""
+        variance = np.diag(np.linalg.inv(self.known))
+        return np.argsort(variance, kind="stable")[-max(1, round(_WIDEST * len(variance))) :]
+
+    @cached_property
+    def _moves(self) -> Array:
+        """Which joints move, shape (n,), bool."""
+        return np.ones(len(self.noise), dtype=bool) if self.moving is None else self.moving
+
+    def judged(self, F: Array) -> tuple[float, Array]:
+        """Return the criterion of information about the base parameters, and its gradient.
+
+        Args:
+            F: The information, in units of the spread, shape (b, b).
+        """
+        if self.aim is None:
+            return criterion(self.name, F, self.widest)
+        own, L = self.aim.information(F)
+        value, by_own = criterion(self.name, own)
+        return value, L @ by_own @ L.T
+
+    def _scale(self, step: float) -> Array:
+        """Return what rows are multiplied by, so that their squares are information, (n, b, 1)."""
+        weight = self._moves * np.sqrt(step / self.noise)
+        scale: Array = weight[:, None, None] * self.spread[:, None]
         return scale
+
+    @cached_property
+    def _step(self) -> float:
+        """Time between two instants of the grid [s]."""
+        step: float = self.basis.duration / (self._functions.shape[1] - 1)
+        return step
 
     def matrix(self, rows: MotionRows) -> Array:
         """Return the information of a motion and what was known, in units of the spread, (b, b).
@@ -319,8 +371,11 @@ class Designer:
         Args:
             rows: Its rows.
         """
+        return self._informed(rows, self._step)
+
+    def _informed(self, rows: MotionRows, step: float) -> Array:
         n, b, N = rows.W.shape
-        scaled = rows.W * self._scale
+        scaled = rows.W * self._scale(step)
         flat = scaled.swapaxes(0, 1).reshape(b, n * N)
         F: Array = flat @ flat.T + self.known
         return F
@@ -363,7 +418,7 @@ class Designer:
     def _objective(self, C: Array) -> float:
         """Return the criterion of a motion."""
         q, v, a, _ = self._functions @ C
-        return criterion(self.name, self.matrix(self.information.rows(q, v, a)))[0]
+        return self.judged(self.matrix(self.information.rows(q, v, a)))[0]
 
     def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
         """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
@@ -375,7 +430,7 @@ class Designer:
         q, v, a, jerk = D @ C
         rows = self.information.rows(q, v, a)
         torque = self.information.torque(rows)
-        value, by_F = criterion(self.name, self.matrix(rows))
+        value, by_F = self.judged(self.matrix(rows))
         used = self.limits.used(q, v, a, jerk, torque)
         cost, pushed = multipliers.of_limits(used)
         by_value = pushed * 2.0 * used / (1.0 - _SPARE) ** 2 / self.limits.sizes[:, None]
@@ -384,21 +439,23 @@ class Designer:
         by_torque = by_torque + by_power * v
         value += cost
         if self.clearance is not None:
-            aim = self._aim
+            aim = self._wanted
             near = self.clearance.near(rows.state, multipliers.reach(aim), hints=self._hints)
             cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
             along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
-        by_W = 2.0 * self._scale * (by_F @ (self._scale * rows.W))
+        scale = self._scale(self._step)
+        by_W = 2.0 * scale * (by_F @ (scale * rows.W))
         by_W += self.information.beta[:, None] * by_torque.T[:, None]
         along_q, along_v, along_a = self.information.pull(rows, by_W)
         by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
         gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
+        gradient[1:, ~self._moves] = 0.0
         return value, gradient
 
     @property
-    def _aim(self) -> Array:
+    def _wanted(self) -> Array:
         """Distances that the search aims at, shape (pairs, 1) [m]."""
         if self.clearance is None:
             return self._spare
@@ -415,6 +472,7 @@ class Designer:
         """
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
+        C[:, ~self._moves] = 0.0
         C[0] = self._posture(rng)
         return self._feasible(C, 1.0 - _SPARE)
 
@@ -574,11 +632,11 @@ class Designer:
             settled: Change of the criterion below which it has settled.
         """
         used, margin, rows = self._kept(C)
-        own = criterion(self.name, self.matrix(rows))[0]
+        own = self.judged(self.matrix(rows))[0]
         held = state.multipliers
         distance = None
         if self.clearance is not None:
-            reach = held.reach(self._aim)
+            reach = held.reach(self._wanted)
             distance = self.clearance.near(rows.state, reach, hints=self._hints).distance
         kept = self._feasible(C, 1.0 - _SPARE)
         objective = self._objective(kept)
@@ -593,7 +651,7 @@ class Designer:
         if gain < 0.0:
             kept, objective = state.kept, state.objective
         broken = max(float(np.abs(used).max()) - 1.0 + _SPARE, -margin / _SOFT, 0.0)
-        held = held.raised(used, distance, self._aim)
+        held = held.raised(used, distance, self._wanted)
         is_settled = bool(is_near and gain < settled)
         return _State(kept, objective, kept if is_lost else C, held, is_settled), broken
 

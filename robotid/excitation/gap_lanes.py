@@ -140,7 +140,9 @@ def _centres(R, p, bodies, middles):
 
 
 @compiled
-def lower_bounds(chosen, pairs, enough, hints, out, R, p, bodies, middles, radii, half, points, starts):
+def lower_bounds(
+    chosen, pairs, enough, hints, out, R, p, bodies, middles, radii, half, points, starts
+):
     """Write lower bounds of the distances of pairs of hulls [m].
 
     Args:

@@ -15,6 +15,7 @@ from robotid._files import file_sha256, read_json
 from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.export.commanded import CommandedDrive, commanded_drives, follow_commands
 from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
@@ -27,7 +28,7 @@ from robotid.identification.pipeline import SOURCES, Identification
 from robotid.identification.previews import Preview
 from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
-from robotid.logs.data import suggestion
+from robotid.logs.data import Log, suggestion
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
@@ -84,7 +85,8 @@ _SHAPE = {
     "base_parameters": [{**_PARAMETER, "expression": TEXT, "std_error": MAYBE}],
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
-    "ranges?": {"robot": TEXT},
+    "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
+    "simulation?": {"controller": {"kind": TEXT}},
     "own_terms?": {...: [TABLE]},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
@@ -255,6 +257,30 @@ class Result:
     def parameters(self) -> Array:
         """Its standard parameters, shape (p,), SI units, in ``robot.layout.names`` order."""
         return self.identified[1]
+
+    @cached_property
+    def commanded(self) -> tuple[CommandedDrive, ...]:
+        """The drives that follow position commands, joint by joint; none without gains."""
+        return commanded_drives(*self.identified, self.content, self.path.name)
+
+    def follow_commands(self, log: Log) -> Array:
+        """Return the positions that the robot takes on the commands of a log, in open loop.
+
+        Args:
+            log: The log, of its joints in its order, with commands.
+
+        Returns:
+            Positions that encoders would read, shape (N, n) [rad or m].
+
+        Raises:
+            DataError: If the result has no gains of drives, or the log no commands.
+            MissingDependencyError: If Numba is not installed.
+        """
+        if not self.commanded:
+            raise DataError(f"{self.path.name} has no gains of drives: it cannot follow commands")
+        if log.q_ref is None:
+            raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
+        return follow_commands(*self.identified, self.commanded, log)
 
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None

@@ -154,7 +154,9 @@ def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
     near = np.isfinite(clearance.room)
     distance = clearance.near(clearance.poses(q), 0.05, clearance.everything).distance
     assert near.sum() == 2
-    np.testing.assert_allclose(clearance.kept[near], np.median(distance[near], axis=1) / 2, rtol=0.1)
+    np.testing.assert_allclose(
+        clearance.kept[near], np.median(distance[near], axis=1) / 2, rtol=0.1
+    )
     assert (clearance.kept[~near] == 0.02).all()
     assert ((distance >= clearance.kept[:, None]).all(axis=0)).any()  # there are postures to be in
 
