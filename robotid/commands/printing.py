@@ -314,11 +314,14 @@ def _margin(name: str, margin: Mapping[str, Any]) -> str:
     said = "no links or obstacles come near each other"
     if margin["margin"] is not None:
         apart, time = 1e3 * margin["margin"], margin["time"]
-        said = f"{apart:5.1f} mm beyond the clearance, {margin['where']} at {time:.2f} s"
+        kept = 1e3 * margin["kept"]
+        said = f"{apart:5.1f} mm beyond {kept:.0f} mm, {margin['where']} at {time:.2f} s"
     if margin["unread"]:
         said += f"; not looked at, since no shape can be read: {listed(margin['unread'])}"
     if margin["left_alone"]:
-        said += f"; not looked at, for they hardly ever have room: {listed(margin['left_alone'])}"
+        said += f"; made to touch and not looked at: {listed(margin['left_alone'])}"
+    if margin["built_near"]:
+        said += f"; built near each other, kept apart by: {listed(margin['built_near'])}"
     return said
 
 
