@@ -141,6 +141,19 @@ def test_the_plant_is_quick_and_its_truth_says_what_it_does(name):
     assert np.std(noisy - exact) == pytest.approx(1e-3, rel=0.05)
 
 
+def test_the_plant_logs_the_torques_of_its_drives():
+    """kp (q_ref(t - delay) - q) - kd v, from the log itself, and the offset of the equation."""
+    leg = plant("leg", np.random.default_rng(0), delay=0.006, offset=0.7)
+    log, _ = recorded(leg, np.random.default_rng(1), duration=2.0, noise=0.0, torque=0.0)
+    assert log.has_torque
+    v = np.gradient(log.q, log.t, axis=0)
+    kp, kd = (np.array([getattr(drive, key) for drive in leg.drives]) for key in ("kp", "kd"))
+    late = 3  # rows
+    by_hand = kp * (log.q_ref[:-late] - log.q[late:]) - kd * v[late:]
+    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.035)
+    assert np.ptp(by_hand, axis=0).min() > 0.8
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     leg = plant("leg", np.random.default_rng(0), coulomb=0.2, offset=0.1, zero=0.02, delay=0.0063)
