@@ -1,6 +1,6 @@
 """Designing a motion: how good after how long, beside random motions and a plain optimiser.
 
-    python benchmarks/bench_excitation.py [--robots] [--next] [--quick]
+    python benchmarks/bench_excitation.py [--robots] [--quick]
 
 Panda (arm) and UR10, 10 s, 5 harmonics, position, velocity and torque limits of the URDF times
 0.9, self-collision and the floor at 2 cm. The criterion is D: minus the mean logarithm of the
@@ -10,9 +10,7 @@ narrower. Every motion that is counted keeps all limits on the grid of its desig
 objective and grid, gradients by differences, and the limits at every fifth instant; each of its
 iterates is then scaled until it keeps the limits, as a random motion is, and the best counts.
 
-``--robots``: twelve robots through excite, simulate with noise, and identify. ``--next``: what a
-second motion adds that is designed for what the first has left open, beside a repetition of the
-first and beside one designed with another seed as if nothing were known.
+``--robots``: twelve robots through excite, simulate with noise, and identify.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -132,46 +130,6 @@ def all_robots(seconds, names):
             print(robot_row(Path(folder), name, ROBOTS[name], seconds), flush=True)
 
 
-def second_motion(file, seconds):
-    """Print what each second motion would leave of the standard errors."""
-    robot = (example_urdf(file),)
-    design = ("--json", "--starts", 4, "--seconds", seconds)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        motions = {"the first again": folder / "first.parquet"}
-        must("excite", *robot, "--out", motions["the first again"], "--seed", 0, *design)
-        log = record(folder, robot, "log", motions["the first again"], 1)
-        result, _ = identified(folder, robot, log)
-        for criterion in ("D", "A"):
-            for words, given in (("a fresh one", ()), ("--given the first", ("--given", result))):
-                key = f"{words}, criterion {criterion}"
-                motions[key] = folder / f"{len(motions)}.parquet"
-                must("excite", *robot, "--out", motions[key], "--seed", 1, *design,
-                     "--criterion", criterion, *given)  # fmt: skip
-        print("| second motion | standard errors over what is plausible: median | 90 % | largest | "
-              "the widest quarter is cut by |")  # fmt: skip
-        print("|---" * 5 + "|")
-        for words, motion in motions.items():
-            said = json.loads(must("preview", *robot, motion, "--given", result, "--json"))
-            rows = [
-                [entry[key] or np.inf for key in ("std_error", "std_error_before", "plausible")]
-                for entry in said["base_parameters"]
-                if entry["plausible"]
-            ]
-            after, before, plausible = np.array(rows).T
-            if motion == motions["the first again"]:
-                print(cut_row("none", before, before, plausible))
-            print(cut_row(words, after, before, plausible), flush=True)
-
-
-def cut_row(words, after, before, plausible):
-    share, wide = after / plausible, before / plausible
-    widest = np.argsort(wide)[-max(1, round(len(wide) / 4)) :]
-    cut = 100 * (1 - np.exp(np.mean(np.log(share[widest] / wide[widest]))))
-    cells = " | ".join(f"{x:.3f}" for x in np.quantile(share, [0.5, 0.9, 1.0]))
-    return f"| {words} | {cells} | {cut:.0f} % |"
-
-
 class TimeIsOver(Exception):
     pass
 
@@ -288,7 +246,6 @@ def gradient_row(name, task, repeats):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", action="store_true", help="twelve robots to the end, too")
-    parser.add_argument("--next", action="store_true", help="a second motion, too")
     parser.add_argument("--quick", action="store_true", help="little time and one robot: a try-out")
     options = parser.parse_args()
     cases = CASES[1:] if options.quick else CASES
@@ -309,9 +266,6 @@ def main():
     if options.robots:
         print()
         all_robots(1 if options.quick else 10, list(ROBOTS)[-2:] if options.quick else ROBOTS)
-    if options.next:
-        print()
-        second_motion("ur10_robot.urdf", 1 if options.quick else 30)
     print(f"\n{setting.machine()}")
 
 

@@ -36,6 +36,7 @@ PAGES = {
     "verdict": "verdicts.md",
     "preview": "recording.md",
     "excitation": "excitation.md",
+    "motions": "excitation.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

@@ -1,7 +1,7 @@
 """A motion to record: designed for a robot within its limits, and written."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,11 +19,13 @@ from robotid.excitation.design import Design, Designer
 from robotid.excitation.files import write_motion
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.motion_page import write_motion_page
+from robotid.excitation.payload_motion import design_payload
 from robotid.excitation.routes import design_stands, design_sweeps
 from robotid.identification.previews import Preview, Run, preview_logs
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
+from robotid.simulation.settings import Payload
 
 if TYPE_CHECKING:
     from robotid._typing import ProgressCallback
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
 _ROUTES = ("sweeps", "stands")
-_KINDS = ("fourier", "bspline", *_ROUTES)
+_KINDS = ("fourier", "bspline", "payload", *_ROUTES)
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,11 @@ class MotionSettings:
 
     Attributes:
         kind: "fourier" or "bspline"; "sweeps", slow ones of joint after joint, which show friction;
-            "stands", which show gravity.
+            "stands", which show gravity; "payload", one of few joints for what hangs on a link.
         duration: Its length [s]; that of sweeps and stands is what they take.
         harmonics: Harmonics of a Fourier series; pieces of B-splines are twice as many.
-        criterion: "D", "A", "E" or "condition", as of ``criterion``.
+        criterion: "D", "A", "E", "condition" or "widest", as of ``criterion``; if None, "widest"
+            after logs that were identified, else "D".
         share: How much of the URDF's limits is used, more than 0 and at most 1.
         acceleration: Largest accelerations by joint [rad/s^2 or m/s^2].
         jerk: Largest jerks by joint [rad/s^3 or m/s^3].
@@ -56,12 +59,14 @@ class MotionSettings:
         starts: How many are followed to the end.
         seconds: Time after which the best motion so far is taken [s].
         points: Rows per second that are written [Hz].
+        payload: What hangs on which link, as far as it is known, of the kind "payload".
+        moving: Joints that move then; the fewest that suffice if there are none.
     """
 
     kind: str = "fourier"
     duration: float = 10.0
     harmonics: int = 5
-    criterion: str = "D"
+    criterion: str | None = None
     share: float = 0.9
     acceleration: Mapping[str, float] = field(default_factory=dict)
     jerk: Mapping[str, float] = field(default_factory=dict)
@@ -74,6 +79,8 @@ class MotionSettings:
     starts: int = 3
     seconds: float = np.inf
     points: float = 100.0
+    payload: Payload = field(default_factory=Payload)
+    moving: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in _KINDS:
@@ -82,6 +89,11 @@ class MotionSettings:
             value = getattr(self, name)
             if not value > 0:
                 raise SettingsError(f"{name} is {value:g}, wanted more than 0")
+        if self.kind != "payload" and (self.moving or self.payload != Payload()):
+            raise SettingsError(
+                f"a payload or joints that move are stated, but kind is {self.kind!r}; wanted "
+                "payload"
+            )
 
     def basis(self) -> Basis:
         """Return the functions that the motion is a sum of.
@@ -147,9 +159,55 @@ def design_motion(
     """
     for file in (target, *([] if report is None else [report])):
         check_file(Path(file))
+    designer, run = _designer(job, settings, given)
+    model = designer.information.model
+
+    def told(start: int, _: float) -> None:
+        if progress is not None:
+            progress("designing", start, settings.starts, "starts")
+
+    begun, carried = time.monotonic(), None
+    if settings.kind == "payload":
+        carried = design_payload(
+            designer, np.random.default_rng(settings.seed), settings.payload,
+            moving=settings.moving, starts=settings.starts, seconds=settings.seconds,
+            progress=told,
+        )  # fmt: skip
+        designer, design = carried.designer, carried.design
+    else:
+        design = _designed(designer, settings, told)
+    design = replace(design, seconds=time.monotonic() - begun)
+    course = Course.of_design(designer, design)
+    if settings.kind in _ROUTES:
+        _check_jerk(course, model.joints)
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
+    content = _content(designer, design, course, settings)
+    if carried is not None:
+        content["payload"] = carried.to_dict()
+    if report is not None:
+        expected = (
+            _expected(job, model, design, settings, run, str(target))
+            if carried is None
+            else carried.in_words()
+        )
+        write_motion_page(report, model, content, course, expected)
+        content["report"] = str(report)
+    return content
+
+
+def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[Designer, Run | None]:
+    """Return what looks for the motion, and what was recorded before."""
     model, run = job.model(), None
     if given is not None:
         _, _, model, run = result_run(job, given)
+    name = settings.criterion
+    if name is None:
+        name = "D" if run is None or settings.kind == "payload" else "widest"
+    elif name == "widest" and (run is None or settings.kind == "payload"):
+        raise SettingsError(
+            "criterion is widest, which is about what logs have told of the robot: wanted --given "
+            "RESULT, and another kind than payload; or another criterion"
+        )
     limits = MotionLimits.of_model(
         model,
         share=settings.share,
@@ -162,36 +220,23 @@ def design_motion(
         clearance = Clearance(
             model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
         )
-    basis = settings.basis()
     designer = Designer.of_model(
-        model, basis, limits, name=settings.criterion, clearance=clearance, noise=settings.noise,
+        model, settings.basis(), limits, name=name, clearance=clearance, noise=settings.noise,
         run=run,
     )  # fmt: skip
+    return designer, run
 
-    def told(start: int, _: float) -> None:
-        if progress is not None:
-            progress("designing", start, settings.starts, "starts")
 
-    rng, begun = np.random.default_rng(settings.seed), time.monotonic()
+def _designed(
+    designer: Designer, settings: MotionSettings, progress: Callable[[int, float], None]
+) -> Design:
+    """Return a motion of another kind than "payload"."""
+    rng = np.random.default_rng(settings.seed)
     if settings.kind == "sweeps":
-        design = design_sweeps(designer, rng)
-    elif settings.kind == "stands":
-        design = design_stands(designer, rng)
-    else:
-        design = designer.design(
-            rng, starts=settings.starts, seconds=settings.seconds, progress=told
-        )
-    design = replace(design, seconds=time.monotonic() - begun)
-    course = Course.of_design(designer, design)
-    if settings.kind in _ROUTES:
-        _check_jerk(course, model.joints)
-    write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    content = _content(model, design, course, settings)
-    if report is not None:
-        expected = _expected(job, model, design, settings, run, str(target))
-        write_motion_page(report, model, content, course, expected)
-        content["report"] = str(report)
-    return content
+        return design_sweeps(designer, rng)
+    if settings.kind == "stands":
+        return design_stands(designer, rng)
+    return designer.design(rng, starts=settings.starts, seconds=settings.seconds, progress=progress)
 
 
 def _check_jerk(course: Course, joints: Sequence[str]) -> None:
@@ -227,9 +272,10 @@ def _expected(
 
 
 def _content(
-    model: RobotModel, design: Design, course: Course, settings: MotionSettings
+    designer: Designer, design: Design, course: Course, settings: MotionSettings
 ) -> dict[str, Any]:
     """Return what was designed, for people and programs."""
+    model, names = designer.information.model, designer.information.mapping.base_names
     margins: dict[str, Any] = {}
     limits, clearance = course.limits, course.clearance
     jerk = LIMITS.index("jerk")
@@ -249,10 +295,10 @@ def _content(
             "unread": clearance.unread,
             "left_alone": clearance.made_to,
         }
-    return {
+    content = {
         "robot": model.name,
         "joints": list(model.joints),
-        "criterion": settings.criterion,
+        "criterion": designer.name,
         "objective": design.objective,
         "condition_number": design.condition if np.isfinite(design.condition) else None,
         "seconds": design.seconds,
@@ -266,3 +312,6 @@ def _content(
         "limits": margins,
         "history": [list(entry) for entry in design.history],
     }
+    if designer.name == "widest":
+        content["widest"] = [names[k] for k in designer.widest[::-1]]
+    return content

@@ -12,7 +12,7 @@ from robotid.findings import listed
 if TYPE_CHECKING:
     from robotid.commands.excite import MotionSettings
     from robotid.commands.job import Job
-    from robotid.simulation.settings import Simulation
+    from robotid.simulation.settings import Payload, Simulation
 
 __all__ = [
     "add_flags",
@@ -257,12 +257,22 @@ def _add_excite(parser: argparse.ArgumentParser) -> None:
     add("--given", metavar="RESULT", help="a result.json or its folder: what its logs have told")
     words = "page to write about the motion: its limits over time, what it will tell"
     add("--report", metavar="PAGE.html", help=words)
-    words = "sweeps show friction, stands gravity, the others all; default: fourier"
-    add("--kind", choices=("fourier", "bspline", "sweeps", "stands"), help=words)
+    words = "sweeps show friction, stands gravity, payload what hangs on a link; default: fourier"
+    add("--kind", choices=("fourier", "bspline", "sweeps", "stands", "payload"), help=words)
+    words = "of the kind payload: link that it hangs on; default: the last moving one"
+    add("--link", metavar="NAME", help=words)
+    add("--mass", metavar="KG", type=float, help="its mass: limits are kept with it, too")
+    words = "its centre of mass in the frame of the link [m]; default: 0,0,0"
+    add("--com", metavar="X,Y,Z", help=words)
+    words = "joints that move for it, by comma; default: the fewest before the link that suffice"
+    add("--moving", metavar="JOINTS", help=words)
     add("--duration", metavar="S", type=float, help="default: 10")
     add("--harmonics", metavar="N", type=int, help="of the series; default: 5")
-    words = "of the information: D (volume), A (mean), E (weakest) or condition; default: D"
-    add("--criterion", choices=("D", "A", "E", "condition"), help=words)
+    words = (
+        "of the information: D (volume), A (mean), E (weakest), condition, or widest (the quarter "
+        "that RESULT knows the least); default: widest with --given, else D"
+    )
+    add("--criterion", choices=("D", "A", "E", "condition", "widest"), help=words)
     add("--share", metavar="X", type=float, help="of the URDF's limits; default: 0.9")
     for name, unit in (
         ("acceleration", "rad/s^2 or m/s^2"), ("jerk", "rad/s^3 or m/s^3"), ("power", "W"),
@@ -307,7 +317,30 @@ def motion_settings(options: argparse.Namespace) -> "MotionSettings":
         stated[name] = _pairs(getattr(options, f"max_{name}"), f"--max-{name}")
     if options.clearance is not None:
         stated["clearance"] = _clearance(options.clearance)
-    return MotionSettings(**stated, boxes=stated_boxes(options.box))
+    if options.moving is not None:
+        stated["moving"] = options.moving.split(",")
+    return MotionSettings(**stated, boxes=stated_boxes(options.box), payload=_load(options))
+
+
+def _load(options: argparse.Namespace) -> "Payload":
+    """Return what is stated of a payload.
+
+    Raises:
+        SettingsError: If a flag is not usable.
+    """
+    from robotid.simulation.settings import Payload
+
+    load = {"link": options.link, "mass": options.mass}
+    if options.com is not None:
+        try:
+            load["com"] = tuple(float(number) for number in options.com.split(","))
+        except ValueError:
+            load["com"] = ()
+        if len(load["com"]) != 3 or not options.mass:
+            raise SettingsError(
+                f"--com {options.com!r}: wanted X,Y,Z [m], three numbers, and --mass beside it"
+            )
+    return Payload(**{key: value for key, value in load.items() if value is not None})
 
 
 def _clearance(word: str) -> float | None:

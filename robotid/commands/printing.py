@@ -254,17 +254,25 @@ def _worst_of(findings: Sequence[Mapping[str, Any]], joints: Sequence[str]) -> s
 def _print_motion(content: dict[str, Any]) -> None:
     done = f"in {content['seconds']:.1f} s"
     if content["starts"]:
-        settled = "" if content["converged"] else "not "
-        done = f"{content['starts']} starts {done}, {settled}settled"
+        plural = "start" if content["starts"] == 1 else "starts"
+        done = f"{content['starts']} {plural} {done}, "
+        done += "settled" if content["converged"] else "not settled: more --seconds may improve it"
     condition = content["condition_number"]
     say(
         f"{content['robot']}: a motion of {content['duration']:g} s for {len(content['joints'])} "
         f"joints, condition number {'infinite' if condition is None else format(condition, '.0f')};"
         f" {done}"
     )
+    if "widest" in content:
+        names = content["widest"]
+        say(f"made for what the logs given know the least: {listed(names, 5)}", "  ")
     print("\nwhat it leaves of each limit, least where")
     for name, margin in content["limits"].items():
         say(f"  {name:13} {_margin(name, margin)}", 16 * " ")
+    if "payload" in content:
+        print()
+        for words in content["payload"]["words"]:
+            say(words)
 
 
 def _margin(name: str, margin: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ _OFFSETS = (0.4, -0.4, np.pi / 2, -np.pi / 2, np.pi)  # [rad] that a zero positi
 _EARTH = 9.81  # [m/s^2]
 _RINGING = 0.05  # of its top, that the filter makes a torque of one sign pass 0
 _TURNS = 8  # of signs and fit
-_FOLDED = 0.3  # share of what is unexplained that must be left to take a torque for a size
+_FOLDED = 0.4  # share of what is unexplained that may be left to take a torque for a size
 _CONSTANT = 1e-9  # of its size: a torque that varies less does not, but for rounding
 
 
@@ -121,7 +121,9 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
     """Return the torques that are never negative as sizes of torques of either sign.
 
     The signs are those of what physics makes of the signed torque, in turn, from those of the
-    URDF's torque, of the velocity or of the acceleration on.
+    URDF's torque, of the velocity or of the acceleration on. They must explain how the size varies,
+    for a constant one turned with the speed would be all friction; the share that is left counts of
+    the signed torque, for the size of one that is mostly friction hardly varies.
     """
     share, joints = own[:, 0].copy(), []
     loads = probe.loads()
@@ -130,22 +132,26 @@ def _unsigned(probe: Probe, own: Array) -> Explanation:
             continue
         X = np.hstack([loads[:, j], probe.drive(j)])
         starts = (loads[:, j].sum(axis=1), probe.v[:, j], probe.a[:, j])
-        found = min(_folded_misfit(X, tau, np.sign(start)) for start in starts)
-        if found < _FOLDED * own[j].min():
-            share[j] = found
+        of_size, signed = min(_folded_misfit(X, tau, np.sign(start)) for start in starts)
+        if of_size < _FOLDED * own[j].min():
+            share[j] = signed
             joints.append(j)
     return Explanation("unsigned_torque", share, tuple(joints))
 
 
-def _folded_misfit(X: Array, tau: Array, sign: Array) -> float:
-    """Return the unexplained share of a torque whose signs are found in turn from a first guess."""
+def _folded_misfit(X: Array, tau: Array, sign: Array) -> tuple[float, float]:
+    """Return what is unexplained of a torque whose signs are found in turn from a first guess.
+
+    Returns:
+        The share of the variance of the torque as logged, and of that with signs.
+    """
     for _ in range(_TURNS):
         sign = np.where(_nonnegative_prediction(X, sign * tau) < 0, -1.0, 1.0)
     signed = sign * tau
     R, T = _compressed(X, signed[:, None])
-    # of the torque as logged: a constant one turned with the speed would be all friction
-    size = float(np.sum((tau - tau.mean()) ** 2))
-    return _nonnegative_misfit(R, T[:, 0]) / size if size > 0 else 1.0
+    left = _nonnegative_misfit(R, T[:, 0])
+    of_size, of_signed = (float(np.sum((x - x.mean()) ** 2)) for x in (tau, signed))
+    return (left / of_size, left / max(of_signed, left)) if of_size > 0 else (1.0, 1.0)
 
 
 def _order(share: Array) -> Explanation:

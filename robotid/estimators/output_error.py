@@ -22,9 +22,9 @@ from robotid.regressor.factors import Factors, triangle_of
 __all__ = ["OutputError", "Residual", "Simulator", "linearised"]
 
 _STEPS = 25  # of the damped Gauss-Newton method in a round
-_ROUNDS = 6  # of whitening and noise levels ...
-_SETTLED = 5e-3  # ... until they change by less than that
-_ROUGH, _CLOSE = 1e-3, 1e-6  # relative decrease that ends a round, and the last one
+_ROUNDS = 5  # of whitening and noise levels ...
+_SETTLED = 2e-2  # ... until they change by less than that
+_ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends a round, and the last one
 _TOO_STIFF = 1e10  # damping at which no step lowers the cost any more
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
 _STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
@@ -103,6 +103,7 @@ class OutputError:
         rows: Further rows [A b] that A theta = b should fit, unit weight, shape (m, c + 1), as
             those of torques; none if None.
         steps: Most steps in a round.
+        rounds: Most rounds.
         progress: Told of the steps.
 
     References:
@@ -113,6 +114,7 @@ class OutputError:
     whitens: bool = True
     rows: Array | None = None
     steps: int = _STEPS
+    rounds: int = _ROUNDS
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, simulator: Simulator, start: Array) -> Estimate:
@@ -128,7 +130,7 @@ class OutputError:
         """
         theta = np.maximum(np.array(start, dtype=float), simulator.lowest)
         weights, rounds, count, converged = self.weights(simulator, theta), 0, 0, False
-        for rounds in range(1, _ROUNDS + 1):
+        for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
             theta, steps, converged = self._descend(simulator, weights, theta, close)
             count += steps

@@ -177,12 +177,17 @@ class TwoRuns:
 
     @cached_property
     def _noise(self) -> Array:
-        """Noise of each joint's signal, shape (n,), never quite zero."""
+        """Noise of each joint's signal, shape (n,), never quite zero.
+
+        A joint that rests but for a few rows leaves nothing, whatever its noise: all of its signal
+        counts as noise then.
+        """
         rows = np.maximum(self._logged.rows, 1)
         spent = len(self._whole) * np.array([len(own) for own in self._logged.columns])
         freedom = np.maximum(rows - spent / self.share, _LEAST_FREEDOM * rows)
-        least = _FLOOR * np.sqrt(self._logged.torque_squares() / rows)
-        noise: Array = np.maximum(np.sqrt(self._own_squares / freedom), least)
+        signal = np.sqrt(self._logged.torque_squares() / rows)
+        left = np.where(self.share * rows > spent, np.sqrt(self._own_squares / freedom), signal)
+        noise: Array = np.maximum(left, _FLOOR * signal)
         return np.where(noise > 0, noise, 1.0)
 
     def _first_gains(self) -> Array:

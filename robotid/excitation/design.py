@@ -18,7 +18,7 @@ from robotid.estimators.determination import base_spread
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact
-from robotid.excitation.information import MotionInformation, MotionRows, criterion
+from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.identification.previews import (
     CORRELATION,
@@ -53,6 +53,7 @@ _NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part i
 _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
 _TRIED = 200  # random postures until one is found that the robot can rest in
+_WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
 _STARTED = 10  # random motions of which the best is a start
 
 
@@ -98,10 +99,14 @@ class Designer:
         noise: Density of each joint's noise, variance times the time over which it is correlated,
             shape (n,) [(N m)^2 s or N^2 s].
         spread: How far base parameters may be from what is known, shape (b,).
+        standard_spread: The same of the standard parameters, shape (p,).
         given: Information that is there already, shape (b, b), in units of the spread; 1 if None.
         name: The criterion, as of ``criterion``.
         clearance: What keeps it from collisions; None: they are not looked at.
         finer: How many times finer than usual the grid of instants is.
+        aim: What is asked for, if not the base parameters; nothing is known of them then.
+        moving: Which joints move, shape (n,), bool; all if None. The others rest where the motion
+            begins, and tell nothing, for friction holds them.
     """
 
     information: MotionInformation
@@ -109,10 +114,13 @@ class Designer:
     basis: Basis
     noise: Array
     spread: Array
+    standard_spread: Array
     given: Array | None = None
     name: str = "D"
     clearance: Clearance | None = None
     finer: int = 1
+    aim: Aim | None = None
+    moving: Array | None = None
 
     @classmethod
     def of_model(
@@ -149,13 +157,16 @@ class Designer:
         found = None if run is None else run.noise(mapping.K)
         density = assumed_noise(model, size, noise or {}, correlation, found).density(0.0)
         usual = _USUAL * np.array([size, speed, speed * 2 * np.pi / basis.shortest])
-        spread = base_spread(mapping.K, prior_spread(model, usual**2, 1))
+        standard_spread = prior_spread(model, usual**2, 1)
+        spread = base_spread(mapping.K, standard_spread)
         given = None
         if run is not None:
             told = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * told * spread
         information = MotionInformation(model, mapping, mapping.to_base(pi))
-        return cls(information, limits, basis, density, spread, given, name, clearance)
+        return cls(
+            information, limits, basis, density, spread, standard_spread, given, name, clearance
+        )
 
     @cached_property
     def _functions(self) -> Array:
@@ -240,16 +251,24 @@ class Designer:
             duration: Its length [s].
             rate: Instants per second at which it is looked at [Hz].
         """
-        t = np.arange(round(duration * rate) + 1) / rate
-        q, v, a = motion.evaluate(t)
-        rows = self.information.rows(q, v, a)
-        used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
-        scale = np.sqrt(1.0 / rate / self.noise)[:, None, None] * self.spread[:, None]
-        flat = (scale * rows.W).swapaxes(0, 1).reshape(len(self.spread), -1)
+        used, information = self.used_and_told(motion, duration, rate)
         contact = None
         if self.clearance is not None:
             contact = self.clearance.nearest(motion, duration)
-        return self._weighed(motion, duration, flat @ flat.T + self.known, used, contact)
+        return self._weighed(motion, duration, information, used, contact)
+
+    def used_and_told(self, motion: Motion, duration: float, rate: float) -> tuple[Array, Array]:
+        """Return what a motion uses of limits but jerk, (6, N, n), and its information, (b, b).
+
+        Args:
+            motion: The motion.
+            duration: Its length [s].
+            rate: Instants per second at which it is looked at [Hz].
+        """
+        q, v, a = motion.evaluate(np.arange(round(duration * rate) + 1) / rate)
+        rows = self.information.rows(q, v, a)
+        used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
+        return used, self._informed(rows, 1.0 / rate)
 
     def _weighed(
         self,
@@ -259,11 +278,13 @@ class Designer:
         used: Array,
         contact: Contact | None,
     ) -> Design:
-        low, *_, high = np.linalg.eigvalsh(information - self.known)
+        own = information - self.known
+        own = own if self.aim is None else self.aim.information(own)[0]
+        low, *_, high = np.linalg.eigvalsh(own)
         return Design(
             motion=motion,
             duration=duration,
-            objective=criterion(self.name, information)[0],
+            objective=self.judged(information)[0],
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
             used=np.abs(used).max(axis=1),
             contact=contact,
@@ -291,15 +312,45 @@ class Designer:
     @property
     def known(self) -> Array:
         """Information that is there already, in units of the spread, shape (b, b)."""
+        if self.aim is not None:
+            return np.zeros((len(self.spread), len(self.spread)))
         known: Array = np.eye(len(self.spread)) if self.given is None else self.given
         return known
 
     @cached_property
-    def _scale(self) -> Array:
-        """What rows are multiplied by, so that their squares are information, (n, b, 1)."""
-        step = self.basis.duration / (self._functions.shape[1] - 1)
-        scale: Array = np.sqrt(step / self.noise)[:, None, None] * self.spread[:, None]
+    def widest(self) -> Array:
+        """The quarter of base parameters that are known the least already, shape (k,)."""
+        variance = np.diag(np.linalg.inv(self.known))
+        return np.argsort(variance, kind="stable")[-max(1, round(_WIDEST * len(variance))) :]
+
+    @cached_property
+    def _moves(self) -> Array:
+        """Which joints move, shape (n,), bool."""
+        return np.ones(len(self.noise), dtype=bool) if self.moving is None else self.moving
+
+    def judged(self, F: Array) -> tuple[float, Array]:
+        """Return the criterion of information about the base parameters, and its gradient.
+
+        Args:
+            F: The information, in units of the spread, shape (b, b).
+        """
+        if self.aim is None:
+            return criterion(self.name, F, self.widest)
+        own, L = self.aim.information(F)
+        value, by_own = criterion(self.name, own)
+        return value, L @ by_own @ L.T
+
+    def _scale(self, step: float) -> Array:
+        """Return what rows are multiplied by, so that their squares are information, (n, b, 1)."""
+        weight = self._moves * np.sqrt(step / self.noise)
+        scale: Array = weight[:, None, None] * self.spread[:, None]
         return scale
+
+    @cached_property
+    def _step(self) -> float:
+        """Time between two instants of the grid [s]."""
+        step: float = self.basis.duration / (self._functions.shape[1] - 1)
+        return step
 
     def matrix(self, rows: MotionRows) -> Array:
         """Return the information of a motion and what was known, in units of the spread, (b, b).
@@ -307,8 +358,11 @@ class Designer:
         Args:
             rows: Its rows.
         """
+        return self._informed(rows, self._step)
+
+    def _informed(self, rows: MotionRows, step: float) -> Array:
         n, b, N = rows.W.shape
-        scaled = rows.W * self._scale
+        scaled = rows.W * self._scale(step)
         flat = scaled.swapaxes(0, 1).reshape(b, n * N)
         F: Array = flat @ flat.T + self.known
         return F
@@ -322,7 +376,7 @@ class Designer:
         if self.clearance is not None:
             near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
             distance = float(near.distance.min(initial=np.inf))
-        return criterion(self.name, self.matrix(rows))[0], used, distance, rows
+        return self.judged(self.matrix(rows))[0], used, distance, rows
 
     def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
         """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
@@ -334,7 +388,7 @@ class Designer:
         q, v, a, jerk = D @ C
         rows = self.information.rows(q, v, a)
         torque = self.information.torque(rows)
-        value, by_F = criterion(self.name, self.matrix(rows))
+        value, by_F = self.judged(self.matrix(rows))
         used = self.limits.used(q, v, a, jerk, torque)
         cost, pushed = multipliers.of_limits(used)
         by_value = pushed * 2.0 * used / (1.0 - _SPARE) ** 2 / self.limits.sizes[:, None]
@@ -348,11 +402,13 @@ class Designer:
             value += cost
             along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
-        by_W = 2.0 * self._scale * (by_F @ (self._scale * rows.W))
+        scale = self._scale(self._step)
+        by_W = 2.0 * scale * (by_F @ (scale * rows.W))
         by_W += self.information.beta[:, None] * by_torque.T[:, None]
         along_q, along_v, along_a = self.information.pull(rows, by_W)
         by_motion = (along_q + by_q, along_v + by_v, along_a + by_a, by_jerk)
         gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
+        gradient[1:, ~self._moves] = 0.0
         return value, gradient
 
     def random(self, rng: np.random.Generator) -> Array:
@@ -366,6 +422,7 @@ class Designer:
         """
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
+        C[:, ~self._moves] = 0.0
         C[0] = self.postures(rng)[0]
         return self._feasible(C, 1.0 - _SPARE)
 

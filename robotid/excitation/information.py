@@ -13,10 +13,10 @@ from robotid.regressor.columns import drive_motion
 from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
-__all__ = ["CRITERIA", "MotionInformation", "MotionRows", "criterion"]
+__all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
 #: Which property of the information is made large, or small.
-CRITERIA = ("D", "A", "E", "condition")
+CRITERIA = ("D", "A", "E", "condition", "widest")
 _STEP = 1e-6  # of the differences by which drive columns are derived, in their argument's scale
 _TURN = 0.01  # [rad/s or m/s] speed over which the sign of friction changes
 
@@ -168,13 +168,44 @@ class MotionInformation:
         return gradients
 
 
-def criterion(name: str, F: Array) -> tuple[float, Array]:
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """What is asked for, where it is not the base parameters: some of u unknowns that make them.
+
+    Attributes:
+        columns: What each unknown adds to the base parameters, both in units of their spreads,
+            shape (b, u).
+        asked: How many of them, the last ones, are asked for; the others are unknown, too.
+    """
+
+    columns: Array
+    asked: int
+
+    def information(self, F: Array) -> tuple[Array, Array]:
+        """Return the information about what is asked for, and L with d information = L^T dF L.
+
+        Args:
+            F: Information about the base parameters in units of their spread, shape (b, b).
+
+        Returns:
+            Shapes (asked, asked), in units of the spreads and with 1 for what is known before; and
+            (b, asked).
+        """
+        T, rest = self.columns, self.columns.shape[1] - self.asked
+        N = T.T @ F @ T + np.eye(T.shape[1])
+        others = np.linalg.solve(N[:rest, :rest], N[:rest, rest:])
+        L = np.vstack([-others, np.eye(self.asked)])
+        return L.T @ N @ L, T @ L
+
+
+def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, Array]:
     """Return what is to be made small of an information matrix, and its gradient.
 
     Args:
         name: "D": -log det F / b; "A": log(trace F^-1 / b); "E": -log of the smallest eigenvalue;
-            "condition": log of the condition number.
+            "condition": log of the condition number; "widest": the mean log variance of some.
         F: Information about b parameters in units of like size, shape (b, b), positive definite.
+        widest: Which parameters these are, of "widest"; all if None.
 
     Raises:
         SettingsError: If there is no such criterion.
@@ -194,6 +225,11 @@ def criterion(name: str, F: Array) -> tuple[float, Array]:
         total = float(np.sum(1.0 / values))
         by_value = -1.0 / values**2 / total
         return float(np.log(total / size)), (vectors * by_value) @ vectors.T
+    if name == "widest":
+        some = np.arange(size) if widest is None else widest
+        C = (vectors[some] / values) @ vectors.T  # (k, b) of F^-1
+        variance = C[np.arange(len(some)), some]
+        return float(np.log(variance).mean()), -(C.T / variance) @ C / len(some)
     low, high = vectors[:, 0], vectors[:, -1]
     by_low = -np.outer(low, low) / values[0]
     if name == "E":

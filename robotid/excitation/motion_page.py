@@ -1,6 +1,6 @@
 """The page of a designed motion: what it is, what it uses of each limit, what it will tell."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ _CRITERIA = {
     "A": "A: log of the mean variance",
     "E": "E: −log of the weakest direction's information",
     "condition": "log of the information's condition number",
+    "widest": "mean log variance of the quarter of the parameters that was known the least",
 }
 
 
@@ -48,7 +49,7 @@ def write_motion_page(
     model: RobotModel,
     content: Mapping[str, Any],
     course: Course,
-    preview: Preview,
+    expected: Preview | Sequence[str],
 ) -> Path:
     """Write what a designed motion uses and what it will tell, as one HTML file.
 
@@ -59,7 +60,7 @@ def write_motion_page(
         model: The robot.
         content: What ``robotid excite --json`` prints of the motion.
         course: The motion over time.
-        preview: What is to be expected of it.
+        expected: What is to be expected of it; or sentences that say so.
 
     Returns:
         Path of the file.
@@ -67,10 +68,11 @@ def write_motion_page(
     Raises:
         DataError: If the folder of the target does not exist.
     """
+    told = _expected(expected) if isinstance(expected, Preview) else _paragraphs(expected)
     sections = {
         "limits": Section("Limits", _limit_table(model, content, course)),
         "time": Section("Over time", _over_time(model, content, course)),
-        "expected": Section("What it will tell", _expected(preview)),
+        "expected": Section("What it will tell", told),
     }
     best = [entry[1] for entry in content["history"]]
     if best and max(best) - min(best) > _VISIBLE:
@@ -243,6 +245,10 @@ def _expected(preview: Preview) -> str:
         f"Noise of the torque, standard deviation {listed(dict.fromkeys(noise.origins))}: "
         f"{', '.join(stds)} (N m or N).",
     ]
+    return _paragraphs(said)
+
+
+def _paragraphs(said: Sequence[str]) -> str:
     return "".join(f"<p>{escape(words)}</p>\n" for words in said if words)
 
 

@@ -17,6 +17,7 @@ from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import Sample, misfit_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
+from robotid.robot.bodies import held_parameters
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -40,6 +41,8 @@ _ROUNDING = 1e-6  # [m^2] by which a body that touches its box may leave it
 _NAMED = 5  # outliers that a finding names
 _WIDE = 1e-2  # margin of a pseudo-inertia above which it may hold a fit back
 _DIFFERS = 1.2  # a consistent fit that misses this much more than WLS is reported
+_SHRUNK = 0.1  # of the URDF's smallest moment of mass: a link so much smaller is hardly possible
+_MUCH = 0.2  # share of a body's mass in links on locked joints that may leave it so
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _BEYOND = 0.02  # share of a recording's rows beyond what friction was fitted to, that is told
 _LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
@@ -78,13 +81,14 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
         where = evaluation.recording.log.path
         findings.append(Finding("validation_was_fitted", "warning", where, message))
     wls, asked = identification.metrics("wls").per_joint, _asked(identification)
+    kept = _kept_links(identification)
     for joint, measured in identification.metrics().per_joint.items():
         free = wls[joint]
         if measured.rmse > _DIFFERS * free.rmse:
             message = (
                 f"{joint}: the residual is {measured.rmse:.3g} {measured.unit} against "
                 f"{free.rmse:.3g} of unconstrained WLS: physics and data disagree there; check "
-                f"{asked}the torque scale (gains), the drive model and the payload"
+                f"{asked}{kept}the torque scale (gains), the drive model and the payload"
             )
             errors = {"error_pct": measured, "wls_error_pct": free}
             evidence = {key: m.relative_error_pct or 0.0 for key, m in errors.items()}
@@ -377,6 +381,26 @@ def _asked(identification: Identification) -> str:
     if settings.margin > _WIDE:
         asked["margin"] = settings.margin
     return f"what [estimator] asks for ({asked}), " if asked else ""
+
+
+def _kept_links(identification: Identification) -> str:
+    """Return in words which bodies links on locked joints leave hardly possible, empty if none.
+
+    Those links keep the URDF's inertials, so that all that is wrong of them is the moved link's.
+    """
+    model, size = identification.model, identification.model.layout.n_inertial
+    held, found = held_parameters(model), identification.standard[:size]
+    own, before = (
+        np.linalg.eigvalsh(pseudo_inertia(pi[:size] - held))[:, 0]
+        for pi in (found, model.standard_parameters())
+    )
+    said = [
+        f"the inertials of the links on locked joints, {held[10 * k]:.3g} of the "
+        f"{found[10 * k]:.3g} kg of {model.layout.bodies[k]}, which are the URDF's (identify their "
+        "joints, too, if they are wrong), "
+        for k in np.flatnonzero((own < _SHRUNK * before) & (held[::10] > _MUCH * found[::10]))
+    ]
+    return "".join(said)
 
 
 def _speaks_against(identification: Identification) -> str:

@@ -59,7 +59,8 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "a motion of 4 s for 3 joints, condition number" in said
     assert "collision" not in said
-    assert "not settled" in said
+    assert "1 start in " in said
+    assert "not settled: more --seconds may improve it" in " ".join(said.split())
     assert (tmp_path / "motion.yaml").read_text().startswith("joint_names: [wrist_1_joint, ")
 
 
@@ -72,6 +73,7 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
         (["--max-jerk", "elbow=3"], "jerk is stated of 'elbow', which is no joint that moves"),
         (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1"),
         (["--harmonics", "1"], "harmonics is 1, wanted 2 or more"),
+        (["--criterion", "widest"], "criterion is widest, which is about what logs have told"),
     ],
 )
 def test_bad_flags_are_refused_before_anything_is_written(tmp_path, capsys, words, message):
@@ -139,3 +141,84 @@ def test_sweeps_say_what_they_use_of_jerk_and_refuse_what_is_too_little(tmp_path
     assert "wrist_2_joint needs " in (said := capsys.readouterr().err)
     assert f"{100 * used * 50:.0f} % of its jerk limit at " in said
     assert not list(tmp_path.iterdir())
+
+
+def test_a_payload_is_found_by_a_motion_of_the_few_joints_that_show_it(tmp_path, capsys):
+    robot, motion = str(example_urdf("ur10_robot.urdf")), str(tmp_path / "motion.parquet")
+    words = ["--kind", "payload", "--mass", "2", "--com", "0.02,0.01,0.05", "--harmonics", "3",
+             "--duration", "5", "--starts", "1", "--seconds", "0.5",
+             "--clearance", "none"]  # fmt: skip
+    page = ["--report", str(tmp_path / "motion.html")]
+    assert main(["excite", robot, "--out", motion, "--json", *words, *page]) == 0
+    told = json.loads(capsys.readouterr().out)["payload"]
+    assert told["moving"] == WRIST
+    columns = open_table(tmp_path / "motion.parquet", LogSource()).read(
+        ["q_elbow_joint", "q_wrist_2_joint"]
+    )
+    assert np.ptp(columns["q_elbow_joint"]) == 0.0
+    assert told["resting"]["elbow_joint"] == pytest.approx(columns["q_elbow_joint"][0])
+    assert (
+        "For what hangs on wrist_3_link, wrist_1_joint, wrist_2_joint, wrist_3_joint move;"
+        in (tmp_path / "motion.html").read_text()
+    )
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        "[payload]\nmass = 2.0\ncom = [0.02, 0.01, 0.05]\n"
+        "inertia = [0.02, 0.0, 0.025, 0.0, 0.0, 0.015]\n"
+    )
+    logs = [str(tmp_path / name) for name in ("loaded.parquet", "bare.parquet")]
+    for log, own in zip(logs, (["--plant", str(plant)], []), strict=True):
+        noisy = ["--rate", "200", "--torque-noise", "0.02", "--perturb", "0.1", "--seed", "3"]
+        assert main(["simulate", robot, motion, "--out", log, *noisy, *own, "--json"]) == 0
+    capsys.readouterr()
+    assert main(["payload", robot, logs[0], "--reference", logs[1], "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["payloads"][0]
+    low, high = found["mass_interval"]
+    assert low < 2.0 < high < low + 0.6
+    error = np.subtract(found["com"], [0.02, 0.01, 0.05])
+    assert (np.abs(error) < 3 * np.array(found["com_std_error"])).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--mass", "2"], "a payload or joints that move are stated, but kind is 'fourier'"),
+        (["--kind", "payload", "--moving", "elbow"], "elbow cannot move wrist_3_link; joints that"),
+        (["--kind", "payload", "--mass", "-1"], "mass"),
+        (["--kind", "payload", "--com", "1,2,3"], "--com '1,2,3': wanted X,Y,Z [m], three numbers"),
+        (["--kind", "payload", "--mass", "1", "--com", "1,2"], "--com '1,2': wanted X,Y,Z [m]"),
+        (["--kind", "payload", "--link", "tool"], "link 'tool' is not in ur10_robot.urdf"),
+    ],
+)
+def test_flags_of_a_payload_that_do_not_fit_are_refused(tmp_path, capsys, words, message):
+    assert main([*WORDS, "--out", str(tmp_path / "m.csv"), *words]) == (
+        1 if "--link" in words else 2
+    )
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, capsys):
+    motion, log, out = (str(tmp_path / name) for name in ("m.parquet", "log.parquet", "out"))
+    assert main([*WORDS, "--out", motion, "--json"]) == 0
+    robot = [WORDS[1], WORDS[2], WORDS[3]]
+    noisy = ["--rate", "100", "--torque-noise", "0.02", "--controller", "perfect"]
+    assert main(["simulate", robot[0], motion, *robot[1:], "--out", log, *noisy, "--json"]) == 0
+    plain = ["--estimator", "wls", "--friction", "viscous+coulomb", "--json"]
+    assert main(["identify", robot[0], log, *robot[1:], "--out", out, *plain]) == 0
+    capsys.readouterr()
+    assert main([*WORDS, "--out", motion, "--given", out]) == 0
+    assert "made for what the logs given know the least: " in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert main([*WORDS, "--out", motion, "--given", out, "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["criterion"] == "widest"
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    names = [entry["name"] for entry in result["base_parameters"]]
+    assert len(content["widest"]) == round(len(names) / 4)
+    assert set(content["widest"]) < set(names)
+    assert main([*WORDS, "--out", motion, "--given", out, "--criterion", "A", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["criterion"] == "A"
+    assert "widest" not in content

@@ -102,6 +102,27 @@ def test_what_is_known_already_is_not_asked_for_again(designer, design):
     assert fresh.objective < again - 0.02
 
 
+def test_a_motion_after_another_narrows_what_that_one_left_wide(designer, design):
+    rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
+    told = designer.matrix(rows)
+    after = replace(designer, given=told, name="widest")
+    before = np.diag(np.linalg.inv(told))
+    widest = after.widest
+    assert len(widest) == round(len(told) / 4)
+    assert before[widest].min() >= np.delete(before, widest).max()
+    found, usual = (some.design(np.random.default_rng(4), starts=1) for some in (after, designer))
+
+    def left(F):
+        return np.mean(np.log(np.diag(np.linalg.inv(F))[widest]))
+
+    again, fresh, own = (
+        left(told + designer.matrix(designer.information.rows(*x)) - np.eye(len(told)))
+        for x in (some.motion.evaluate(np.linspace(0, 4.0, 61)) for some in (design, usual, found))
+    )
+    assert own < fresh - 0.02
+    assert own < again - 0.1
+
+
 def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
     # a wall 3 cm beside the tool at rest
     wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))

@@ -72,11 +72,14 @@ def test_criteria_have_their_values_and_gradients(name, rng):
         "A": np.log(np.trace(np.linalg.inv(F)) / 7),
         "E": -np.log(eigenvalues[0]),
         "condition": np.log(np.linalg.cond(F)),
+        "widest": np.log(np.diag(np.linalg.inv(F))[[5, 2]]).mean(),
     }[name]
-    value, gradient = criterion(name, F)
+    some = np.array([5, 2])  # the parameters that were the widest
+    value, gradient = criterion(name, F, some)
     assert value == pytest.approx(expected, rel=1e-9)
     h = 1e-6
-    slope = (criterion(name, F + h * D)[0] - criterion(name, F - h * D)[0]) / (2 * h)
+    up, down = (criterion(name, F + s * h * D, some)[0] for s in (1, -1))
+    slope = (up - down) / (2 * h)
     assert np.sum(gradient * D) == pytest.approx(slope, rel=1e-6)
 
 

@@ -205,7 +205,7 @@ CASES = {
     "dead torque channel": Case(("constant_torque",), column("tau_wrist_2_joint",
         lambda x, _t: np.full_like(x, 3.0))),
     "torques without their sign": Case(("unsigned_torque",), unsigned("tau_")),
-    "one torque without its sign": Case(("unsigned_torque",), unsigned("tau_wrist_2")),
+    "one torque without its sign": Case(("unsigned_torque",), unsigned(f"tau_{B}")),
     "torques held for 5 rows": Case(("held_torque",), held("tau_", 5)),
     "one torque held for 3 rows": Case(("held_torque",), held("tau_elbow", 3)),
     "gravity-compensated torques": Case(("gravity_compensated",), compensated),

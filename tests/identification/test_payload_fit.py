@@ -11,6 +11,7 @@ from robotid.commands.job import LogEntry, read_job
 from robotid.estimators.stretches import quantile
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.identification.payload_fit import identify_payload
+from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
@@ -218,3 +219,22 @@ def test_the_load_of_a_ur10e_and_what_it_says_of_its_gains(recordings, monkeypat
     lift = found.gains["shoulder_lift_joint"].interval
     assert 11.5 < lift[0] < 12.3 < lift[1] < 13.26
     assert quantile(np.array([np.inf]))[0] == pytest.approx(1.96, abs=0.01)
+
+
+def test_a_joint_that_rests_but_for_a_few_rows_does_not_outweigh_the_others(ur5, rng):
+    # what its few rows leave is nothing, for they are fewer than the parameters
+    t = np.arange(1000) / 100.0
+    w = 2 * np.pi / 10.0 * np.array([1, 1, 1, 3, 4, 5])
+    bump = np.exp(-(((t - 5.0) / 0.1) ** 2))
+    place = np.array([0.3, -1.0, 1.2, 0.2, 0.5, 0.1])
+    q = place + 1.2 * np.sin(np.outer(t, w) + np.arange(6)) * (np.arange(6) > 2)
+    q[:, 2] += 0.01 * bump
+    v, a = (np.gradient(x, t, axis=0, edge_order=2) for x in (q, np.gradient(q, t, axis=0)))
+    tau = joint_torque_regressor(ur5, q, v, a) @ truth(ur5)
+    without = Log(t, q, tau.reshape(q.shape), ur5.joints, v, a)
+    loaded = replace(without, tau=without.tau + load_torque(ur5, without, "tool0"))
+    runs = [replace(x, tau=x.tau + LEVEL * rng.standard_normal(q.shape)) for x in (loaded, without)]
+    found = identify_payload(ur5, runs[:1], runs[1:], links=["tool0"])["tool0"]
+    assert found.mass_std_error < 0.1
+    assert abs(found.mass - MASS) < 3 * found.mass_std_error
+    assert (np.abs(found.com - COM) < 3 * found.com_std_error).all()

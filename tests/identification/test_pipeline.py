@@ -11,7 +11,9 @@ from robotid.identification import pipeline
 from robotid.identification.pipeline import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
+from robotid.robot.examples import example_urdf
 from robotid.robot.mass_matrix import MassMatrixCheck
+from robotid.robot.model import RobotModel
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 
@@ -197,3 +199,20 @@ def test_a_body_held_by_its_extent_is_no_prior(ur5, rng):
     bound = {o for o, s in zip(owners, found.sources, strict=True) if s == "bound"}
     assert bound
     assert bound <= held
+
+
+def test_links_on_locked_joints_that_weigh_less_than_the_urdf_says_are_named():
+    model = RobotModel.from_urdf(
+        example_urdf("ur5_robot.urdf"), joints=["elbow_joint", "wrist_1_joint"]
+    )
+    costs = []
+    for share in (0.45, 1.0):
+        pi = model.standard_parameters()
+        pi[10:20] *= share  # the hand alone has 0.53 of it by the URDF
+        pi[20:] = 0.5
+        log = exact_log(model, pi, np.random.default_rng(0), samples=400, rate=50.0, noise=0.02)
+        found = identify(model, [log])
+        costs.append([f.message for f in found.findings if f.code == "constraint_costs"])
+    assert costs[1] == []
+    assert "the inertials of the links on locked joints, 1.41 of the " in costs[0][0]
+    assert "kg of wrist_1_link, which are the URDF's (identify their joints, too" in costs[0][0]
