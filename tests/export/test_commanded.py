@@ -256,6 +256,19 @@ def test_mjcf_of_a_result_says_what_it_lacks(result, tmp_path, capsys):
     np.testing.assert_allclose(robot.dof_frictionloss, [0.2, 0.2, 0.4 + mean], rtol=1e-4)
 
 
+def test_a_controller_that_carries_the_weight_is_named(tmp_path, capsys):
+    settings = {"estimator": {"name": "wls"}, "controller": {"gravity_compensation": True}}
+    folder = written_result(
+        plant("planar", np.random.default_rng(0)), tmp_path / "out", settings=settings
+    )
+    for kind in ("mjcf", "isaac"):
+        code, out, _ = export(folder, kind, tmp_path / "a", capsys)
+        assert code == 0
+        assert "the controller adds the torque of gravity by the URDF" in out
+        said = " ".join((tmp_path / "a").read_text().split())
+        assert "adds the torque of gravity by the URDF" in said
+
+
 def test_mean_friction_changes_nothing_without_such_friction():
     leg = plant("leg", np.random.default_rng(0))
     pi = leg.model.standard_parameters()
