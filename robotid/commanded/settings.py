@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from robotid._settings import Range, Settings, setting
+from robotid._settings import Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
@@ -29,13 +29,12 @@ class LoopSettings(Settings):
         "counted as that, if not stated", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
-        None, "largest torque of the drive [N m or N], likewise; none if not stated, and found if "
-        "it is 'find'",
+        None,
+        "largest torque of the drive [N m or N], likewise; none if not stated, found if 'find'",
         reads=(int, float, dict, str),
-        within=Range(
-            "positive numbers, or 'find'", lambda x: x == "find" or GAIN["within"].holds(x)
-        ),
-    )  # fmt: skip
+        within=GAIN["within"],
+        among=("find",),
+    )
     delay: PerJoint | None = setting(
         None, "how late the command acts [s], likewise; found, one for all joints, if not stated",
         **LEVEL,
@@ -49,7 +48,7 @@ class LoopSettings(Settings):
         reads=(dict,),
     )  # fmt: skip
     zeros: str = setting(
-        "urdf", "urdf: encoders have the URDF's zero and sign; find: both are found, from gravity",
+        "urdf", "urdf: encoders have the URDF's zero and sense; find: both are found, from gravity",
         among=("urdf", "find"),
     )  # fmt: skip
 
