@@ -14,8 +14,8 @@ from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
-from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.drives import DriveTerm, Viscous
+from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
 from robotid.simulation.settings import PerJoint, by_joint
@@ -140,7 +140,7 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         SettingsError: If a joint is named that is not there.
     """
     n, joints = len(model.joints), model.joints
-    limit = None if loop.limit == "find" else loop.limit
+    limit = None if isinstance(loop.limit, str) else loop.limit  # it is to be found
     bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
     return Loops(
         bodies=bodies,
@@ -254,9 +254,9 @@ def _unknowns(
                 found.append(Unknown(f"{group}.{what}", what, own, begin, wide, lowest))
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
-            own = [j for j in joints if term in base.terms[j]]
+            having = [j for j in joints if term in base.terms[j]]
             # what wears and what leans differ from drive to drive, grease and motor do not
-            for sharing in [own] if isinstance(term, Viscous) else [[j] for j in own]:
+            for sharing in [having] if isinstance(term, Viscous) else [[j] for j in having]:
                 name = group if len(sharing) > 1 else model.joints[sharing[0]]
                 found.append(_term(name, term, sharing, base, usual))
     if not _is_stated(loop.delay, model).any():
