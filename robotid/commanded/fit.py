@@ -150,7 +150,7 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         SettingsError: If a joint is named that is not there.
     """
     n, joints = len(model.joints), model.joints
-    limit = None if loop.limit == "find" else loop.limit
+    limit = None if isinstance(loop.limit, str) else loop.limit  # it is to be found
     bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
     return Loops(
         bodies=bodies,
@@ -319,9 +319,9 @@ def _unknowns(
                 found.append(Unknown(f"{group}.{what}", what, own, begin, wide, lowest))
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
-            own = [j for j in joints if term in base.terms[j]]
+            having = [j for j in joints if term in base.terms[j]]
             # what wears and what leans differ from drive to drive, grease and motor do not
-            for sharing in [own] if isinstance(term, Viscous) else [[j] for j in own]:
+            for sharing in [having] if isinstance(term, Viscous) else [[j] for j in having]:
                 name = group if len(sharing) > 1 else model.joints[sharing[0]]
                 found.append(_term(name, term, sharing, base, usual))
     return found

@@ -5,17 +5,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import pinocchio as pin
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.errors import OpenLoop, run_open_loop
 from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_terms
 from robotid.commanded.settings import LoopSettings
+from robotid.commanded.term_choice import Tried
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import JointVerdict, Verdict
 from robotid.logs.data import Log
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import Loops
 
@@ -163,12 +164,7 @@ def _urdf(model: RobotModel, stated: Loops) -> Loops:
 
 def _with_gravity(model: RobotModel, log: Log) -> Log:
     """Return a log whose fed-forward torque has that of gravity by the URDF, as measured."""
-    data = model.pin_model.createData()
-    G = model.velocity_map
-    configurations = model.configurations(log.q)
-    torque = np.array(
-        [pin.computeGeneralizedGravity(model.pin_model, data, q) @ G for q in configurations]
-    )
+    torque = predict_instants(model, model.standard_parameters(), log.q)
     fed = torque if log.tau_ref is None else log.tau_ref + torque
     return replace(log, tau_ref=fed)
 
@@ -245,17 +241,19 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             "needs them",
         )
     yield from _encoder_findings(found)
-    chosen = [t for t in found.fitted.tried if t.is_chosen]
-    for t in chosen:
-        terms = " and ".join(t.terms)
-        yield Finding(
-            "friction_found",
-            "note",
-            t.joint,
-            f"{t.joint}: {terms} lowers the squared error of windows that it was not fitted to by "
-            f"{100 * t.gain:.0f} %",
-            {"gain_pct": 100 * t.gain},
-        )
+    yield from map(_friction_found, (t for t in found.fitted.tried if t.is_chosen))
+
+
+def _friction_found(tried: Tried) -> Finding:
+    """Return what is said of terms that other windows confirmed."""
+    return Finding(
+        "friction_found",
+        "note",
+        tried.joint,
+        f"{tried.joint}: {' and '.join(tried.terms)} lowers the squared error of windows that it "
+        f"was not fitted to by {100 * tried.gain:.0f} %",
+        {"gain_pct": 100 * tried.gain},
+    )
 
 
 def _encoder_findings(found: Commanded) -> Iterator[Finding]:

@@ -59,10 +59,14 @@ class Simulator(Protocol):
         lowest: Smallest value that each may have, shape (c,); -inf without.
     """
 
-    names: tuple[str, ...]
-    prior: Array
-    prior_std: Array
-    lowest: Array
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def prior(self) -> Array: ...
+    @property
+    def prior_std(self) -> Array: ...
+    @property
+    def lowest(self) -> Array: ...
 
     def residuals(self, theta: Array, *, with_slopes: bool) -> Sequence[Residual]:
         """Return what is measured less what is simulated, window by window.
