@@ -36,6 +36,7 @@ PAGES = {
     "verdict": "verdicts.md",
     "preview": "recording.md",
     "excitation": "excitation.md",
+    "designs": "excitation.md",
     "motions": "excitation.md",
 }
 BLOCK = re.compile(

@@ -180,7 +180,7 @@ def _identify(options: argparse.Namespace) -> int:
         source = source_words(options.words)
         found, result = run_job(job, options.out, plan=plan, source=source)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
-    if not options.json:
+    if not (options.json or "simulation" in result):
         print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["alarms"] else 0
 
@@ -325,7 +325,9 @@ def _compare(options: argparse.Namespace) -> None:
 def _export(options: argparse.Namespace) -> None:
     from robotid.commands.export import export_result
 
-    _show(export_result(options.result, options.format, options.out), options, "export")
+    chosen = {key: getattr(options, key) for key in ("step", "delay", "mean_friction")}
+    done = export_result(options.result, options.format, options.out, **chosen)
+    _show(done, options, "export")
 
 
 def _simulate(options: argparse.Namespace) -> None:
@@ -368,7 +370,10 @@ _COMMANDS: Mapping[str, tuple[str, _Run]] = {
     "payload": ("what hangs on a link: a log with it against one without", _payload),
     "report": ("write the report of a result again, from its inputs", _report),
     "compare": ("several results side by side", _compare),
-    "export": ("write a result as URDF, MJCF, SDF or ranges for randomisation", _export),
+    "export": (
+        "write a result as URDF, MJCF, SDF, Isaac Lab's actuators or ranges for randomisation",
+        _export,
+    ),
     "simulate": ("a log of a motion by a robot whose truth is known", _simulate),
     "convert": (
         "write a log as CSV, Parquet, NPZ, HDF5 or MAT, with standard column names",

@@ -32,8 +32,10 @@ _WIDE = 10.0  # spreads of drives are so many times their usual size: they bind 
 _SHARE = 0.5  # of the loop's inertia by which gains are unknown, that bodies have to begin with
 _SLOWEST = 0.1  # [s] spread of a delay
 _TURN = 0.3  # [rad or m] spread of an encoder's zero about where it was found
+_LIGHTEST = 0.3  # of the largest such inertia: small joints have a motor behind a gear, too
 _POSES = 50  # that the bodies' inertia is looked at in
 _LEAST = 0.05  # of a usual size, that an inertia begins with, or a gain keeps
+_FEW = 12  # windows that are fitted first, of many
 _PASSES = 2  # of choosing terms and fitting again
 
 
@@ -99,10 +101,15 @@ def fit_loops(
     has_speeds = all(log.v_ref is not None for log in logs)
     unknowns = _unknowns(model, loop, groups, base, usual, has_speeds=has_speeds)
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
-    estimator = OutputError(whitens=settings.whiten, progress=progress)
+    dt = max(float(np.median(np.diff(log.t))) for log in logs)
+    estimator = OutputError(
+        whitens=settings.whiten, most=np.exp(-dt / plain.time_constant), progress=progress
+    )
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
-    estimate = estimator.fit(simulator, simulator.prior)
+    few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
+    begun = replace(estimator, rounds=1).fit(few, simulator.prior)
+    estimate = estimator.fit(simulator, begun.theta)
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
         report_stage(progress, "trying friction", STAGES)
@@ -181,9 +188,11 @@ def _usual(
     poses = q[:: max(1, len(q) // _POSES)]
     M = joint_mass_matrices(model, model.standard_parameters(), poses)
     bodies = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
-    scale = np.where(has_gain, 1.0, bodies / _SHARE / plain.inertia)
+    measure = np.maximum(bodies, _LIGHTEST * bodies.max()) / _SHARE
+    scale = np.where(has_gain, 1.0, measure / plain.inertia)
     speed = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
-    return _Usual(plain.inertia * scale, bodies, plain.torque * scale, speed, scale)
+    inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
+    return _Usual(inertia, bodies, plain.torque * scale, speed, scale)
 
 
 def _begin(model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual) -> Loops:
@@ -230,7 +239,7 @@ def _unknowns(
     }
     spread = {
         "armature": usual.inertia,
-        "kp": base.kp,
+        "kp": base.kp / _WIDE,
         "kd": usual.torque / usual.speed,
         "limit": usual.torque,
     }

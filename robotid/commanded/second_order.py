@@ -22,7 +22,8 @@ _FREQUENCIES = (6.0, 12.0, 24.0, 48.0, 96.0)  # [rad/s] of the loop, that are tr
 _DAMPINGS = (0.5, 1.5)  # of critical
 _FRICTIONS = (0.05, 0.5)  # of the loop's usual torque
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # [s]
-_TRIED = 8  # windows that the tries look at
+_TRIED = 8  # windows that the tries look at ...
+_FITTED = 16  # ... and the fit
 _LEAST = 1e-6  # of the usual inertia, that a joint must have
 _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
@@ -48,6 +49,14 @@ class SecondOrder:
     def inertia(self) -> Array:
         """Inertia J of each joint [kg m^2 or kg]."""
         return self.loops.armature
+
+    @property
+    def time_constant(self) -> Array:
+        """How fast each joint follows [s]: the slower of its damping and its swing."""
+        loops = self.loops
+        damped = (loops.kd + self.friction("viscous")) / loops.kp
+        slow: Array = np.maximum(damped, np.sqrt(loops.armature / loops.kp))
+        return slow
 
     def friction(self, name: str) -> Array:
         """Return "viscous", "coulomb" or "offset" of each joint.
@@ -88,7 +97,8 @@ def fit_second_order(
     )
     start = _coarse(robot, windows[:_TRIED], bare, torque, finds_delay)
     unknowns = _unknowns(robot, start, torque, finds_delay)
-    simulator = LoopSimulator(robot, windows, start, unknowns)
+    some = windows[:: max(1, len(windows) // _FITTED)]
+    simulator = LoopSimulator(robot, some, start, unknowns)
     theta = OutputError(whitens=False, steps=_STEPS).fit(simulator, simulator.prior).theta
     return SecondOrder(simulator, theta, simulator.loops(theta), torque)
 

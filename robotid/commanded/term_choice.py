@@ -13,7 +13,7 @@ import scipy.linalg
 from robotid._typing import Array
 from robotid.commanded.unknowns import LoopSimulator, Unknown
 from robotid.estimators.output_error import OutputError, linearised
-from robotid.robot.drives import Cubic, DriveTerm, LoadFriction, PositionCoulomb, Stribeck
+from robotid.robot.drives import DriveTerm, LoadFriction, PositionCoulomb, Stribeck
 
 __all__ = ["Tried", "candidates", "choose"]
 
@@ -60,14 +60,13 @@ def candidates(simulator: LoopSimulator, torque: Array) -> list[tuple[Unknown, .
             continue
         centre, seen = float((low + high) / 2), (float(low), float(high))
         half = (high - low) / 2
-        sets: list[tuple[DriveTerm, ...]] = [(Stribeck(speed=_SLOW * speed),), (Cubic(),)]
-        sets.append((LoadFriction(),))
+        sets: list[tuple[DriveTerm, ...]] = [(Stribeck(speed=_SLOW * speed),), (LoadFriction(),)]
         if half > _WIDE:
             sets.append(tuple(PositionCoulomb(order=k, centre=centre, seen=seen) for k in (1, 2)))
         for terms in sets:
             unknowns = []
             for term in terms:
-                size = {"cubic": speed**3, "load": torque[j]}.get(term.name, 1.0)
+                size = torque[j] if isinstance(term, LoadFriction) else 1.0
                 if isinstance(term, PositionCoulomb):
                     size = half**term.order
                 unknowns.append(

@@ -15,8 +15,8 @@ from robotid.simulation.loops import LoopedRobot, Loops, RollOut, Window
 __all__ = ["LoopSimulator", "Unknown", "body_unknowns"]
 
 _POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
-#: Entries of the triangle that a body changes by: logarithms of the diagonal, then the rest.
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+#: Entries of the triangle that a body changes by: the logarithm of its mass' root, and its centre.
+_ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Unknown:
         spread: How far from that it may plausibly be; inf where nothing is known.
         lowest: Smallest value that it may have.
         term: The term of friction.
-        coordinate: Number of a body's coordinate, 0 to 9.
+        coordinate: Number of a body's coordinate, 0 to 3.
     """
 
     name: str
@@ -46,10 +46,11 @@ class Unknown:
 
 
 def body_unknowns(robot: LoopedRobot, spread: float) -> list[Unknown]:
-    """Return how bodies may differ from the URDF's, ten coordinates each, 0 before any data.
+    """Return how bodies may differ from the URDF's, four coordinates each, 0 before any data.
 
-    J' = U T T' U' with U U' the URDF's pseudo-inertia and T an upper triangle with exponentials on
-    its diagonal: every value is a body that can be.
+    J' = U T T' U' with U U' the URDF's pseudo-inertia and T the unit matrix but for its last
+    column, (c, exp m): mass and centre of mass change, and the moments with them, the shape about
+    the centre stays. Every value is a body that can be.
 
     Args:
         robot: The robot.
@@ -68,7 +69,8 @@ def body_unknowns(robot: LoopedRobot, spread: float) -> list[Unknown]:
             continue  # a massless frame, or a body that the URDF makes impossible: it stays
         name = model.layout.bodies[body]
         found += [
-            Unknown(f"{name}.{k}", "body", (joint,), 0.0, spread, coordinate=k) for k in range(10)
+            Unknown(f"{name}.{what}", "body", (joint,), 0.0, spread, coordinate=k)
+            for k, what in enumerate(("mass", "cx", "cy", "cz"))
         ]
     return found
 
@@ -157,9 +159,13 @@ class LoopSimulator:
             error = _error(out)
             for joints, places, slopes in out.slopes:
                 own = np.unique(owners[places])
-                shared = np.zeros((len(places), len(own)))  # a column of each joint that shares it
-                shared[np.arange(len(places)), np.searchsorted(own, owners[places])] = 1.0
-                found.append(Residual(error[:, joints], slopes @ shared, joints, own))
+                if len(own) < len(places):  # a column of each joint that shares it
+                    shared = np.zeros((len(places), len(own)))
+                    shared[np.arange(len(places)), np.searchsorted(own, owners[places])] = 1.0
+                    slopes = slopes @ shared
+                else:
+                    slopes = slopes[:, :, np.argsort(owners[places])]
+                found.append(Residual(error[:, joints], slopes, joints, own))
         return found
 
     def _columns(self, loops: Loops) -> tuple[list[tuple[int, int, int]], Array]:

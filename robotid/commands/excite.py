@@ -24,6 +24,7 @@ from robotid.excitation.routes import design_stands, design_sweeps
 from robotid.identification.previews import Preview, Run, preview_logs
 from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
+from robotid.regressor.compiled import is_installed, why_not
 from robotid.robot.model import RobotModel
 from robotid.simulation.settings import Payload
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
 _ROUTES = ("sweeps", "stands")
+_START = 2.0  # [s] of design from which compiled code pays
 _KINDS = ("fourier", "bspline", "payload", *_ROUTES)
 
 
@@ -215,14 +217,15 @@ def _designer(job: Job, settings: MotionSettings, given: str | None) -> tuple[De
         jerk=settings.jerk,
         power=settings.power,
     )
-    clearance = None
+    clearance, is_fast = None, _pays(model, settings)
     if settings.clearance is not None:
         clearance = Clearance(
-            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes
-        )
+            model, least=settings.clearance, floor=settings.floor, boxes=settings.boxes,
+            is_fast=is_fast,
+        )  # fmt: skip
     designer = Designer.of_model(
         model, settings.basis(), limits, name=name, clearance=clearance, noise=settings.noise,
-        run=run,
+        run=run, is_fast=is_fast,
     )  # fmt: skip
     return designer, run
 
@@ -237,6 +240,12 @@ def _designed(
     if settings.kind == "stands":
         return design_stands(designer, rng)
     return designer.design(rng, starts=settings.starts, seconds=settings.seconds, progress=progress)
+
+
+def _pays(model: RobotModel, settings: MotionSettings) -> bool:
+    """Return whether compiled code can be used and pays its start of about half a second."""
+    is_long = settings.kind not in _ROUTES and settings.seconds > _START
+    return is_long and is_installed() and why_not(model) is None
 
 
 def _check_jerk(course: Course, joints: Sequence[str]) -> None:
@@ -289,11 +298,13 @@ def _content(
     if clearance is not None:
         contact = design.contact
         margins["collision"] = {
-            "margin": None if contact is None else contact.distance - clearance.least,
+            "margin": None if contact is None else contact.margin,
+            "kept": None if contact is None else contact.kept,
             "where": None if contact is None else f"{contact.first} and {contact.second}",
             "time": None if contact is None else contact.time,
             "unread": clearance.unread,
             "left_alone": clearance.made_to,
+            "built_near": clearance.built_near,
         }
     content = {
         "robot": model.name,

@@ -178,9 +178,16 @@ def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
     add = parser.add_argument
     if command == "export":
         add("result", metavar="RESULT", help="result.json or its folder")
-        kinds = ("urdf", "mjcf", "sdf", "ranges")
-        add("--format", required=True, choices=kinds, help="ranges: YAML of 95 %% intervals")
+        kinds = ("urdf", "mjcf", "sdf", "isaac", "ranges")
+        words = "isaac: YAML of Isaac Lab's actuators; ranges: YAML of 95 %% intervals"
+        add("--format", required=True, choices=kinds, help=words)
         add("--out", required=True, metavar="FILE", help="file to write")
+        words = "time step of the simulator; default: 0.001 of mjcf, 0.005 of isaac"
+        add("--step", type=float, metavar="S", help=words)
+        words = "how mjcf delays commands; default: history, which needs MuJoCo 3.5"
+        add("--delay", choices=("history", "filter"), help=words)
+        words = "add the mean of friction that depends on the position, which formats lack"
+        add("--mean-friction", action="store_true", help=words)
     else:
         add("log", metavar="IN", help="a log of any format, or a bag's folder")
         add("out", metavar="OUT", help="file to write; its suffix says the format")

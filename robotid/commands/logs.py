@@ -18,7 +18,7 @@ from robotid.identification.previews import Run
 from robotid.identification.recordings import Recordings
 from robotid.identification.survey import SurveyedLog, survey_log
 from robotid.identification.verdict import check_ignored
-from robotid.logs.read import LogLayout
+from robotid.logs.read import LogLayout, Needs
 from robotid.logs.table import Table
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
@@ -36,6 +36,7 @@ def survey_logs(
     model: RobotModel,
     *groups: Sequence[LogEntry],
     refuse: Callable[[LogEntry, DataError], None] | None = None,
+    needs: Needs = "torque",
 ) -> tuple[tuple[SurveyedLog, ...], ...]:
     """Return the logs of each group of a job's, ready to be read.
 
@@ -49,13 +50,14 @@ def survey_logs(
         model: The robot whose joints are read.
         groups: The logs: those to fit, those kept apart.
         refuse: Called with a log that cannot be used, and why; if None, the error is raised.
+        needs: What is wanted of the logs beside positions, as of ``lay_out``.
 
     Raises:
         DataError: If a file cannot be used.
         SettingsError: If a setting does not fit a log.
     """
     paths = dict.fromkeys(entry.path for entry in chain(*groups))
-    opened = {path: _open(job, model, path) for path in paths}
+    opened = {path: _open(job, model, path, needs) for path in paths}
     rows = sum(_count(found) for found in opened.values())
     is_long = rows > job.rows_in_memory and not model.is_static
     length = max(job.rows_in_memory // _PIECES, _SHORTEST) if is_long else None
@@ -100,7 +102,8 @@ def examine(
         refused.append(Finding(error.code, "error", entry.path.name, str(error)))
 
     report_stage(progress, "reading logs", STAGES[:2])
-    fitted, kept = survey_logs(job, model, job.identification, job.validation, refuse=refuse)
+    groups = job.identification, job.validation
+    fitted, kept = survey_logs(job, model, *groups, refuse=refuse, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
     return by_severity([*refused, *examine_logs(job, model, fitted, kept)])
 
@@ -212,9 +215,11 @@ def _identity(path: Path) -> dict[str, Any]:
     return found
 
 
-def _open(job: Job, model: RobotModel, path: Path) -> tuple[LogLayout, Table] | DataError:
+def _open(
+    job: Job, model: RobotModel, path: Path, needs: Needs
+) -> tuple[LogLayout, Table] | DataError:
     try:
-        return job.lay_out(LogEntry(path), model)
+        return job.lay_out(LogEntry(path), model, needs=needs)
     except DataError as error:
         return error
 

@@ -1,7 +1,7 @@
 """A replay from files: the log, what results predict of it, what a tracker saw, a ghost."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.clearance import Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.limits import LIMITS, MotionLimits
-from robotid.export.result import read_result, stated_model
+from robotid.export.result import Result, load_result, stated_model
 from robotid.export.shape import FILE, NUMBER, TABLE, TEXT, check_shape
+from robotid.findings import listed
 from robotid.identification.evaluation import predict
 from robotid.identification.pipeline import Identification
 from robotid.identification.survey import hold_log
@@ -47,6 +48,7 @@ class Findings:
     """What identifications and a tracker found, as read from their files."""
 
     results: Mapping[str, Mapping[str, Any]]  # contents of result.json, by label
+    commanded: Mapping[str, Result] = field(default_factory=dict)  # those of drives with gains
     track: Mapping[str, Any] | None = None  # content of a track.json
     folder: Path = Path()  # of the track.json, which its history is in
 
@@ -67,6 +69,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
         DataError: If a file cannot be used, or there are two tracks.
     """
     results: dict[str, Mapping[str, Any]] = {}
+    commanded: dict[str, Result] = {}
     tracks: list[tuple[Path, Mapping[str, Any]]] = []
     for path in map(Path, paths):
         files = [path]
@@ -82,11 +85,14 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
                 continue
             name = file.resolve().parent.name if len(paths) > 1 else "identified"
             label = name if name not in results else f"{name} {len(results) + 1}"
-            results[label] = read_result(file)
+            loaded = load_result(file)
+            results[label] = loaded.content
+            if "simulation" in loaded.content:
+                commanded[label] = loaded
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks were given; a replay shows one")
     folder, content = tracks[0] if tracks else (Path(), None)
-    return Findings(results, content, folder)
+    return Findings(results, commanded, content, folder)
 
 
 def stated_job(findings: Findings, urdf: str | Path, log: str | Path) -> Job:
@@ -123,14 +129,16 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
     """
     model = job.model()
     (entry,) = job.identification
+    if findings.commanded:
+        return _replay_commanded(job, findings.commanded, ghost)
     is_motion = not job.lay_out(entry, model, needs="motion")[0].has_torque
     motion = job.read(entry, model, needs="motion" if is_motion else "torque")
     robots = {label: stated_model(r, model) for label, r in findings.results.items()}
     bodies = {label: robot.carried_by for label, robot in robots.items()}
-    second = None
+    ghosts = {}
     if ghost is not None:
         shadow = job.read(LogEntry(Path(ghost)), model, needs="motion")
-        second = (Path(ghost).name, shadow.t, shadow.q)
+        ghosts[Path(ghost).name] = (shadow.t, shadow.q)
     torques, marks, notes = None, _payloads(findings.track), [f"Motion: {entry.path.name}."]
     if is_motion:
         used, said = _limits_used(job, motion, model)
@@ -140,7 +148,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         marks += _contacts(torques, model)
     masses = {"URDF": model.standard_parameters(), **bodies} if bodies else {}
     shown, q = model, motion.q
-    base = None if second else _base_poses(job, entry, motion)
+    base = None if ghosts else _base_poses(job, entry, motion)
     if base is not None:  # the same robot, whose first body is the trunk
         shown, q = _afloat(job, model), np.hstack([base, q])
         trunk = shown.standard_parameters()[:10]
@@ -152,7 +160,7 @@ def replay_files(job: Job, findings: Findings, *, ghost: str | Path | None = Non
         q,
         torques=torques,
         masses=masses or None,
-        ghost=second,
+        ghosts=ghosts,
         bands=None if findings.track is None else _bands(findings.track, findings.folder),
         marks=marks,
         notes=notes,
@@ -181,6 +189,45 @@ def replay_identified(identification: Identification) -> Replay:
         masses={"URDF": identification.prior, "identified": identification.standard},
         notes=[f"Motion: {shown.recording.name}."],
     )
+
+
+def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path | None) -> Replay:
+    """Return the replay of a log of commands: measured, commanded and simulated robot.
+
+    Poses are those of the URDF's joints, whose zero need not be the encoders'.
+    """
+    (entry,) = job.identification
+    first = next(iter(results.values()))
+    model, zero = first.robot, np.array([drive.zero for drive in first.commanded])
+    log = job.read(entry, model, needs="commands")
+    q_ref = np.asarray(log.q_ref)
+    simulated = {label: result.follow_commands(log) for label, result in results.items()}
+    names = ["simulated"] if len(simulated) == 1 else [f"simulated: {x}" for x in simulated]
+    shown = dict(zip(names, simulated.values(), strict=True)) | {"commanded": q_ref}
+    ghosts = {label: _known(log.t, q + zero) for label, q in shown.items()}
+    if ghost is not None:
+        other = job.read(LogEntry(Path(ghost)), model, needs="motion")
+        ghosts[Path(ghost).name] = (other.t, other.q + zero)
+    error = np.sqrt(np.mean((q_ref - log.q) ** 2, axis=0))
+    left = np.sqrt(np.nanmean((shown[names[0]] - log.q) ** 2, axis=0))
+    worst = [f"{model.joints[j]} {1e3 * left[j]:.2g}" for j in np.argsort(-left).tolist()]
+    return replay(
+        model,
+        log.t,
+        log.q + zero,
+        torques=Torques(log.t, log.q, shown, error, "position"),
+        ghosts=ghosts,
+        notes=[
+            f"Motion: {entry.path.name}, as measured; ghosts on its commands.",
+            f"Position missed in open loop, rms [mrad or mm]: {listed(worst, 3)}.",
+        ],
+    )
+
+
+def _known(t: Array, q: Array) -> tuple[Array, Array]:
+    """Return the rows that are numbers."""
+    rows = np.isfinite(q).all(axis=1)
+    return t[rows], q[rows]
 
 
 def _afloat(job: Job, model: RobotModel) -> RobotModel:

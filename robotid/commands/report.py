@@ -5,20 +5,23 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from robotid._files import check_file, file_sha256
 from robotid._typing import ProgressCallback, report_stage
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.result import load_result
+from robotid.export.result import Result, load_result
 from robotid.findings import listed
 from robotid.identification.advice import Origin
 from robotid.identification.pipeline import Identification
+from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.report.document import write_report
 from robotid.versions import versions
 from robotid.workers.plan import WorkPlan
 
-__all__ = ["rewrite_report"]
+__all__ = ["followed_logs", "rewrite_report"]
 
 _SHARE = 1e-6  # of a base parameter ...
 _PART = 0.01  # ... or of its standard error, which is rounding: solvers stop somewhere
@@ -29,7 +32,8 @@ def rewrite_report(
 ) -> dict[str, Any]:
     """Write the report of a result again, as this version of robotid shows it.
 
-    The fit is made again, from the inputs and with the settings that the result names.
+    The fit is made again, from the inputs and with the settings that the result names; of drives
+    that follow commands the result is rolled out instead.
 
     Args:
         path: A result.json, or its folder.
@@ -53,8 +57,10 @@ def rewrite_report(
     settings = {key: value for key, value in content["settings"].items() if value != {}}
     job = job_from_settings(settings, loaded.path.name, Path())
     _check_inputs(job, content, loaded.path.name)
-    found, _ = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
-    _require_same(found, content, loaded.path.name)
+    found = None
+    if "simulation" not in content:
+        found, _ = identify_job(job, job.model(), WorkPlan(job.workers or 1, progress=progress))
+        _require_same(found, content, loaded.path.name)
     report_stage(progress, "writing")
     beside = {"result": loaded.path.name, **content["outputs"], "replay": "replay.html"}
     files = {
@@ -63,8 +69,38 @@ def rewrite_report(
         if what != "report" and goal.resolve().with_name(name) == (folder / name).resolve()
         if (folder / name).is_file()
     }
-    write_report(found, goal, files=files, origin=Origin((), str(folder)))
+    origin = Origin((), str(folder))
+    if found is None:
+        write_commanded_report(
+            content, followed_logs(loaded, job), goal, files=files, origin=origin
+        )
+    else:
+        write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}
+
+
+def followed_logs(result: Result, job: Job) -> list[Followed]:
+    """Return the logs of a job beside what the identified robot does on their commands.
+
+    Args:
+        result: A result of drives that follow commands.
+        job: Its job.
+
+    Returns:
+        The logs that were kept apart first.
+
+    Raises:
+        DataError: If a log cannot be read, or has no commands.
+        MissingDependencyError: If Numba is not installed.
+    """
+    model, found = result.robot, []
+    for is_kept, entries in ((True, job.validation), (False, job.identification)):
+        for entry in entries:
+            log = job.read(entry, model, needs="commands")
+            name = f"{entry.path.name}, {log.t[0]:.4g} to {log.t[-1]:.4g} s"
+            q_ref, q_sim = np.asarray(log.q_ref), result.follow_commands(log)
+            found.append(Followed(name, is_kept, log.t, q_ref, log.q, q_sim))
+    return found
 
 
 def _check_target(goal: Path) -> None:

@@ -207,7 +207,8 @@ def _velocity_scale(
             "and every friction and inertia with it; correct the column, or set [signals] velocity "
             "= 'differentiated'"
         )
-        severity = "note" if velocity == "differentiated" else "error"
+        is_used = {"differentiated": "note", "auto": "error" if log.has_torque else "warning"}
+        severity = is_used.get(velocity, "error")
         yield log_finding(log.name, "velocity_scale", severity, message, joint, factor=factor)
 
 
@@ -225,7 +226,7 @@ def _slopes(log: Log, velocity: Array) -> tuple[Array, Array]:
 
 def _channels(log: Log) -> Iterator[tuple[str, Array]]:
     for kind, values in (("q", log.q), ("dq", log.v), ("tau", log.tau)):
-        if values is not None:
+        if values is not None and (kind != "tau" or log.has_torque):
             yield kind, values
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
+from robotid.doctor.command_channels import check_commands
 from robotid.doctor.motions import check_excitation, check_repeated_motion
 from robotid.doctor.mounted import check_payload_change
 from robotid.doctor.sample import Probe, smooth_motion, take_probe
@@ -28,9 +29,10 @@ __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "gravity_compensated", "joint_axis", "joint_order", "locked_position",
-    "position_offset", "position_order", "position_sign", "spikes", "torque_order", "torque_sign",
-    "unlike_velocity", "unsigned_torque", "velocity_order", "velocity_scale",
+    "gravity", "gravity_compensated", "joint_axis", "joint_order", "late_command",
+    "locked_position", "position_offset", "position_order", "position_sign", "spikes",
+    "torque_order", "torque_sign", "unlike_velocity", "unsigned_torque", "velocity_order",
+    "velocity_scale",
 )  # fmt: skip
 
 
@@ -58,7 +60,7 @@ def check_logs(
         SettingsError: If a setting does not fit a log.
     """
     first, second = (
-        read_logs(some, model.joints, prismatic=model.layout.prismatic)
+        read_logs(some, model.joints, prismatic=model.layout.prismatic, needs="any")
         for some in (logs, validation)
     )
     return diagnose(model, first, second, signals or SignalSettings())
@@ -126,7 +128,8 @@ def _examine_log(
     findings += [log_finding(name, "log_note", "note", note) for note in log.notes]
     if not model.is_static:  # the rows of poses may be apart
         findings += [*check_clock(log), *check_channels(log, signals)]
-    sizes = list(check_torque_channels(log))
+    findings += check_commands(log)
+    sizes = list(check_torque_channels(log)) if log.has_torque else []
     findings += sizes
     if model.free_flyer:
         message = "torques of a robot with a floating base are not judged"
@@ -140,6 +143,8 @@ def _examine_log(
         findings.append(Finding(error.code, "error", name, str(error)))
         return None, None
     findings += check_rest(log, motion, model.layout)
+    if not log.has_torque:
+        return motion, None
     probe = take_probe(model, motion)
     if probe is None:
         message = "too little moves to judge torques by; record motion of every joint"

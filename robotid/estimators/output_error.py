@@ -22,9 +22,9 @@ from robotid.regressor.factors import Factors, triangle_of
 __all__ = ["OutputError", "Residual", "Simulator", "linearised"]
 
 _STEPS = 25  # of the damped Gauss-Newton method in a round
-_ROUNDS = 6  # of whitening and noise levels ...
-_SETTLED = 5e-3  # ... until they change by less than that
-_ROUGH, _CLOSE = 1e-3, 1e-6  # relative decrease that ends a round, and the last one
+_ROUNDS = 5  # of whitening and noise levels ...
+_SETTLED = 2e-2  # ... until they change by less than that
+_ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends a round, and the last one
 _TOO_STIFF = 1e10  # damping at which no step lowers the cost any more
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
 _STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
@@ -100,9 +100,12 @@ class OutputError:
 
     Attributes:
         whitens: Whether the residual's correlation is estimated and taken out.
+        most: Largest correlation of one sample with the next that is taken out, shape (n,): beyond
+            the loop's own, whitening takes away what the loop shows. 0.95 if None.
         rows: Further rows [A b] that A theta = b should fit, unit weight, shape (m, c + 1), as
             those of torques; none if None.
         steps: Most steps in a round.
+        rounds: Most rounds.
         progress: Told of the steps.
 
     References:
@@ -111,8 +114,10 @@ class OutputError:
     """
 
     whitens: bool = True
+    most: Array | None = None
     rows: Array | None = None
     steps: int = _STEPS
+    rounds: int = _ROUNDS
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, simulator: Simulator, start: Array) -> Estimate:
@@ -128,7 +133,7 @@ class OutputError:
         """
         theta = np.maximum(np.array(start, dtype=float), simulator.lowest)
         weights, rounds, count, converged = self.weights(simulator, theta), 0, 0, False
-        for rounds in range(1, _ROUNDS + 1):
+        for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
             theta, steps, converged = self._descend(simulator, weights, theta, close)
             count += steps
@@ -149,11 +154,12 @@ class OutputError:
         found = simulator.residuals(theta, with_slopes=False)
         n = 1 + max(int(r.joints.max()) for r in found)
         rho, sigma = np.zeros(n), np.ones(n)
+        most = np.full(n, _MOST_RHO) if self.most is None else self.most
         for j in range(n):
             own = [r.e[:, k] for r in found for k in np.flatnonzero(r.joints == j)]
             if self.whitens:
                 along = sum(float(x[1:] @ x[:-1]) for x in own)
-                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, _MOST_RHO)
+                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, most[j])
             size = sum(len(x) - 1 for x in own)
             level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
             sigma[j] = max(level, 1e-12)

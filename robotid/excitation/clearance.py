@@ -24,13 +24,15 @@ __all__ = ["Box", "Clearance", "Contact", "Nearness"]
 
 _TRIED = 400  # random poses that say which links may meet at all
 _APART = 0.05  # [m] links that stay so far apart at all of them are looked at in the end alone
-_MADE_TO = 0.95  # share of the poses: links that are too near in so many are made to
-_ROOM = 5e-3  # [m] beyond the clearance that links must have to move at all
+_ALMOST_ALL = 0.95  # share of the poses
+_TOUCH = 1e-3  # [m] hulls nearer than this touch
+_ROOM = 5e-3  # [m] beyond the clearance: links that have no more are built near each other
 _THINNEST = 1e-3  # [m] a flat shape is as thick
 _FIRST = 0.05  # [s] the intervals that a motion is first looked at in ...
 _SHORTEST = 1e-3  # [s] ... and the shortest that they are halved to
 _SURE = 5e-4  # [m] by which a lower bound may be too low
 _WIDE = 100.0  # [m] extent of the floor
+_SIGNS = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T  # corners of a box, (8, 3)
 
 
 @dataclass(frozen=True)
@@ -57,12 +59,19 @@ class Contact:
         second: Name of the other.
         distance: Between their hulls, below 0 if they overlap [m].
         time: When [s].
+        kept: Distance that is to be kept between them [m].
     """
 
     first: str
     second: str
     distance: float
     time: float
+    kept: float = 0.0
+
+    @property
+    def margin(self) -> float:
+        """How much farther apart they stay than they have to [m]."""
+        return self.distance - self.kept
 
     def __str__(self) -> str:
         said = f"come to {1e3 * self.distance:.0f} mm" if self.distance > 0 else "overlap"
@@ -95,11 +104,17 @@ class _Hull:
     centre: Array
     radius: float
     half: Array  # of the box around it, in that frame, shape (3,)
+    corners: Array  # about the centre, shape (k, 3)
     shape: Any  # of coal, about the centre
 
 
 class Clearance:
     """What keeps a robot from hitting itself and what stands around it.
+
+    Links that a joint joins are not looked at. Of other links the hulls of two may touch where the
+    robot stands at zero and in 95 % of random poses: they are made to, and left alone. Links that
+    are built near each other, without room for the clearance in 95 % of the poses, but that come
+    apart, are watched at half the distance that they usually have.
 
     Args:
         model: The robot, with a fixed base.
@@ -107,13 +122,18 @@ class Clearance:
         floor: Height below which nothing that moves may go, in the frame of the root link [m].
         boxes: What stands around the robot.
         seed: Of the random poses that say which links may meet.
+        is_fast: Whether hulls that are far enough apart are left out by compiled code, which needs
+            the extra ``fast``; what is near has the same distances.
 
     Attributes:
         pairs: Numbers of the two hulls of each pair.
         likely: Which pairs may meet within the limits, shape (pairs,), bool.
+        kept: Distance that each pair is to keep, shape (pairs,) [m].
+        room: How much more than that pairs that are built near each other usually have, shape
+            (pairs,) [m]; inf of the others.
         unread: Links of which a shape cannot be read: nothing keeps them from hitting anything.
-        made_to: Links that are nearer, or within 5 mm of it, in almost every pose, by two, and are
-            left to it.
+        made_to: Links that are made to touch and left alone, by two, with their least distance.
+        built_near: Links that are built near each other, by two, with the distance they keep.
 
     Raises:
         DataError: If no link has a shape that can be read.
@@ -128,12 +148,14 @@ class Clearance:
         floor: float | None = None,
         boxes: Sequence[Box] = (),
         seed: int = 0,
+        is_fast: bool = False,
     ) -> None:
         import coal
 
         if not least >= 0:
             raise SettingsError(f"clearance is {least}, wanted 0 m or more")
         self.least, self._model, self._regressor = least, model, MotionRegressor(model)
+        self._is_fast = is_fast
         self._ratios = model.velocity_map[self._regressor.places]  # of joints by body, (m, n)
         clouds, self.unread = link_clouds(model)
         if not clouds:
@@ -148,7 +170,7 @@ class Clearance:
             self._hulls.append(_hull(below.name, -1, _corners(below)))
         self._request = coal.DistanceRequest(True, True)
         self.pairs = self._possible_pairs()
-        self.likely = self._likely(np.random.default_rng(seed))
+        self._sort_out(np.random.default_rng(seed))
 
     def _possible_pairs(self) -> Array:
         """Return pairs that can move against each other: not links that a joint joins."""
@@ -162,22 +184,39 @@ class Clearance:
                 found.append((i, j))
         return np.array(found, dtype=int).reshape(-1, 2)
 
-    def _likely(self, rng: np.random.Generator) -> Array:
-        """Return which pairs may meet, by random poses; those that always do are taken out."""
+    def _sort_out(self, rng: np.random.Generator) -> None:
+        """Find by random poses which pairs may meet, are made to, or are built near each other."""
         low = [j.lower if j.has_limits else -np.pi for j in self._model.limits]
         high = [j.upper if j.has_limits else np.pi for j in self._model.limits]
-        q = rng.uniform(low, high, (_TRIED, len(low)))
-        near = self.near(self.poses(q), self.least + _APART, self.everything)
-        distance = near.distance
+        q = np.vstack([np.clip(0.0, low, high), rng.uniform(low, high, (_TRIED, len(low)))])
+        distance = self.near(self.poses(q), self.least + _APART, self.everything).distance
         is_link = np.array([hull.name in self._model.tree.links for hull in self._hulls])
-        always: Array = (distance < self.least + _ROOM).mean(axis=1) > _MADE_TO
-        always &= is_link[self.pairs].all(axis=1)
-        names = self.named
-        self.made_to = [" and ".join(names[k]) for k in np.flatnonzero(always)]
-        likely = distance.min(axis=1, initial=np.inf) < self.least + _APART
-        self.pairs = self.pairs[~always]
-        kept: Array = likely[~always]
-        return kept
+        are_links = np.all(is_link[self.pairs], axis=1)
+        touch = np.less(distance, _TOUCH)
+        always = are_links & touch[:, 0] & (touch.mean(axis=1) > _ALMOST_ALL)
+        self.made_to = self._listed(always, distance.min(axis=1))
+        self.pairs, distance, touch = self.pairs[~always], distance[~always], touch[~always]
+        near = (distance < self.least + _ROOM).mean(axis=1) > _ALMOST_ALL
+        near &= are_links[~always] & ~touch.all(axis=1)
+        self.kept, self.room = np.full(len(near), self.least), np.full(len(near), np.inf)
+        for k in np.flatnonzero(near):
+            usual = float(np.median(distance[k, ~touch[k]]))
+            self.kept[k] = min(self.least, usual / 2)
+            self.room[k] = usual - self.kept[k]
+        self.built_near = self._listed(near, self.kept)
+        apart = self.kept + np.minimum(_APART, self.room / 2)
+        self.likely = distance.min(axis=1, initial=np.inf) < apart
+
+    def _listed(self, chosen: Array, distance: Array) -> list[str]:
+        """Return the links of pairs and their least distances, in words, each two once."""
+        least: dict[tuple[str, str], float] = {}
+        for k in np.flatnonzero(chosen).tolist():
+            names = self.named[k]
+            least[names] = min(least.get(names, np.inf), float(distance[k]))
+        return [
+            f"{a} and {b} ({'overlap by ' * (d < 0)}{abs(1e3 * d):.0f} mm)"
+            for (a, b), d in least.items()
+        ]
 
     @cached_property
     def _supports(self) -> Array:
@@ -207,47 +246,57 @@ class Clearance:
         G, shift = self._model.velocity_map, self._model.position_offset
         return self._regressor.poses(q @ G.T + shift)
 
-    def near(self, poses: Poses, within: float | Array, chosen: Array | None = None) -> Nearness:
+    def near(
+        self,
+        poses: Poses,
+        within: float | Array,
+        chosen: Array | None = None,
+        hints: Array | None = None,
+    ) -> Nearness:
         """Return the distances of pairs along a motion, exact where they are near.
 
         Args:
             poses: Where the bodies are at N instants.
-            within: Distance from which a lower bound will do, one or one per instant [m].
+            within: Distance from which a lower bound will do, one, or one per pair and instant,
+                shape (pairs, N) or one that broadcasts to it [m].
             chosen: Which pairs to look at, shape (pairs,), bool; those that may meet if None.
+            hints: Directions that parted the hulls before, shape (pairs, N, 3), 0 at first; the
+                better they are, the faster it goes. Those found are written to it.
         """
         import coal
 
         chosen = self.likely if chosen is None else chosen
-        centres, turns = self._placed(poses)  # (hulls, N, 3), (hulls, N, 3, 3)
-        radii = np.array([hull.radius for hull in self._hulls])
-        i, j = self.pairs.T
-        bound = np.full((len(self.pairs), centres.shape[1]), np.inf)
-        gap = np.linalg.norm(centres[i[chosen]] - centres[j[chosen]], axis=2)
-        bound[chosen] = gap - (radii[i] + radii[j])[chosen, None]
-        pairs, samples = np.nonzero(bound < within)
-        limit = np.broadcast_to(within, len(gap[0]))[samples]
-        bound[pairs, samples] = self._box_bound(centres, turns, self.pairs[pairs], samples)
-        is_near = bound[pairs, samples] < limit
-        pairs, samples = pairs[is_near], samples[is_near]
-        witness = np.empty((2, len(pairs), 3))
-        normals, result = np.empty((len(pairs), 3)), coal.DistanceResult()
-        placed = {}
-        for k, (pair, sample) in enumerate(zip(pairs.tolist(), samples.tolist(), strict=True)):
-            two = []
-            for hull in self.pairs[pair].tolist():
-                at = hull, sample
-                if at not in placed:
-                    placed[at] = coal.Transform3s(turns[at], centres[at])
-                two += [self._hulls[hull].shape, placed[at]]
+        bound = np.full((len(self.pairs), poses.p.shape[2]), np.inf)
+        limit = np.broadcast_to(within, bound.shape)
+        hints = np.zeros((*bound.shape, 3)) if hints is None else hints
+        if self._is_fast:
+            from robotid.excitation.gap_lanes import lower_bounds  # imports Numba
+
+            numbers, enough = np.flatnonzero(chosen), np.array(limit, order="C")
+            lower_bounds(
+                numbers, self.pairs, enough, hints, bound, poses.R, poses.p, *self._corners
+            )
+        else:
+            bound[chosen] = self._bounds(poses, self.pairs[chosen], limit[chosen], hints[chosen])
+        pairs, samples = np.nonzero(bound < limit)
+        hulls = self.pairs[pairs].T  # (2, k)
+        centres, turns = self._placed(poses, hulls.ravel(), np.tile(samples, 2))
+        shapes = [self._hulls[k].shape for k in hulls.ravel().tolist()]
+        placed = [coal.Transform3s(R, x) for R, x in zip(turns, centres, strict=True)]
+        count, result, exact = len(pairs), coal.DistanceResult(), np.empty(len(pairs))
+        witness, normals = np.empty((2, count, 3)), np.empty((count, 3))
+        for k in range(count):
+            one, other = (shapes[k], placed[k]), (shapes[count + k], placed[count + k])
             result.clear()
-            bound[pair, sample] = coal.distance(*two, self._request, result)
+            exact[k] = coal.distance(*one, *other, self._request, result)
             witness[:, k] = result.getNearestPoint1(), result.getNearestPoint2()
             normals[k] = result.normal
+        bound[pairs, samples], hints[pairs, samples] = exact, normals
         gradient = self._gradient(poses, pairs, samples, witness, normals)
         return Nearness(bound, pairs, samples, gradient)
 
     def nearest(self, motion: Motion, duration: float) -> Contact | None:
-        """Return where a motion comes nearest to a collision, between any samples, too.
+        """Return where a motion has the least margin to a collision, between any samples, too.
 
         An interval of time is halved until no two hulls can come nearer within it, by what the
         joints between them can still move them, than by 1 mm what has been seen elsewhere.
@@ -257,13 +306,13 @@ class Clearance:
             duration: Its length [s].
 
         Returns:
-            The nearest pair with a lower bound of its distance; None if nothing comes nearer than
-            5 cm beyond the clearance.
+            The pair with the least margin, by a lower bound of its distance; None if all of them
+            keep 5 cm more than they have to.
 
         References:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
         """
-        seen = self.least + _APART
+        seen, kept = _APART, self.kept[:, None]  # seen: the least margin so far
         lowest: Contact | None = None
         h = duration / max(2, round(duration / _FIRST)) / 2
         middles = np.arange(h, duration, 2 * h)
@@ -273,16 +322,17 @@ class Clearance:
             q, v, _ = motion.evaluate(middles)
             way = np.abs(v @ self._ratios.T) * h + fastest * h**2 / 2  # of each joint, (N, m)
             moved = self._levers @ way.T  # (pairs, N)
-            near = self.near(self.poses(q), seen + moved.max(axis=0), self.everything)
-            exact = near.distance[near.pairs, near.samples]
+            near = self.near(self.poses(q), kept + seen + moved, self.everything)
+            exact = near.distance[near.pairs, near.samples] - self.kept[near.pairs]
             seen = min(seen, exact.min(initial=np.inf))
-            bound = near.distance - moved
+            bound = near.distance - kept - moved
             is_open = (bound < seen - _SURE).any(axis=0) & (2 * h > _SHORTEST)
             closed = np.where(is_open, np.inf, bound)
             pair, sample = np.unravel_index(np.argmin(closed), closed.shape)
             found = float(closed[pair, sample])
-            if found < (seen if lowest is None else lowest.distance):
-                lowest = Contact(*self.named[pair], found, float(middles[sample]))
+            if found < (seen if lowest is None else lowest.margin):
+                own = float(self.kept[pair])
+                lowest = Contact(*self.named[pair], found + own, float(middles[sample]), own)
             h /= 2
             middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
         return lowest
@@ -307,6 +357,51 @@ class Clearance:
                     body = int(tree.parents[body + 1]) - 1
         return out
 
+    def _bounds(self, poses: Poses, pairs: Array, limit: Array, hints: Array) -> Array:
+        """Return lower bounds of distances by spheres, where too low by boxes, then by hints.
+
+        Args:
+            poses: Where the bodies are.
+            pairs: Numbers of two hulls, shape (k, 2).
+            limit: What a bound need not exceed, shape (k, N) [m].
+            hints: Directions that may part the hulls, shape (k, N, 3).
+        """
+        N, count = limit.shape[1], len(self._hulls)
+        every = np.repeat(np.arange(count), N), np.tile(np.arange(N), count)
+        placed = self._placed(poses, *every)
+        centres, turns = placed[0].reshape(count, N, 3), placed[1].reshape(count, N, 3, 3)
+        i, j = pairs.T
+        radii = np.array([hull.radius for hull in self._hulls])
+        bound: Array = np.linalg.norm(centres[i] - centres[j], axis=2)
+        bound -= (radii[i] + radii[j])[:, None]
+        k, samples = np.nonzero(bound < limit)
+        bound[k, samples] = self._box_bound(centres, turns, pairs[k], samples)
+        k, samples = np.nonzero((bound < limit) & hints.any(axis=2))
+        way = hints[k, samples]  # from the first hull to the second
+        i, j = pairs[k].T
+        gap = np.einsum("kc,kc->k", way, centres[j, samples] - centres[i, samples])
+        gap -= self._reach(i, turns[i, samples], way) + self._reach(j, turns[j, samples], -way)
+        bound[k, samples] = np.maximum(bound[k, samples], gap)
+        return bound
+
+    def _reach(self, hulls: Array, turns: Array, ways: Array) -> Array:
+        """Return how far k hulls reach from their middles along directions, shape (k,) [m]."""
+        own = np.einsum("kba,kb->ka", turns, ways)
+        out = np.empty(len(hulls))
+        for hull in np.unique(hulls):
+            rows = hulls == hull
+            out[rows] = (own[rows] @ self._hulls[hull].corners.T).max(axis=1)
+        return out
+
+    @cached_property
+    def _corners(self) -> tuple[Array, ...]:
+        """The hulls as ``lower_bounds`` takes them."""
+        hulls = self._hulls
+        starts = np.cumsum([0, *(len(hull.corners) for hull in hulls)])
+        of_each = zip(*[(h.body, h.centre, h.radius, h.half) for h in hulls], strict=True)
+        points = np.vstack([hull.corners for hull in hulls])
+        return *map(np.array, of_each), points, starts
+
     def _box_bound(self, centres: Array, turns: Array, pairs: Array, samples: Array) -> Array:
         """Return lower bounds of distances by the boxes around hulls, shape (k,) [m].
 
@@ -323,17 +418,15 @@ class Clearance:
         apart: Array = (np.abs(axes @ way[:, :, None])[..., 0] - shadow).max(axis=1)
         return apart
 
-    def _placed(self, poses: Poses) -> tuple[Array, Array]:
-        """Return where the centres of hulls are, and how they are turned."""
-        N = poses.p.shape[2]
-        centres, turns = np.empty((len(self._hulls), N, 3)), np.empty((len(self._hulls), N, 3, 3))
-        for k, hull in enumerate(self._hulls):
-            if hull.body < 0:
-                centres[k], turns[k] = hull.centre, np.eye(3)
-                continue
-            R = np.moveaxis(poses.R[:, :, hull.body], -1, 0)
-            centres[k], turns[k] = poses.p[:, hull.body].T + R @ hull.centre, R
-        return centres, turns
+    def _placed(self, poses: Poses, hulls: Array, samples: Array) -> tuple[Array, Array]:
+        """Return where centres of k hulls are at k instants, (k, 3), and how they are turned."""
+        bodies = np.array([hull.body for hull in self._hulls])[hulls]
+        middles = np.array([hull.centre for hull in self._hulls])[hulls]
+        turns = np.moveaxis(poses.R[:, :, bodies, samples], -1, 0)  # (k, 3, 3)
+        centres = poses.p[:, bodies, samples].T + (turns @ middles[..., None])[..., 0]
+        stands = bodies < 0
+        turns = np.where(stands[:, None, None], np.eye(3), turns)
+        return np.where(stands[:, None], middles, centres), np.ascontiguousarray(turns)
 
     def _gradient(
         self, poses: Poses, pairs: Array, samples: Array, witness: Array, normals: Array
@@ -343,9 +436,9 @@ class Clearance:
         bodies = np.array([hull.body for hull in self._hulls])[self.pairs[pairs]]  # (k, 2)
         out = np.zeros((len(pairs), linear.shape[1]))
         for side, sign in ((0, -1.0), (1, 1.0)):
-            x = witness[side]  # (k, 3)
-            velocity = linear + np.cross(angular, x.T[:, None], axis=0)
-            along = np.einsum("cjk,kc->kj", velocity, normals)
+            turning = np.cross(witness[side], normals)  # n . (w x p) = w . (p x n)
+            along = np.einsum("cjk,kc->kj", linear, normals)
+            along += np.einsum("cjk,kc->kj", angular, turning)
             out += sign * np.where(self._supports[bodies[:, side]], along, 0.0)
         by_joint: Array = out @ self._ratios
         return by_joint
@@ -354,21 +447,24 @@ class Clearance:
 def _hull(name: str, body: int, points: Array) -> _Hull:
     """Return the convex hull of points; a flat one as the box around it."""
     import coal
+    from scipy.spatial import ConvexHull
 
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     about = points - centre
     radius = float(np.linalg.norm(about, axis=1).max())
     extent = np.ptp(about, axis=0)  # the centre is the middle of it
-    if np.linalg.matrix_rank(about, tol=_THINNEST) < 3:
-        extent = np.maximum(extent, _THINNEST)
-        return _Hull(name, body, centre, radius + _THINNEST, extent / 2, coal.Box(*extent))
-    if len(points) == 8 and np.allclose(np.abs(about), extent / 2):
-        return _Hull(name, body, centre, radius, extent / 2, coal.Box(*extent))
-    corners = coal.StdVec_Vec3s()
-    for corner in np.unique(np.round(about, 6), axis=0):
-        corners.append(corner)
-    shape = coal.ConvexBase.convexHull(corners, False, "Qt")
-    return _Hull(name, body, centre, radius, extent / 2, shape)
+    is_flat = np.linalg.matrix_rank(about, tol=_THINNEST) < 3
+    if is_flat or (len(points) == 8 and np.allclose(np.abs(about), extent / 2)):
+        extent, radius = np.maximum(extent, _THINNEST), radius + is_flat * _THINNEST
+        corners = _SIGNS * extent / 2
+        return _Hull(name, body, centre, radius, extent / 2, corners, coal.Box(*extent))
+    corners = np.unique(np.round(about, 6), axis=0)
+    corners = corners[ConvexHull(corners).vertices]
+    listed_ones = coal.StdVec_Vec3s()
+    for corner in corners:
+        listed_ones.append(corner)
+    shape = coal.ConvexBase.convexHull(listed_ones, False, "Qt")
+    return _Hull(name, body, centre, radius, extent / 2, corners, shape)
 
 
 def _corners(box: Box) -> Array:

@@ -12,8 +12,6 @@ from robotid.excitation.limits import LIMITS, MotionLimits
 
 __all__ = ["Course"]
 
-_RATE = 100.0  # [Hz] of the instants of a designed motion that are looked at ...
-_FEWEST = 400  # ... of which there are so many at least
 _MOST = 1000  # at which distances are looked at
 _LOOKED_AT = 20  # instants that say which distances change ...
 _STILL = 1e-4  # [m] ... by more than this
@@ -38,14 +36,15 @@ class Course:
 
     @classmethod
     def of_design(cls, designer: Designer, design: Design) -> "Course":
-        """Return the course of a designed motion, with the torque that its design assumes.
+        """Return the course of a designed motion at the instants at which its limits were checked.
+
+        The torque is the one that its design assumes.
 
         Args:
             designer: What it was designed for.
             design: The motion.
         """
-        count = max(round(_RATE * design.duration), _FEWEST)
-        t = np.linspace(0.0, design.duration, count + 1)
+        t = np.linspace(0.0, design.duration, design.intervals + 1)
         q, v, a = design.motion.evaluate(t)
         torque = designer.information.torque(designer.information.rows(q, v, a))
         return cls.of_motion(t, (q, v, a, torque), designer.limits, designer.clearance)

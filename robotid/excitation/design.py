@@ -27,6 +27,7 @@ from robotid.identification.previews import (
     assumed_parameters,
     largest_torques,
 )
+from robotid.regressor.adjoint import Poses
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -35,24 +36,29 @@ from robotid.simulation.motions import Motion
 
 __all__ = ["Design", "Designer"]
 
-_PER_PERIOD = 20  # instants within the shortest period of a basis that a design looks at
-_POLISHED = 2  # times as many that its last rounds look at ...
-_FINER = 10  # ... and at which its limits are checked in the end
+_PER_PERIOD = 14  # instants within the shortest period of a basis that a design looks at
+_POLISHED = 3  # times as many that its last rounds look at ...
+_FINER = 15  # ... and at which its limits are checked in the end
 _ROUNDS = 14  # of the augmented Lagrangian ...
-_LAST_ROUNDS = 4  # ... and on the finer grid
+_LAST_ROUNDS = 8  # ... and on the finer grid
 _STEPS = 20  # of L-BFGS in each
 _WEIGHT = 3.0  # of what is violated at all instants together, at first
 _GROWTH = 3.0  # of that from one round to the next
-_SETTLED = 1e-3  # change of the criterion below which a design has converged
+_LESS = 0.25  # of what a round broke: more weight is put on it if the next one breaks more
+_NEARLY = 1e-2  # change of the criterion from which on the finer grid is used ...
+_SETTLED = 2e-3  # ... and below which a design has converged
 _LOST = 0.02  # of the criterion that may be lost where a motion is made to keep its limits
 _OVER = 1.01  # share of a limit up to which a design that settled may use it before it is scaled
-_HALVINGS = 10  # until the largest share of a motion that keeps the limits is known
+_TRIALS = 10  # of shares of a motion, until the largest that keeps the limits is known ...
+_SHARE = 1e-3  # ... to within this, or as near to a limit
 _SPARE = 0.003  # of limits that a design leaves for what lies between its instants
 _SPARE_WAY = 0.002  # [m] the same of distances
-_NEAR = 0.03  # [m] beyond the clearance from which a pair of links has a part in the design
+_SPARE_ROOM = 0.25  # of the room that links have which are built near each other: at most that
+_SEEN = 0.01  # [m] short of which distances are reckoned where a motion is made to keep them
 _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
-_TRIED = 200  # random postures until one is found that the robot can rest in
+_TRIED = 200  # random postures until one is found that the robot can rest in ...
+_AT_ONCE = 10  # ... so many at a time
 _WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
 _STARTED = 10  # random motions of which the best is a start
 
@@ -64,6 +70,8 @@ class Design:
     Attributes:
         motion: The motion.
         duration: Its length [s].
+        intervals: Into how many equal ones it is divided by the instants at which its limits were
+            checked.
         objective: Its criterion, the smaller the better.
         condition: Condition number of the base problem, columns in units of what the URDF leaves
             open.
@@ -78,6 +86,7 @@ class Design:
 
     motion: Motion
     duration: float
+    intervals: int
     objective: float
     condition: float
     used: Array
@@ -134,6 +143,7 @@ class Designer:
         noise: Mapping[str, float] | None = None,
         correlation: float = CORRELATION,
         run: Run | None = None,
+        is_fast: bool = False,
     ) -> "Designer":
         """Return a designer that assumes of friction and noise what a preview does.
 
@@ -146,6 +156,7 @@ class Designer:
             noise: Standard deviation of the torque's noise by joint [N m or N].
             correlation: Time over which it is correlated [s].
             run: What was recorded before: the motion then tells what it did not.
+            is_fast: Whether compiled code is used, which needs the extra ``fast``.
 
         Raises:
             SettingsError: If a setting is unusable.
@@ -163,7 +174,7 @@ class Designer:
         if run is not None:
             told = run.factors.information(run.step / density)
             given = np.eye(len(spread)) + spread[:, None] * told * spread
-        information = MotionInformation(model, mapping, mapping.to_base(pi))
+        information = MotionInformation(model, mapping, mapping.to_base(pi), is_fast)
         return cls(
             information, limits, basis, density, spread, standard_spread, given, name, clearance
         )
@@ -182,7 +193,7 @@ class Designer:
         seconds: float = np.inf,
         progress: Callable[[int, float], None] | None = None,
     ) -> Design:
-        """Return the best motion that was found, checked on a ten times finer grid.
+        """Return the best motion that was found, checked on a grid 15 times as fine as at first.
 
         Args:
             rng: Source of the starts.
@@ -193,41 +204,41 @@ class Designer:
         Raises:
             SettingsError: If the robot cannot even rest within its limits.
         """
-        begun = time.monotonic()
+        begun, best = time.monotonic(), np.inf
         history: list[tuple[float, float]] = []
-        best = _Best()
+        followed: list[_State] = []
 
         def is_over() -> bool:
-            return best.coefficients is not None and time.monotonic() - begun > seconds
+            return bool(history) and time.monotonic() - begun > seconds
 
-        def follow(designer: Designer, C: Array, rounds: int, held: _Multipliers) -> bool:
-            """Follow a start; return whether it settled."""
-            is_settled = False
-            search = designer._search(C, rounds, is_over, held)
-            for kept, objective, is_settled in search:  # noqa: B007
-                if objective < best.objective:
-                    best.coefficients, best.objective, best.multipliers = kept, objective, held
-                    history.append((time.monotonic() - begun, objective))
+        def follow(designer: Designer, state: _State, rounds: int, settled: float) -> _State:
+            """Return what a start leads to."""
+            nonlocal best
+            for state in designer._search(state, rounds, settled, is_over):  # noqa: B020
+                if state.objective < best:
+                    best = state.objective
+                    history.append((time.monotonic() - begun, best))
                 if progress is not None:
-                    progress(done, best.objective)
-            return is_settled
+                    progress(len(followed), best)
+            return state
 
-        done = 0
-        while done < starts and not is_over():
+        while len(followed) < starts and not is_over():
             random = [self.random(rng) for _ in range(_STARTED)]
-            begin = min(random, key=lambda C: self._looked_at(C)[0])
-            follow(self, begin, _ROUNDS, _Multipliers(_WEIGHT / self._functions.shape[1]))
-            done += 1
-        chosen, best = best, _Best()
-        fine = replace(self, finer=_POLISHED * self.finer)
-        begin = fine._feasible(chosen.of(), 1.0 - _SPARE)
-        is_settled = follow(fine, begin, _LAST_ROUNDS, chosen.multipliers.finer(_POLISHED))
-        found = replace(self, finer=_FINER * self.finer).checked(best.of())
+            objective, k = min((self._objective(C), k) for k, C in enumerate(random))
+            held = _Multipliers(_WEIGHT / self._functions.shape[1])
+            begin = _State(random[k], objective, random[k], held)
+            followed.append(follow(self, begin, _ROUNDS, _NEARLY))
+        chosen = min(followed, key=lambda state: state.objective)
+        fine, best = replace(self, finer=_POLISHED * self.finer), np.inf
+        kept, held = fine._feasible(chosen.kept, 1.0 - _SPARE), chosen.multipliers.finer(_POLISHED)
+        begin = _State(kept, fine._objective(kept), chosen.away, held)
+        polished = follow(fine, begin, _LAST_ROUNDS, _SETTLED)
+        found = replace(self, finer=_FINER * self.finer).checked(polished.kept)
         return replace(
             found,
             seconds=time.monotonic() - begun,
-            starts=done,
-            is_converged=is_settled,
+            starts=len(followed),
+            is_converged=polished.is_settled,
             history=tuple(history),
         )
 
@@ -238,7 +249,7 @@ class Designer:
             C: Coefficients of a motion, shape (h, n).
         """
         C, contact = self._clear(self._feasible(C, 1.0))
-        _, used, _, rows = self._looked_at(C)
+        used, _, rows = self._kept(C)
         motion = DesignedMotion(self.basis, C)
         information = self.matrix(rows)
         return self._weighed(motion, self.basis.duration, information, used, contact)
@@ -265,10 +276,11 @@ class Designer:
             duration: Its length [s].
             rate: Instants per second at which it is looked at [Hz].
         """
-        q, v, a = motion.evaluate(np.arange(round(duration * rate) + 1) / rate)
+        count = round(duration * rate)
+        q, v, a = motion.evaluate(np.linspace(0.0, duration, count + 1))
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, 0.0 * a, self.information.torque(rows))
-        return used, self._informed(rows, 1.0 / rate)
+        return used, self._informed(rows, duration / count)
 
     def _weighed(
         self,
@@ -284,6 +296,7 @@ class Designer:
         return Design(
             motion=motion,
             duration=duration,
+            intervals=used.shape[1] - 1,
             objective=self.judged(information)[0],
             condition=float(np.sqrt(high / low)) if low > 0 else np.inf,
             used=np.abs(used).max(axis=1),
@@ -298,9 +311,9 @@ class Designer:
         """
         if self.clearance is None:
             return C, None
-        for _ in range(_HALVINGS):
+        for _ in range(_TRIALS):
             contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
-            if contact is None or contact.distance >= self.clearance.least:
+            if contact is None or contact.margin >= 0.0:
                 return C, contact
             C = _scaled(C, 0.99)
         raise NotConvergedError(
@@ -367,16 +380,45 @@ class Designer:
         F: Array = flat @ flat.T + self.known
         return F
 
-    def _looked_at(self, C: Array) -> tuple[float, Array, float, MotionRows]:
-        """Return criterion, shares of limits used (6, N, n), least distance and rows."""
+    @cached_property
+    def _hints(self) -> Array | None:
+        """Directions that parted hulls of the motion looked at last, shape (pairs, N, 3)."""
+        if self.clearance is None:
+            return None
+        return np.zeros((len(self.clearance.pairs), self._functions.shape[1], 3))
+
+    @cached_property
+    def _spare(self) -> Array:
+        """What is left of distances for what lies between instants, shape (pairs, 1) [m]."""
+        if self.clearance is None:
+            return np.zeros((0, 1))
+        return np.minimum(_SPARE_WAY, _SPARE_ROOM * self.clearance.room)[:, None]
+
+    def _kept(self, C: Array, spare: float = 0.0) -> tuple[Array, float, MotionRows]:
+        """Return shares of limits used (6, N, n), the least margin of distances and rows.
+
+        Args:
+            C: Coefficients of a motion, shape (h, n).
+            spare: How many times what distances spare is taken off the margin.
+        """
         q, v, a, jerk = self._functions @ C
         rows = self.information.rows(q, v, a)
         used = self.limits.used(q, v, a, jerk, self.information.torque(rows))
-        distance = np.inf
-        if self.clearance is not None:
-            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-            distance = float(near.distance.min(initial=np.inf))
-        return self.judged(self.matrix(rows))[0], used, distance, rows
+        return used, float(self._margins(rows.state, spare).min(initial=np.inf)), rows
+
+    def _margins(self, poses: Poses, spare: float) -> Array:
+        """Return margins of distances, shape (pairs, N) [m]; a lower bound of those over 1 cm."""
+        if self.clearance is None:
+            return np.zeros((0, poses.p.shape[2]))
+        kept = self.clearance.kept[:, None] + spare * self._spare
+        seen = np.minimum(_SEEN, self.clearance.room[:, None] / 4)
+        hints = self._hints if poses.p.shape[2] == self._functions.shape[1] else None
+        return self.clearance.near(poses, kept + seen, hints=hints).distance - kept
+
+    def _objective(self, C: Array) -> float:
+        """Return the criterion of a motion."""
+        q, v, a, _ = self._functions @ C
+        return self.judged(self.matrix(self.information.rows(q, v, a)))[0]
 
     def _lagrangian(self, C: Array, multipliers: "_Multipliers") -> tuple[float, Array]:
         """Return the augmented Lagrangian of a motion and its gradient, shape (h, n).
@@ -397,8 +439,9 @@ class Designer:
         by_torque = by_torque + by_power * v
         value += cost
         if self.clearance is not None:
-            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-            cost, pushed = multipliers.of_distances(near.distance, self.clearance.least)
+            aim = self._wanted
+            near = self.clearance.near(rows.state, multipliers.reach(aim), hints=self._hints)
+            cost, pushed = multipliers.of_distances(near.distance, aim)
             value += cost
             along = -pushed[near.pairs, near.samples, None] / _SOFT * near.gradient
             np.add.at(by_q, near.samples, along)
@@ -410,6 +453,13 @@ class Designer:
         gradient: Array = sum(functions.T @ g for functions, g in zip(D, by_motion, strict=True))
         gradient[1:, ~self._moves] = 0.0
         return value, gradient
+
+    @property
+    def _wanted(self) -> Array:
+        """Distances that the search aims at, shape (pairs, 1) [m]."""
+        if self.clearance is None:
+            return self._spare
+        return self.clearance.kept[:, None] + 2.0 * self._spare
 
     def random(self, rng: np.random.Generator) -> Array:
         """Return the coefficients of a random motion that keeps the limits, shape (h, n).
@@ -423,7 +473,7 @@ class Designer:
         n = len(self.limits.middle)
         C = rng.standard_normal((self.basis.size, n)) * self.limits.sizes[0]
         C[:, ~self._moves] = 0.0
-        C[0] = self.postures(rng)[0]
+        C[0] = self._posture(rng)
         return self._feasible(C, 1.0 - _SPARE)
 
     def postures(self, rng: np.random.Generator, tried: int = _TRIED) -> Array:
@@ -436,13 +486,30 @@ class Designer:
         Raises:
             SettingsError: If none of them does.
         """
-        reach = rng.uniform(-0.8, 0.8, (tried, len(self.limits.middle)))
-        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
-        q = self.limits.middle + reach * self.limits.sizes[0]
+        q = self._drawn(rng, tried)
         kept: Array = q[self.can_rest(q)]
         if not len(kept):
             raise SettingsError(self._why_not(*self._at_rest(q)))
         return kept
+
+    def _posture(self, rng: np.random.Generator) -> Array:
+        """Return the first of ``postures``, which are tried a few at a time, shape (n,)."""
+        for _ in range(_TRIED // _AT_ONCE):
+            q = self._drawn(rng, _AT_ONCE)
+            kept: Array = q[self.can_rest(q)]
+            if len(kept):
+                break
+        else:
+            kept = self.postures(rng)
+        first: Array = kept[0]
+        return first
+
+    def _drawn(self, rng: np.random.Generator, count: int) -> Array:
+        """Return random postures, shape (count, n) [rad or m]."""
+        reach = rng.uniform(-0.8, 0.8, (count, len(self.limits.middle)))
+        reach[:, self.limits.sizes[0] > 2.0] *= 0.6
+        q: Array = self.limits.middle + reach * self.limits.sizes[0]
+        return q
 
     def can_rest(self, q: Array) -> Array:
         """Return whether postures keep limits and distances at rest, shape (N,), bool.
@@ -450,23 +517,19 @@ class Designer:
         Args:
             q: Postures, shape (N, n) [rad or m].
         """
-        used, distance = self._at_rest(q)
-        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
-        can: Array = (used.max(axis=(0, 2)) <= 1.0) & (distance >= least)
+        used, margins = self._at_rest(q)
+        is_clear = (margins >= 0.0).all(axis=0)
+        can: Array = (used.max(axis=(0, 2)) <= 1.0) & is_clear
         return can
 
     def _at_rest(self, q: Array) -> tuple[Array, Array]:
-        """Return the shares of limits that postures use, (6, N, n), and least distances, (N,)."""
+        """Return shares of limits that postures use, (6, N, n), and margins, (pairs, N) [m]."""
         still = np.zeros_like(q)
         rows = self.information.rows(q, still, still)
         used = np.abs(self.limits.used(q, still, still, still, self.information.torque(rows)))
-        distance = np.full(len(q), np.inf)
-        if self.clearance is not None:
-            near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-            distance = near.distance.min(axis=0, initial=np.inf)
-        return used, distance
+        return used, self._margins(rows.state, 1.0)
 
-    def _why_not(self, used: Array, distance: Array) -> str:
+    def _why_not(self, used: Array, margins: Array) -> str:
         """Return which limit leaves no posture, and by how much."""
         least = used.min(axis=1)  # (6, n)
         kind, joint = np.unravel_index(int(np.argmax(least)), least.shape)
@@ -478,11 +541,16 @@ class Designer:
                 f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
                 "load that it carries"
             )
+        if self.clearance is None:
+            return f"{tried}: each needs more than a limit allows"
+        best = int(np.argmax(margins.min(axis=0)))
+        pair = int(np.argmin(margins[:, best]))
+        wanted = float(self.clearance.kept[pair] + self._spare[pair, 0])
+        first, second = self.clearance.named[pair]
         return (
-            f"{tried}: the nearest links or obstacles are at most "
-            f"{1e3 * float(distance.max()):.0f} mm apart, wanted "
-            f"{1e3 * (self.clearance.least if self.clearance else 0.0):.0f} mm; lower the "
-            "clearance, or move the floor and the boxes"
+            f"{tried}: in the best of them {first} and {second} are "
+            f"{1e3 * (float(margins[pair, best]) + wanted):.1f} mm apart, wanted "
+            f"{1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the boxes"
         )
 
     def _feasible(self, C: Array, most: float) -> Array:
@@ -506,71 +574,86 @@ class Designer:
             C: Where it ends.
             most: Share of the limits that may be used.
         """
-        least = -np.inf if self.clearance is None else self.clearance.least + _SPARE_WAY
-        low, high = 0.0, 1.0
-        for k in range(_HALVINGS):
-            share = 1.0 if k == 0 else (low + high) / 2
-            _, used, distance, _ = self._looked_at(kept + share * (C - kept))
-            is_kept = np.abs(used).max() <= most and distance >= least
-            low, high = (share, high) if is_kept else (low, share)
-            if low == 1.0:
+        way, low, high, share = C - kept, 0.0, 1.0, 1.0
+        under, over = -1.0, np.inf  # by how much limits are broken at both
+        for _ in range(_TRIALS):
+            used, margin, _ = self._kept(kept + share * way, 1.0)
+            broken = max(float(np.abs(used).max()) / most - 1.0, -margin / _SOFT)
+            if broken <= 0.0:
+                low, under, over = share, broken, over / 2
+            else:
+                high, over, under = share, broken, under / 2
+            if low == 1.0 or high - low < _SHARE or (low > 0.0 and under > -_SHARE):
                 break
-        return kept + low * (C - kept)
+            share = low + (high - low) * np.clip(under / (under - over), 0.02, 0.98)
+        return kept + low * way
 
     def _search(
-        self,
-        start: Array,
-        rounds: int,
-        is_over: Callable[[], bool],
-        multipliers: "_Multipliers",
-    ) -> Iterator[tuple[Array, float, bool]]:
-        """Yield motions that keep the limits, their criterion, and whether the search settled."""
+        self, state: "_State", rounds: int, settled: float, is_over: Callable[[], bool]
+    ) -> Iterator["_State"]:
+        """Yield where a search stands, at first and after each round, until it has settled."""
         from scipy.optimize import minimize
 
         unit = self.limits.sizes[0]
-        least = -np.inf if self.clearance is None else self.clearance.least
-        C = kept = start
+        before = np.inf  # by how much limits were broken
 
         def scaled(x: Array) -> tuple[float, Array]:
             if is_over():
                 raise _OutOfTime
-            value, gradient = self._lagrangian(x.reshape(C.shape) * unit, multipliers)
+            value, gradient = self._lagrangian(x.reshape(-1, len(unit)) * unit, state.multipliers)
             return value, (gradient * unit).reshape(-1)
 
-        before = self._looked_at(start)[0]
-        yield start, before, False
+        yield state
         for _ in range(rounds):
             try:
                 found = minimize(
                     scaled,
-                    (C / unit).reshape(-1),
+                    (state.away / unit).reshape(-1),
                     jac=True,
                     method="L-BFGS-B",
                     options={"maxiter": _STEPS, "maxcor": 20},
                 )
             except _OutOfTime:
                 return
-            C = found.x.reshape(C.shape) * unit
-            own, used, distance, rows = self._looked_at(C)
-            multipliers.raise_by(used)
-            if self.clearance is not None:
-                near = self.clearance.near(rows.state, self.clearance.least + _NEAR)
-                multipliers.raise_by_distances(near.distance, self.clearance.least)
-            is_near = np.abs(used).max() < _OVER and distance >= least
-            best, kept = kept, self._feasible(C, 1.0 - _SPARE)
-            objective = self._looked_at(kept)[0]
-            if objective > before - _SETTLED:
-                kept = self._towards(best, C, 1.0 - _SPARE)
-                objective = self._looked_at(kept)[0]
-            is_near &= objective - own < _LOST
-            is_settled = abs(before - objective) < _SETTLED and is_near
-            if not is_near and objective > before - _LOST:
-                C = kept  # the way from there leads farther
-            yield kept, objective, is_settled
-            if is_settled:
+            state, broken = self._judged(state, found.x.reshape(-1, len(unit)) * unit, settled)
+            if broken > _LESS * before:
+                state = replace(state, multipliers=state.multipliers.heavier())
+            before = broken
+            yield state
+            if state.is_settled:
                 return
-            before = objective
-            multipliers.weight *= _GROWTH
+
+    def _judged(self, state: "_State", C: Array, settled: float) -> tuple["_State", float]:
+        """Return where a search stands after a round, and by how much a limit is broken.
+
+        Args:
+            state: Where it stood before.
+            C: Where the round has led.
+            settled: Change of the criterion below which it has settled.
+        """
+        used, margin, rows = self._kept(C)
+        own = self.judged(self.matrix(rows))[0]
+        held = state.multipliers
+        distance = None
+        if self.clearance is not None:
+            reach = held.reach(self._wanted)
+            distance = self.clearance.near(rows.state, reach, hints=self._hints).distance
+        kept = self._feasible(C, 1.0 - _SPARE)
+        objective = self._objective(kept)
+        if objective > state.objective - settled:
+            mixed = self._towards(state.kept, C, 1.0 - _SPARE)
+            objective, kept = min(
+                [(objective, kept), (self._objective(mixed), mixed)], key=lambda pair: pair[0]
+            )
+        gain = state.objective - objective
+        is_near = np.abs(used).max() < _OVER and margin >= 0.0 and objective - own < _LOST
+        is_lost = not is_near and gain < _LOST  # the way from what keeps the limits leads farther
+        if gain < 0.0:
+            kept, objective = state.kept, state.objective
+        broken = max(float(np.abs(used).max()) - 1.0 + _SPARE, -margin / _SOFT, 0.0)
+        held = held.raised(used, distance, self._wanted)
+        is_settled = bool(is_near and gain < settled)
+        return _State(kept, objective, kept if is_lost else C, held, is_settled), broken
 
 
 def _gravity(model: RobotModel) -> Array:
@@ -586,55 +669,69 @@ class _OutOfTime(Exception):
     """The time of a design is over."""
 
 
-class _Best:
-    """The best motion so far."""
-
-    coefficients: Array | None = None
-    objective: float = np.inf
-    multipliers: "_Multipliers"
-
-    def of(self) -> Array:
-        """Return its coefficients."""
-        if self.coefficients is None:
-            raise NotConvergedError("no motion was looked at", "max_iterations")
-        return self.coefficients
-
-
+@dataclass(frozen=True, eq=False)
 class _Multipliers:
-    """Multipliers of the limits at each instant, and of distances."""
+    """Multipliers of the limits at each instant, and of distances.
 
-    def __init__(self, weight: float) -> None:
-        self.weight = weight
-        self._limits: Array | float = 0.0
-        self._distances: Array | float = 0.0
+    Attributes:
+        weight: Of what is violated.
+        limits: Shape (6, N, n); 0 at first.
+        distances: Shape (pairs, N).
+    """
+
+    weight: float
+    limits: Array | float = 0.0
+    distances: Array | float = 0.0
 
     def finer(self, times: int) -> "_Multipliers":
         """Return the same on a grid of as many times the instants."""
-        fine = _Multipliers(self.weight / times)
-        fine._limits = _between(self._limits, times)
-        fine._distances = _between(self._distances, times)
-        return fine
+        limits, distances = _between(self.limits, times), _between(self.distances, times)
+        return _Multipliers(self.weight / times, limits, distances)
+
+    def heavier(self) -> "_Multipliers":
+        """Return the same with more weight."""
+        return replace(self, weight=_GROWTH * self.weight)
+
+    def raised(self, used: Array, distance: Array | None, aim: Array) -> "_Multipliers":
+        """Return the slopes as the new multipliers."""
+        distances = 0.0 if distance is None else self.of_distances(distance, aim)[1]
+        return replace(self, limits=self.of_limits(used)[1], distances=distances)
 
     def of_limits(self, used: Array) -> tuple[float, Array]:
         """Return the cost of limits and its slope by what they are over, shape (6, N, n)."""
-        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self._limits)
+        return self._cost(used**2 / (1.0 - _SPARE) ** 2 - 1.0, self.limits)
 
-    def of_distances(self, distance: Array, least: float) -> tuple[float, Array]:
+    def of_distances(self, distance: Array, aim: Array) -> tuple[float, Array]:
         """Return the cost of distances and its slope by what they are short, shape (pairs, N)."""
-        return self._cost((least + 2 * _SPARE_WAY - distance) / _SOFT, self._distances)
+        return self._cost((aim - distance) / _SOFT, self.distances)
+
+    def reach(self, aim: Array) -> Array:
+        """Return the distances from which there is no cost, shape (pairs, N) or (pairs, 1) [m]."""
+        return aim + _SOFT / self.weight * self.distances
 
     def _cost(self, over: Array, multipliers: Array | float) -> tuple[float, Array]:
         pushed = np.maximum(0.0, multipliers + self.weight * over)
         cost = float(np.sum(pushed**2 - np.square(multipliers))) / (2 * self.weight)
         return cost, pushed
 
-    def raise_by(self, used: Array) -> None:
-        """Take the slopes as the new multipliers."""
-        self._limits = self.of_limits(used)[1]
 
-    def raise_by_distances(self, distance: Array, least: float) -> None:
-        """Take the slopes as the new multipliers."""
-        self._distances = self.of_distances(distance, least)[1]
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where a search stands.
+
+    Attributes:
+        kept: Coefficients of the best motion that keeps the limits, shape (h, n).
+        objective: Its criterion.
+        away: Where the search goes on; it may break limits.
+        multipliers: Those of the limits.
+        is_settled: Whether more rounds change nothing.
+    """
+
+    kept: Array
+    objective: float
+    away: Array
+    multipliers: _Multipliers
+    is_settled: bool = False
 
 
 def _scaled(C: Array, share: float | Array) -> Array:

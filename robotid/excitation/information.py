@@ -2,16 +2,21 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.regressor.adjoint import MotionRegressor, RegressorState
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.columns import drive_motion
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 __all__ = ["CRITERIA", "Aim", "MotionInformation", "MotionRows", "criterion"]
 
@@ -46,22 +51,26 @@ class MotionInformation:
         model: The robot, with a fixed base.
         mapping: Its base parameters.
         beta: Base parameters that torques are reckoned by, shape (b,).
+        is_fast: Whether the rows are computed by compiled code, as of ``MotionRegressor``.
     """
 
     model: RobotModel
     mapping: BaseMapping
     beta: Array
+    is_fast: bool = False
     _regressor: MotionRegressor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         wanted = (len(self.mapping.independent),)
         if self.beta.shape != wanted:
             raise DataError(f"beta has shape {self.beta.shape}, wanted {wanted}")
-        object.__setattr__(self, "_regressor", MotionRegressor(self.model))
+        object.__setattr__(self, "_regressor", MotionRegressor(self.model, is_fast=self.is_fast))
 
     @cached_property
-    def _entries(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Which entry of which pair stands in which row and column, and times what."""
+    def _gather(self) -> "csr_array":
+        """What makes the rows, (n b, N), of the entries of all pairs, (pairs 10, N): sparse."""
+        from scipy.sparse import csr_array
+
         size = self.model.layout.n_inertial
         places, bodies = self._regressor.pairs
         kept = self.mapping.independent
@@ -71,9 +80,15 @@ class MotionInformation:
             for pair in np.flatnonzero(bodies == body):
                 for row in np.flatnonzero(self.model.velocity_map[places[pair]]):
                     factor = self.model.velocity_map[places[pair], row]
-                    found.append((row, column, pair, entry, factor))
-        rows, columns, pairs, entries, factors = map(np.array, zip(*found, strict=True))
-        return rows, columns, pairs, entries, factors
+                    found.append((factor, row * len(kept) + column, 10 * pair + entry))
+        factors, to, source = map(np.array, zip(*found, strict=True))
+        shape = (len(self.model.joints) * len(kept), 10 * len(bodies))
+        return csr_array((factors, (to, source)), shape=shape)
+
+    @cached_property
+    def _scatter(self) -> "csr_array":
+        """The transpose of ``_gather``."""
+        return self._gather.T.tocsr()
 
     @cached_property
     def _drives(self) -> tuple[Array, Array]:
@@ -81,6 +96,17 @@ class MotionInformation:
         size = self.model.layout.n_inertial
         columns = np.flatnonzero(self.mapping.independent >= size)
         return columns, self.mapping.independent[columns] - size
+
+    @cached_property
+    def _terms(self) -> list[tuple[DriveTerm, list[int], list[int]]]:
+        """Each term of the kept drive parameters, which of those it has, and their drives."""
+        found: dict[DriveTerm, tuple[list[int], list[int]]] = {}
+        for k, parameter in enumerate(self._drives[1]):
+            drive, term = self.model.layout.drive_parameters[parameter]
+            places, drives = found.setdefault(term, ([], []))
+            places.append(k)
+            drives.append(drive)
+        return [(term, *places) for term, places in found.items()]
 
     def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
         """Return the rows along a motion of N instants.
@@ -92,10 +118,9 @@ class MotionInformation:
         """
         G = self.model.velocity_map
         state = self._regressor(q @ G.T + self.model.position_offset, v @ G.T, a @ G.T)
-        W = np.zeros((len(self.model.joints), len(self.mapping.independent), len(q)))
-        rows, columns, pairs, entries, factors = self._entries
-        np.add.at(W, (rows, columns), factors[:, None] * state.rows[pairs, entries])
-        load = np.einsum("rcn,c->nr", W, self.beta)  # drive columns are still 0
+        flat = self._gather @ state.rows.reshape(-1, len(q))
+        W = flat.reshape(len(self.model.joints), -1, len(q))
+        load = (self.beta @ W).T  # drive columns are still 0
         columns, parameters = self._drives
         values = self._drive_values(self._drive_motion(q, v, a, load))
         W[:, columns] = self.model.layout.drive_loads[:, parameters, None] * values
@@ -109,14 +134,15 @@ class MotionInformation:
 
     def _turning(self, motion: DriveMotion) -> DriveMotion:
         """Return the motion of drives with the signs that its speeds have."""
-        speeds = motion.v / self.model.layout.drive_speeds[:, None]
+        speeds = (motion.v.T / self.model.layout.drive_speeds).T
         return replace(motion, direction=np.tanh(speeds / _TURN))
 
     def _drive_values(self, motion: DriveMotion) -> Array:
-        """Return what the kept drive parameters multiply, shape (k, N)."""
-        own = [self.model.layout.drive_parameters[k] for k in self._drives[1]]
-        values = [term.column(motion.of(d)) for d, term in own]
-        return np.array(values).reshape(len(own), motion.v.shape[1])
+        """Return what the kept drive parameters multiply, shape (k, N); of (d, ..., N), alike."""
+        values = np.empty((len(self._drives[1]), *motion.v.shape[1:]))
+        for term, places, drives in self._terms:
+            values[places] = term.column(motion.of(drives))
+        return values
 
     def torque(self, rows: MotionRows) -> Array:
         """Return the torque along the motion, shape (N, n) [N m or N].
@@ -124,7 +150,7 @@ class MotionInformation:
         Args:
             rows: The rows.
         """
-        torque: Array = np.einsum("rcn,c->nr", rows.W, self.beta)
+        torque: Array = (self.beta @ rows.W).T
         return torque
 
     def pull(self, rows: MotionRows, weights: Array) -> tuple[Array, Array, Array]:
@@ -139,11 +165,9 @@ class MotionInformation:
         by_value = np.einsum("rk,rkn->kn", loads, weights[:, columns])
         *direct, by_load = self._pull_drives(rows, by_value)
         entries = weights + by_load.T[:, None] * self.beta[:, None]
-        r, c, pairs, k, factors = self._entries
-        own = np.zeros_like(rows.state.rows)
-        np.add.at(own, (pairs, k), factors[:, None] * entries[r, c])
+        own = self._scatter @ entries.reshape(-1, weights.shape[2])
         G = self.model.velocity_map
-        bodies = self._regressor.pull(rows.state, own)
+        bodies = self._regressor.pull(rows.state, own.reshape(rows.state.rows.shape))
         q, v, a = (x @ G + y for x, y in zip(bodies, direct, strict=True))
         return q, v, a
 
@@ -154,16 +178,20 @@ class MotionInformation:
         by_drive = np.zeros((len(layout.drives), len(own)))
         by_drive[own, np.arange(len(own))] = 1.0
         R = layout.drive_ratios
+        share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)
+        names = ("q", "v", "a", "load")
+        steps = [_STEP * np.maximum(1.0, np.abs(getattr(motion, name))) for name in names]  # (d, N)
+        beside = {}
+        for k, (name, step) in enumerate(zip(names, steps, strict=True)):
+            x = np.repeat(getattr(motion, name)[:, None], 2 * len(names), axis=1)  # (d, 8, N)
+            x[:, 2 * k] += step
+            x[:, 2 * k + 1] -= step
+            beside[name] = x
+        still = np.zeros_like(x)
+        values = self._drive_values(self._turning(replace(motion, **beside, rate=still)))
         gradients = []
-        for name in ("q", "v", "a", "load"):
-            x = getattr(motion, name)
-            step = _STEP * np.maximum(1.0, np.abs(x))
-            up, down = (
-                self._drive_values(self._turning(replace(motion, **{name: x + sign * step})))
-                for sign in (1, -1)
-            )
-            slope = by_drive @ (weights * (up - down)) / (2 * step)
-            share = R / np.sum(R**2, axis=1, keepdims=True).clip(min=1e-300)
+        for k, (name, step) in enumerate(zip(names, steps, strict=True)):
+            slope = by_drive @ (weights * (values[:, 2 * k] - values[:, 2 * k + 1])) / (2 * step)
             gradients.append(slope.T @ (share if name == "load" else R))
         return gradients
 
@@ -215,9 +243,15 @@ def criterion(name: str, F: Array, widest: Array | None = None) -> tuple[float, 
     """
     if name not in CRITERIA:
         raise SettingsError(f"criterion is {name!r}, wanted one of {', '.join(CRITERIA)}")
+    size = len(F)
+    if name == "D":
+        L, failed = scipy.linalg.lapack.dpotrf(F, lower=1)
+        if not failed:
+            inverse = scipy.linalg.lapack.dpotri(L, lower=1)[0]
+            inverse = np.tril(inverse) + np.tril(inverse, -1).T
+            return -2.0 * float(np.log(np.diag(L)).mean()), -inverse / size
     values, vectors = np.linalg.eigh(F)
     values = np.maximum(values, values[-1] * np.finfo(float).eps)
-    size = len(values)
     if name == "D":
         by_value = -1.0 / values / size
         return -float(np.log(values).mean()), (vectors * by_value) @ vectors.T

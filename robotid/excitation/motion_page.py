@@ -139,12 +139,13 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     entry, contact = content["limits"].get("collision"), course.nearest
     if entry is None or course.clearance is None:
         return "<p>Collisions were not looked at.</p>\n"
-    least, said = course.clearance.least, "No two links can collide."
+    said = "No two links can collide."
     if entry["margin"] is not None:
+        kept = entry["kept"]
         said = (
             f"Nearest to a collision: {entry['where']} come to "
-            f"{1e3 * (entry['margin'] + least):.0f} mm at {entry['time']:.2f} s; "
-            f"{1e3 * least:.0f} mm are kept, between the instants, too."
+            f"{1e3 * (entry['margin'] + kept):.0f} mm at {entry['time']:.2f} s; "
+            f"{1e3 * kept:.0f} mm are kept, between the instants, too."
         )
     elif contact is not None:
         said = (
@@ -154,7 +155,9 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     if entry["unread"]:
         said += f" Not looked at, since no shape can be read: {listed(entry['unread'])}."
     if entry["left_alone"]:
-        said += f" Not looked at, for they hardly ever have room: {listed(entry['left_alone'])}."
+        said += f" Made to touch, and not looked at: {listed(entry['left_alone'])}."
+    if entry["built_near"]:
+        said += f" Built near each other, and kept apart by less: {listed(entry['built_near'])}."
     return f"<p>{escape(said)}</p>\n"
 
 

@@ -24,7 +24,7 @@ _CANDIDATES = 400  # random postures among which stands are chosen ...
 _LOOKED_AT = 20  # ... and those about which sweeps are thought of
 _PLACES = 41  # of a joint's range at which it is asked whether it can go there
 _TRIES = 8  # sweeps, each shorter by a fifth than the one before
-_RATE = 50.0  # [Hz] of the instants at which limits are looked at
+_RATE = 100.0  # [Hz] of the instants at which limits are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def design_sweeps(
     for _ in range(_TRIES):
         route = _sweeps(designer, postures[best], share * rooms[best], speeds)
         design = designer.examined(route, route.duration, _RATE)
-        if _is_kept(design, designer):
+        if _is_kept(design):
             return design
         share *= 0.8
     raise SettingsError(
@@ -185,7 +185,7 @@ def _visited(designer: Designer, places: Array) -> Design:
     kept = [places[0]]
     for place in places[1:]:
         leg = _legs(designer, np.array([kept[-1], place]))
-        if _is_kept(designer.examined(leg, leg.duration, _RATE), designer):
+        if _is_kept(designer.examined(leg, leg.duration, _RATE)):
             kept.append(place)
     if len(kept) < 2:
         raise SettingsError(
@@ -204,9 +204,8 @@ def _legs(designer: Designer, places: Array) -> Route:
     return Route(places, times, np.full(len(times), 0.5), np.full(len(places), _HOLD))
 
 
-def _is_kept(design: Design, designer: Designer) -> bool:
-    least = 0.0 if designer.clearance is None else designer.clearance.least
-    is_clear = design.contact is None or design.contact.distance >= least
+def _is_kept(design: Design) -> bool:
+    is_clear = design.contact is None or design.contact.margin >= 0.0
     return bool(design.used.max() <= 1.0 and is_clear)
 
 

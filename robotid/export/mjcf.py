@@ -1,7 +1,9 @@
 """Write an identified robot as MJCF, the format of MuJoCo, which need not be installed."""
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -9,12 +11,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robotid._typing import Array
+from robotid.exceptions import SettingsError
+from robotid.export.commanded import CommandedDrive, limit_of
 from robotid.export.links import WORLD, Format, SimulatedLink, own_drives, write_model
 from robotid.export.urdf import numbers_text
+from robotid.findings import listed
 from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
 
-__all__ = ["write_mjcf"]
+__all__ = ["DELAYS", "write_mjcf"]
 
 #: Attribute of a joint, or of a tendon over several, that states a term of a drive.
 _ATTRIBUTES = {
@@ -32,18 +38,85 @@ _GEOMS = {
     "visual": _SEEN | {"contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
-#: How friction gives way: with MuJoCo's 0.9 a light joint creeps under less than its friction.
-_STIFF = {"solimpfriction": "0.999 0.999 0.001 0.5 2"}
+#: How friction gives way: with MuJoCo's 0.9 a light joint creeps under less than its friction, and
+#: with its 0.02 s friction is less than Fc for 10 ms about each reversal; the least is 2 steps.
+_STIFF = {"solimpfriction": "0.999 0.999 0.001 0.5 2", "solreffriction": "1e-5 1"}
 _COMPILER = {
     "angle": "radian", "autolimits": "true", "inertiafromgeom": "false", "balanceinertia": "false",
     "boundmass": "0", "boundinertia": "0",
 }  # fmt: skip
 _MOST_FACES = 200_000  # of a mesh that MuJoCo reads
+#: How the delay of a command may be stated.
+DELAYS = ("history", "filter")
+_STEP = 0.001  # [s]
+_EXACT = 1e-9  # of a step: a delay that is so close to whole steps has that many
 _STL_HEAD, _STL_FACE = 84, 50  # bytes; MuJoCo reads no STL written as text
 
 
+@dataclass(frozen=True)
+class _Servos:
+    """The joints that follow commands, by name, and how they are stated.
+
+    A step changes v by a force at its beginning and then moves q with the new v, so that a force
+    acts half a step early: commands are read half a step later, linearly between steps.
+    """
+
+    of: Mapping[str, CommandedDrive]
+    step: float
+    delay: str
+
+    @property
+    def notes(self) -> list[str]:
+        """What is to be said of them."""
+        if not self.of:
+            return []
+        said = ["controls are position commands, positions what the encoders read [rad, m]"]
+        late = {name: drive.delay for name, drive in self.of.items() if drive.delay}
+        if late and self.delay == "filter":
+            said.append(
+                "delays are filters of first order with the delay as time constant; they start at "
+                "0 unless act states them"
+            )
+        elif late:
+            said.append(
+                f"delays have half a step of {self.step:g} s more, by which a step's force acts "
+                "early; they need MuJoCo 3.5, and commands before the start are 0 unless "
+                "mj_initCtrlHistory states them"
+            )
+        short = [name for name in late if late[name] < 0.5 * self.step]
+        if short and self.delay == "history":
+            said.append(f"delays below half a step are half a step: {listed(short)}")
+        return said
+
+    def actuator(self, joint: Joint, offset: float) -> dict[str, str]:
+        """Return the attributes of a joint's actuator: kp (ctrl(t - delay) - q) - kd v - offset."""
+        drive = self.of[joint.name]
+        at = {
+            "gainprm": numbers_text([drive.kp, 0.0, 0.0]),
+            "biastype": "affine",
+            "biasprm": numbers_text([-offset, -drive.kp, -drive.kd]),
+        }
+        if (limit := limit_of(drive, joint)) < np.inf:  # of the drive, before the offset
+            at["forcerange"] = numbers_text([-limit - offset, limit - offset])
+        if drive.delay and self.delay == "filter":
+            at |= {"dyntype": "filterexact", "dynprm": numbers_text([drive.delay, 0.0, 0.0])}
+        elif drive.delay:
+            late = max(drive.delay + 0.5 * self.step, self.step)  # the least that MuJoCo can
+            samples = str(math.ceil(late / self.step - _EXACT))
+            at |= {"delay": numbers_text([late]), "nsample": samples, "interp": "linear"}
+        return at
+
+
 def write_mjcf(
-    model: RobotModel, pi: Array, target: str | Path, *, original: str | Path | None = None
+    model: RobotModel,
+    pi: Array,
+    target: str | Path,
+    *,
+    original: str | Path | None = None,
+    commanded: Sequence[CommandedDrive] = (),
+    step: float = _STEP,
+    delay: str = "history",
+    notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Write standard parameters as an MJCF file.
 
@@ -53,11 +126,19 @@ def write_mjcf(
     joint's actuator, whose control is the drive's torque. A frictionloss is a soft constraint:
     ``mj_inverse`` gives Fc sign(v) where the joint moves, and less where it hardly does.
 
+    The control of a joint that follows commands is its position command. Its delay is a history of
+    commands, which MuJoCo has since 3.5, or a filter of first order that is as late at low
+    frequencies. The position of such a joint is what its encoder reads (``ref``).
+
     Args:
         model: The robot.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
         original: The URDF that the model's was made of, beside which meshes are looked for, too.
+        commanded: The joints that follow position commands, with the friction of pi.
+        step: Time step that the file states if a joint follows commands [s].
+        delay: How the delay of a command is stated, "history" or "filter".
+        notes: What else is to be said of the file.
 
     Returns:
         What the file does not state, a sentence each; its head has them, too.
@@ -65,10 +146,18 @@ def write_mjcf(
     Raises:
         DataError: If pi does not have p finite entries, or the folder does not exist.
         ModelError: If a link or a drive would be physically impossible.
-        SettingsError: If the target is a folder.
+        SettingsError: If the target is a folder, step is not positive, or delay is neither.
     """
-    to = Format("MJCF", (*_ATTRIBUTES, _OFFSET), True, _is_readable)
-    return write_model(model, pi, target, original, to, partial(_mjcf, model))
+    if not 0 < step < np.inf:
+        raise SettingsError(f"step is {step:g} s, wanted a positive time")
+    if delay not in DELAYS:
+        raise SettingsError(f"delay is {delay!r}, wanted one of {listed(DELAYS)}")
+    to, servos = (
+        Format("MJCF", (*_ATTRIBUTES, _OFFSET), True, _is_readable),
+        _Servos({drive.joint: drive for drive in commanded}, step, delay),
+    )
+    build = partial(_mjcf, model, servos)
+    return write_model(model, pi, target, original, to, build, [*notes, *servos.notes])
 
 
 def _is_readable(mesh: Path) -> bool:
@@ -83,12 +172,17 @@ def _is_readable(mesh: Path) -> bool:
 
 
 def _mjcf(
-    model: RobotModel, links: Sequence[SimulatedLink], values: Mapping[str, float]
+    model: RobotModel,
+    servos: _Servos,
+    links: Sequence[SimulatedLink],
+    values: Mapping[str, float],
 ) -> ET.Element:
     top = ET.Element("mujoco", model=model.name)
     ET.SubElement(top, "compiler", _COMPILER)
     gravity = numbers_text(model.pin_model.gravity.linear)
-    ET.SubElement(top, "option", gravity=gravity, integrator="implicitfast")
+    option = ET.SubElement(top, "option", gravity=gravity, integrator="implicitfast")
+    if servos.of:
+        option.set("timestep", numbers_text([servos.step]))
     default, assets = ET.SubElement(top, "default"), ET.SubElement(top, "asset")
     for tag in ("joint", "tendon"):
         ET.SubElement(default, tag, _STIFF)
@@ -98,13 +192,15 @@ def _mjcf(
     for link in links:
         at = {"name": link.name} | _pose(link.pose)
         bodies[link.name] = body = ET.SubElement(bodies[link.parent], "body", at)
-        _add_motion(body, link, own)
+        _add_motion(body, link, own, servos)
         _add_geoms(body, link, assets)
-    _add_drives(top, model, links, values)
+    _add_drives(top, model, links, values, servos)
     return top
 
 
-def _add_motion(body: ET.Element, link: SimulatedLink, values: Mapping[str, float]) -> None:
+def _add_motion(
+    body: ET.Element, link: SimulatedLink, values: Mapping[str, float], servos: _Servos
+) -> None:
     """Add the inertial of a link, and the joint that moves it."""
     if link.inertial is not None:
         moments, axes = principal_moments(link.inertial)
@@ -119,8 +215,11 @@ def _add_motion(body: ET.Element, link: SimulatedLink, values: Mapping[str, floa
     if (joint := link.joint) is not None and link.moves:
         kind = "slide" if joint.type == "prismatic" else "hinge"
         at = {"name": joint.name, "type": kind, "axis": numbers_text(joint.axis)}
+        zero = servos.of[joint.name].zero if joint.name in servos.of else 0.0
+        if zero:  # an encoder reads q_urdf - zero
+            at |= {"ref": numbers_text([-zero]), "springref": numbers_text([-zero])}
         if joint.has_limits:
-            at["range"] = numbers_text([joint.lower, joint.upper])
+            at["range"] = numbers_text([joint.lower - zero, joint.upper - zero])
         ET.SubElement(body, "joint", at | _drive(joint.name, values))
 
 
@@ -147,6 +246,7 @@ def _add_drives(
     model: RobotModel,
     links: Sequence[SimulatedLink],
     values: Mapping[str, float],
+    servos: _Servos,
 ) -> None:
     """Add drives of several joints as tendons, joints that follow others, and actuators."""
     tendons, equality, actuators = (
@@ -164,7 +264,7 @@ def _add_drives(
             ET.SubElement(equality, "joint", at, polycoef=numbers_text([shift, ratio, 0, 0, 0]))
     for limits in model.limits:
         at = {"name": limits.name, "joint": limits.name}
-        if 0.0 < limits.effort < np.inf:
+        if limits.name not in servos.of and 0.0 < limits.effort < np.inf:
             at["ctrlrange"] = numbers_text([-limits.effort, limits.effort])
         offset = sum(  # does not reach the joint
             ratio * values.get(f"{drive.name}.{_OFFSET}", 0.0)
@@ -172,9 +272,11 @@ def _add_drives(
             for joint, ratio in drive.ratios
             if joint == limits.name
         )
-        if offset:
+        if limits.name in servos.of:
+            at |= servos.actuator(limits, offset)
+        elif offset:
             at |= {"biastype": "affine", "biasprm": numbers_text([-offset, 0.0, 0.0])}
-        ET.SubElement(actuators, "general" if offset else "motor", at)
+        ET.SubElement(actuators, "general" if "biastype" in at else "motor", at)
 
 
 def _drive(name: str, values: Mapping[str, float]) -> dict[str, str]:

@@ -6,7 +6,7 @@ fixed axes: any of them above 0 make a possible body, so each may be drawn by it
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,18 @@ from scipy.spatial.transform import Rotation
 from robotid._files import write_text
 from robotid._typing import Array
 from robotid.export.urdf import link_parameters
+from robotid.export.yaml_text import yaml_text
 from robotid.identification.bands import REACH
 from robotid.identification.pipeline import Identification
 from robotid.robot.bodies import principal_moments
+from robotid.robot.drives import TERMS
 from robotid.robot.parameters import pseudo_inertia_basis
 from robotid.versions import __version__
 
-__all__ = ["parameter_ranges", "ranges_text", "write_ranges"]
+__all__ = ["parameter_ranges", "ranges_text", "stated_ranges", "write_ranges"]
 
+#: Parameters of drives that cannot be below 0.
+_NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 _HEAD = """\
 Ranges for domain randomisation of {robot}, by robotid {version}. kg, m, kg m^2, in a link's frame.
 
@@ -32,7 +36,8 @@ what must be more than 0 are those of its logarithm. source says what the interv
   data   the motion;
   prior  the motion says nothing, and it is how wrong the URDF may plausibly be;
   mixed  both, or in sums with others;
-  bound  physics holds the value where it is; a drive at 0 has no known interval: no low, no high.
+  bound  physics holds the value where it is; a drive at 0 has no known interval: no low, no high;
+  stated the job said it, and it was not identified: no low, no high.
 
 second_moments are the integrals of x^2, y^2, z^2 dm about the centre of mass along the principal
 axes, whose quaternion w x y z turns them into the link's. The principal moments of inertia are
@@ -41,7 +46,8 @@ of them, which is possible for any draw; draws of principal_moments themselves n
 
 Values drawn one by one change the torque more than the data allow, since it is sums of parameters
 that the motion determines. undetermined names the sums that it leaves open. Drive parameters are
-those of the joint, gear included.
+those of the joint, gear included: gains kp and kd, delay of commands and zero of the encoder, too,
+if commands were identified.
 """
 
 
@@ -83,6 +89,33 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
     }
 
 
+def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the ranges that a result states, gains, delays and zeros of its drives among them.
+
+    Args:
+        content: Content of a result.json.
+
+    Returns:
+        As of ``parameter_ranges``; of what was stated and not found, "nominal" and "source" alone.
+    """
+    drives: dict[str, dict[str, Any]] = {}
+    for entry in content["drive_parameters"]:
+        drive, _, term = entry["name"].rpartition(".")
+        error = entry.get("std_error")
+        ends = _range(
+            entry["value"],
+            math.inf if error is None else error,
+            _source(entry),
+            is_positive=term == "kp",
+            least=0.0 if term in _NOT_NEGATIVE else -math.inf,
+        )
+        drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
+    empty = {"robot": content["robot"], "confidence": 0.95, "bodies": {}, "drives": {}}
+    ranges = content.get("ranges", empty)
+    merged = {drive: terms | ranges["drives"].get(drive, {}) for drive, terms in drives.items()}
+    return {"undetermined": content["structure"]["undetermined"], **ranges, "drives": merged}
+
+
 def write_ranges(found: Identification, target: str | Path) -> None:
     """Write the ranges of what was identified as YAML.
 
@@ -105,8 +138,7 @@ def ranges_text(ranges: Mapping[str, Any]) -> str:
         ranges: As ``parameter_ranges`` returns them, and result.json has them.
     """
     head = _HEAD.format(robot=json.dumps(ranges["robot"]), version=__version__)
-    lines = [f"# {line}".rstrip() for line in head.splitlines()]
-    return "\n".join([*lines, *_yaml(ranges, "")]) + "\n"
+    return yaml_text(ranges, head)
 
 
 def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any]:
@@ -142,6 +174,12 @@ def _joint_source(sources: Sequence[str]) -> str:
     return sources[0] if len(set(sources)) == 1 else "mixed"
 
 
+def _source(entry: Mapping[str, Any]) -> str:
+    """Return what a drive parameter of a result rests on."""
+    found = "stated" if entry.get("std_error") is None else "data"
+    return "bound" if entry.get("at_bound") else str(entry.get("source", found))
+
+
 def _range(
     value: float, error: float, source: str, *, is_positive: bool = False, least: float = -math.inf
 ) -> dict[str, Any]:
@@ -151,26 +189,3 @@ def _range(
         return {"nominal": nominal, "source": source}
     low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)
     return {"nominal": nominal, "low": low, "high": nominal + half, "source": source}
-
-
-def _yaml(value: Mapping[str, Any], indent: str) -> Iterator[str]:
-    """Yield the lines of a table: one for each that holds no other table."""
-    for key, entry in value.items():
-        name = f"{indent}{json.dumps(key, ensure_ascii=False)}:"
-        if isinstance(entry, Mapping) and any(isinstance(x, Mapping) for x in entry.values()):
-            yield name
-            yield from _yaml(entry, indent + "  ")
-        else:
-            yield f"{name} {_flow(entry)}"
-
-
-def _flow(entry: Any) -> str:  # noqa: ANN401
-    """Return a figure, a name, a list or a table in one line."""
-    if isinstance(entry, Mapping):
-        return "{" + ", ".join(f"{key}: {_flow(x)}" for key, x in entry.items()) + "}"
-    if isinstance(entry, list):
-        return "[" + ", ".join(map(_flow, entry)) + "]"
-    if isinstance(entry, float):  # YAML 1.1 reads 1e-05 as text, and 1.0e-05 as a number
-        mantissa, e, exponent = f"{entry:.6g}".partition("e")
-        return mantissa + (".0" if e and "." not in mantissa else "") + e + exponent
-    return json.dumps(entry, ensure_ascii=False)

@@ -26,7 +26,12 @@ _SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
 
 
 def write_sdf(
-    model: RobotModel, pi: Array, target: str | Path, *, original: str | Path | None = None
+    model: RobotModel,
+    pi: Array,
+    target: str | Path,
+    *,
+    original: str | Path | None = None,
+    notes: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Write standard parameters as an SDF file of one model.
 
@@ -39,6 +44,7 @@ def write_sdf(
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The file to write.
         original: The URDF that the model's was made of, beside which meshes are looked for, too.
+        notes: What else is to be said of the file.
 
     Returns:
         What the file does not state, a sentence each; its head has them, too.
@@ -49,12 +55,13 @@ def write_sdf(
         SettingsError: If the target is a folder.
     """
     gravity = numbers_text(model.pin_model.gravity.linear)
-    notes = [
+    said = [
+        *notes,
         "Drake reads armature (drake:rotor_inertia), not friction; Gazebo the reverse",
         f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with",
     ]
     to = Format("SDF", (*_DYNAMICS, _ROTOR), False, lambda mesh: mesh.suffix.lower() in _MESHES)
-    return write_model(model, pi, target, original, to, partial(_sdf, model.name), notes)
+    return write_model(model, pi, target, original, to, partial(_sdf, model.name), said)
 
 
 def _sdf(name: str, links: Sequence[SimulatedLink], values: Mapping[str, float]) -> ET.Element:

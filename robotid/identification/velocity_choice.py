@@ -62,9 +62,11 @@ def prefers_measured(model: RobotModel, logs: Sequence[Log], settings: SignalSet
 def _errors(model: RobotModel, log: Log, settings: SignalSettings) -> Array:
     """Return what measured and differentiated velocities miss of each torque, shape (n, 2).
 
-    NaN where a joint moves too little to tell.
+    NaN where a joint moves too little to tell, or there is no torque.
     """
     found = np.full((2, len(model.joints)), np.nan)
+    if not log.has_torque:
+        return found.T
     motions = []
     for velocity in ("measured", "differentiated"):
         chosen = replace(settings, velocity=velocity)

@@ -159,7 +159,8 @@ def _open(path: Path) -> Iterator[tuple[Any, Callable[[bytes, str], Any]]]:
         raise MissingDependencyError(purpose, "rosbags", "bag") from error
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise DataError(
-            f"{path.name} is a folder without metadata.yaml, so not a ROS 2 bag; name the .mcap or "
+            f"{path.name} is a folder without metadata.yaml, so not a ROS 2 bag, and without "
+            "meta/info.json, so not a LeRobot dataset; name the .mcap or "
             ".db3 file in it, or restore it with 'ros2 bag reindex'"
         )
     is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()

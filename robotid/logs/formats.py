@@ -10,6 +10,7 @@ from robotid.logs.arrays import Hdf5Format, MatFormat, NpzFormat
 from robotid.logs.bags import BagFormat
 from robotid.logs.csv_files import CsvFormat
 from robotid.logs.foreign_tables import with_own_names
+from robotid.logs.lerobot import LeRobotFormat
 from robotid.logs.parquet_files import ParquetFormat
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Format, Table, WritableFormat
@@ -35,7 +36,7 @@ def open_table(path: Path, source: LogSource) -> Table:
     """Return the table in a file; what is wrong with a column is told when it is read.
 
     Args:
-        path: A file of a known suffix, or the folder of a ROS 2 bag.
+        path: A file of a known suffix, or the folder of a ROS 2 bag or of a LeRobot dataset.
         source: Where in the file.
 
     Raises:
@@ -64,12 +65,13 @@ def open_table(path: Path, source: LogSource) -> Table:
 def _format_of(path: Path) -> Format:
     """Return the format of a log, which is there."""
     if path.is_dir():
-        return BagFormat()
+        is_dataset = (path / "meta" / "info.json").is_file()
+        return LeRobotFormat() if is_dataset else BagFormat()
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         raise DataError(
-            f"{path.name}: logs are {_listed(list(_FORMATS))} files, or the folder of a ROS 2 bag, "
-            f"not {suffix!r}; convert it"
+            f"{path.name}: logs are {_listed(list(_FORMATS))} files, or the folder of a ROS 2 bag "
+            f"or of a LeRobot dataset, not {suffix!r}; convert it"
         )
     if not path.is_file():
         raise DataError(missing_file(path, "log file"))

@@ -38,7 +38,7 @@ __all__ = ["LogLayout", "Needs", "Readable", "lay_out", "read_log", "read_logs",
 Readable = Log | str | Path | Frame
 
 #: What a log is read for beside its positions, as of ``lay_out``.
-Needs: TypeAlias = Literal["torque", "motion", "commands"]
+Needs: TypeAlias = Literal["torque", "motion", "commands", "any"]
 
 _NOUNS = {
     "q": "position",
@@ -73,7 +73,8 @@ def read_log(
 
     Args:
         path: A .csv, .parquet, .npz, .h5, .hdf5, .mat, .mcap, .db3 or .bag file, the folder of
-            a ROS 2 bag, or a DataFrame of pandas or polars with the same columns.
+            a ROS 2 bag or of a LeRobot dataset, or a DataFrame of pandas or polars with the same
+            columns.
         joints: Names of the joints wanted, in the order wanted.
         gains: Torque per current of joints whose current is read [N m/A or N/A], by joint; a
             current with a gain is preferred to a torque column.
@@ -135,7 +136,7 @@ def read_logs(
 
 def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
     """Return a log with its columns in the order of some joints, with all that is needed."""
-    if needs == "torque" and not log.has_torque:
+    if not log.has_torque and (needs == "torque" or (needs == "any" and log.q_ref is None)):
         raise DataError(f"{log.name} has no torque. {_without_torque(log.q_ref is not None)}")
     if needs == "commands" and log.q_ref is None:
         raise DataError(
@@ -279,7 +280,8 @@ def lay_out(
         transmissions: As of ``read_log``.
         needs: What is wanted beside positions: "torque", of every joint; "motion", nothing;
             "commands", a commanded position of every joint, and torques and further commands if
-            every joint has them. What is not wanted is ignored; torques not read are 0.
+            every joint has them; "any", torques or commands, and both if every joint has them.
+            What is not wanted is ignored; torques not read are 0.
 
     Raises:
         DataError: If the file does not hold what is wanted.
@@ -296,6 +298,8 @@ def lay_out(
         where, opened = "log", with_own_names(open_frame(path), "log", "DataFrames", source)
     else:
         raise _no_log(path)
+    if opened.angle_unit and units.angle is None:
+        raise DataError(f"{where}: {opened.angle_unit}", code="angle_unit")
     check_transmissions(transmissions, joints)
     gears = tuple(transmissions)
     stated = {key: opened.renamed.get(name, name) for key, name in (columns or {}).items()}
@@ -364,11 +368,11 @@ class _Finder:
             "time": [self._find("time", ["time", "t"]) or self._missing("time", "")],
             "q": [column or self._missing(*at) for at, column in self._each("q")],
         }
-        optional = ["dq", "ddq"]
-        if self.needs == "commands":
+        optional, wanted = ["dq", "ddq"], self._wanted()
+        if "commands" in wanted:
             found["qref"] = self._find_commands()
             optional += ["dqref", "tauref"]
-        if self.needs == "torque" or (self.needs == "commands" and self._is_torque_whole()):
+        if "torque" in wanted or ("commands" in wanted and self._is_torque_whole()):
             found["tau"] = [
                 self._find_torque(self.joints[j], is_motor)
                 for j, is_motor in enumerate(self.of_motors("tau"))
@@ -510,6 +514,15 @@ class _Finder:
             raise self._no_gain(joint, current)
         return tau or current or self._missing(f"tau{m}", joint)
 
+    def _wanted(self) -> set[str]:
+        """Return which of torque and commands must be there, of every joint."""
+        if self.needs != "any":
+            return {self.needs}
+        has_torque = any(self.has_torque(joint) for joint in self.joints)
+        told = [self._has("qref", joint) for joint in self.joints]
+        wanted = {"commands"} if all(told) or (any(told) and not has_torque) else set[str]()
+        return wanted | ({"torque"} if has_torque or not wanted else set())
+
     def _is_torque_whole(self) -> bool:
         """Return whether every joint has a torque, or a current with its gain; note it if few."""
         without = []
@@ -641,18 +654,22 @@ class _Finder:
 
     def _is_logged(self, joint: str) -> bool:
         """Return whether the file has what is needed of a joint."""
-        is_there = {
-            "torque": self.has_torque(joint),
-            "motion": True,
-            "commands": self._has("qref", joint),
-        }
-        return self._has("q", joint) and is_there[self.needs]
+        wanted = self._wanted()
+        return (
+            self._has("q", joint)
+            and ("torque" not in wanted or self.has_torque(joint))
+            and ("commands" not in wanted or self._has("qref", joint))
+        )
 
     def has_torque(self, joint: str) -> bool:
         """Return whether the file has a torque or a current of a joint."""
         return self._has("tau", joint) or self._has("current", joint)
 
     def _has(self, kind: str, joint: str) -> bool:
-        """Return whether the file has a quantity of a joint."""
+        """Return whether the file has a quantity of a joint, or of the motor in its place."""
         names = (prefix + self._named(joint) for prefix in prefixes(self.source.effort)[kind])
-        return f"{kind}_{joint}" in self.columns or any(name in self.names for name in names)
+        return (
+            f"{kind}_{joint}" in self.columns
+            or any(name in self.names for name in names)
+            or (joint in self.motors and self._has(f"{kind}m", self.motors[joint]))
+        )

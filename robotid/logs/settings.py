@@ -111,8 +111,8 @@ class LogSource(Settings):
 
     topic: str | None = setting(
         None,
-        "the topic of a bag, or the group or struct of an HDF5, MAT or NPZ file; not needed if "
-        "there is only one",
+        "the topic of a bag, the group or struct of an HDF5, MAT or NPZ file, or the episode of "
+        "a LeRobot dataset, as episode_3; not needed if there is only one",
     )
     command: str | None = setting(
         None,

@@ -99,6 +99,7 @@ class Table:
     notes: tuple[str, ...] = ()  # what the reader should know
     rows: RowReader | None = None  # reads row by row; None if the format is only read whole
     renamed: Mapping[str, str] = field(default_factory=dict)  # to the names above, from the file's
+    angle_unit: str = ""  # why the unit of angles must be stated; "" if it need not be
 
 
 class Format(ABC):

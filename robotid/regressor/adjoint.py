@@ -22,7 +22,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import DataError
-from robotid.regressor.compiled import joint_axis
+from robotid.regressor.compiled import joint_constants
 from robotid.robot.model import RobotModel
 
 __all__ = ["MotionRegressor", "Poses", "RegressorState"]
@@ -70,6 +70,8 @@ class MotionRegressor:
 
     Args:
         model: The robot, with a fixed base.
+        is_fast: Whether the compiled way is taken, which needs the extra ``fast`` and half a
+            second to start; the figures are the same to rounding.
 
     Attributes:
         places: Pinocchio's velocity that moves each of the m bodies, shape (m,).
@@ -79,17 +81,17 @@ class MotionRegressor:
         DataError: If the base floats.
     """
 
-    def __init__(self, model: RobotModel) -> None:
+    def __init__(self, model: RobotModel, *, is_fast: bool = False) -> None:
         if model.free_flyer:
             raise DataError("the base floats; motions are designed for robots with a fixed base")
         tree = model.pin_model
-        self._model = model
-        self._placements = [tree.jointPlacements[i] for i in range(1, tree.njoints)]
-        self._parents = [int(tree.parents[i]) - 1 for i in range(1, tree.njoints)]
+        self._is_fast = is_fast
+        self._parents = np.array([int(tree.parents[i]) - 1 for i in range(1, tree.njoints)])
         joints = [tree.joints[i] for i in range(1, tree.njoints)]
-        screws = np.array([joint_axis(tree, i) for i in range(1, tree.njoints)])  # (m, 6)
-        self.slides = np.any(screws[:, :3], axis=1)
-        self._axes = np.where(self.slides[:, None], screws[:, :3], screws[:, 3:])  # own frames
+        self._constants = np.array([joint_constants(tree, i) for i in range(1, tree.njoints)])
+        slide, turn = self._constants[:, 33:36], self._constants[:, 36:]  # axes, in own frames
+        self.slides = np.any(slide, axis=1)
+        self._axes = np.where(self.slides[:, None], slide, turn)
         self.places = np.array([joint.idx_v for joint in joints])
         self._gravity = np.array(tree.gravity.linear)
         size = len(joints)
@@ -104,6 +106,11 @@ class MotionRegressor:
         """Which Pinocchio velocity loads which body: columns of v, and bodies, shape (pairs,)."""
         return self.places[self._joints], self._bodies
 
+    @cached_property
+    def _carriers(self) -> Array:
+        """Body, and joint that carries it, of each pair, shape (2, pairs)."""
+        return np.array([self._bodies, self._joints])
+
     def __call__(self, q: Array, v: Array, a: Array) -> RegressorState:
         """Return the regressor at N instants.
 
@@ -113,6 +120,8 @@ class MotionRegressor:
             a: Their accelerations, shape (N, m) [rad/s^2, m/s^2].
         """
         v, a = v.T[self.places], a.T[self.places]
+        if self._is_fast:
+            return self._state_fast(q.T[self.places], v, a)
         poses = self.poses(q)
         R, p, screw = poses.R, poses.p, poses.screw
         linear, angular = screw
@@ -129,6 +138,15 @@ class MotionRegressor:
             R, p, screw, v, a, velocity, acceleration, own_velocity, own_acceleration, seen, rows
         )
 
+    def _state_fast(self, q: Array, v: Array, a: Array) -> RegressorState:
+        """Return the regressor by compiled code, the joints in the order of the bodies."""
+        from robotid.regressor.adjoint_lanes import rows_along  # imports Numba
+
+        tree = self._parents, self._constants, self.slides, self._gravity
+        q, v, a = (np.array(x, order="C") for x in (q, v, a))
+        R, p, screw, *rest = rows_along(*tree, self._carriers, q, v, a)
+        return RegressorState(R, p, screw, v, a, *rest)
+
     def poses(self, q: Array) -> Poses:
         """Return where the bodies are at N instants.
 
@@ -139,16 +157,10 @@ class MotionRegressor:
         size, N = angle.shape
         R, p = np.empty((3, 3, size, N)), np.empty((3, size, N))
         cosine, sine = np.cos(angle), np.sin(angle)
-        for i, (M, parent) in enumerate(zip(self._placements, self._parents, strict=True)):
-            axis, turn = self._axes[i], np.array(M.rotation)
-            own = turn[:, :, None] * np.ones(N)
-            if not self.slides[i]:
-                along, across = np.outer(axis, axis), _skew(axis)
-                constant, even, odd = turn @ along, turn @ (np.eye(3) - along), turn @ across
-                own = constant[..., None] + even[..., None] * cosine[i] + odd[..., None] * sine[i]
-            place = np.array(M.translation)[:, None] * np.ones(N)
-            if self.slides[i]:
-                place = place + (turn @ axis)[:, None] * angle[i]
+        for i, (joint, parent) in enumerate(zip(self._constants, self._parents, strict=True)):
+            constant, even, odd = joint[:27].reshape(3, 3, 3).swapaxes(1, 2)[..., None]
+            own = constant + even * cosine[i] + odd * sine[i]
+            place = joint[27:30, None] + joint[30:33, None] * angle[i]
             if parent < 0:
                 R[:, :, i], p[:, i] = own, place
             else:
@@ -198,6 +210,8 @@ class MotionRegressor:
             state: The regressor.
             weights: What each entry counts, shape (pairs, 10, N).
         """
+        if self._is_fast:
+            return self._placed(self._pull_fast(state, weights))
         i, j, size = self._bodies, self._joints, len(self._parents)
         to_u, to_e, to_d, to_dw, to_w = self._pull_rows(state, weights)
         # the acceleration of the origin is d = a + w x v
@@ -223,13 +237,25 @@ class MotionRegressor:
         g_s = (g_s[0] + state.v * S_V[0], g_s[1] + state.v * S_V[1])
         own = _adjoint(s, g_s)
         total = self._gathered((turn[0] - own[0], turn[1] - own[1]))
-        g_q = _pair(s, total)
-        out = []
-        for g in (g_q, g_v, g_a):
-            placed = np.empty_like(g)
-            placed[self.places] = g
-            out.append(placed.T)
-        return out[0], out[1], out[2]
+        return self._placed(np.array([_pair(s, total), g_v, g_a]))
+
+    def _pull_fast(self, state: RegressorState, weights: Array) -> Array:
+        """Return the gradient by compiled code, shape (3, m, N)."""
+        from robotid.regressor.adjoint_lanes import gradient_along  # imports Numba
+
+        gradient: Array = gradient_along(
+            self._parents, self._carriers, state.v, state.a, state.R, state.p, state.screw,
+            state.velocity, state.acceleration, state.own_velocity, state.own_acceleration,
+            state.seen, weights,
+        )  # fmt: skip
+        return gradient
+
+    def _placed(self, gradient: Array) -> tuple[Array, Array, Array]:
+        """Return gradients by q, v and a, (3, m, N), in the order of the velocities, (N, m)."""
+        placed = np.empty_like(gradient)
+        placed[:, self.places] = gradient
+        by_q, by_v, by_a = placed.swapaxes(1, 2)
+        return by_q, by_v, by_a
 
     def _pull_rows(self, state: RegressorState, weights: Array) -> tuple[Array, ...]:
         i, size = self._bodies, len(self._parents)
@@ -254,10 +280,6 @@ def _by(index: Array, values: Array, size: int) -> Array:
     chosen[index, np.arange(len(index))] = 1.0
     summed: Array = chosen @ values
     return summed
-
-
-def _skew(x: Array) -> Array:
-    return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
 
 
 def _cross(x: Array, y: Array) -> Array:

@@ -25,7 +25,7 @@ __all__ = [
     "Tree",
     "flatten",
     "is_installed",
-    "joint_axis",
+    "joint_constants",
     "why_not",
     "work_per_sample",
 ]
@@ -61,7 +61,7 @@ def why_not(model: "RobotModel") -> str | None:
     """
     joints, first = list(model.pin_model.joints), 2 if model.free_flyer else 1
     for name, joint in list(zip(model.pin_model.names, joints, strict=True))[first:]:
-        if joint.nv != 1 or not _is_simple(joint_axis(model.pin_model, joint.id)):
+        if joint.nv != 1 or not _is_simple(_joint_axis(model.pin_model, joint.id)):
             return f"joint {name!r} is a {joint.shortname()}, which is not compiled"
     if np.any(np.sum(model.velocity_map != 0, axis=1) > 1):
         return "a joint follows several others, which is not compiled"
@@ -167,7 +167,7 @@ def flatten(model: "RobotModel") -> Tree:
         rows.append(above if leader in above else [*above, leader])
         slots[body], leaders[body] = rows[-1].index(leader), leader
         ratio, offset = G[joint.idx_v, leader], model.position_offset[joint.idx_v]
-        joints[body] = np.append(_constants(pin_model, body), [ratio, offset])
+        joints[body] = np.append(joint_constants(pin_model, body), [ratio, offset])
     table = np.full((bodies, max(map(len, rows))), -1)
     for body, own in enumerate(rows):
         table[body, : len(own)] = own
@@ -197,9 +197,14 @@ def _prepare(state: Array, model: "RobotModel", tree: Tree) -> None:
             state[body, 12 + 6 * slot : 18 + 6 * slot] = axis[:, None]
 
 
-def _constants(pin_model: pin.Model, body: int) -> Array:
-    """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,)."""
-    slide, turn = joint_axis(pin_model, body).reshape(2, 3)
+def joint_constants(pin_model: pin.Model, body: int) -> Array:
+    """Return A, B, C (by columns), p0, d and the axis (v, w) of a joint, shape (39,).
+
+    Args:
+        pin_model: The robot.
+        body: Number of the joint.
+    """
+    slide, turn = _joint_axis(pin_model, body).reshape(2, 3)
     P, p0 = pin_model.jointPlacements[body].rotation, pin_model.jointPlacements[body].translation
     along = np.outer(turn, turn)
     about = np.eye(3) - along if turn.any() else np.zeros((3, 3))
@@ -208,13 +213,8 @@ def _constants(pin_model: pin.Model, body: int) -> Array:
     return np.concatenate([A.T.reshape(-1), *rotation, p0, P @ slide, slide, turn])
 
 
-def joint_axis(pin_model: pin.Model, body: int) -> Array:
-    """Return the axis (v, w) of a joint in its own frame, at its neutral position, shape (6,).
-
-    Args:
-        pin_model: The robot.
-        body: Number of the joint.
-    """
+def _joint_axis(pin_model: pin.Model, body: int) -> Array:
+    """Return the axis (v, w) of a joint in its own frame, at its neutral position, shape (6,)."""
     data, q = pin_model.createData(), pin.neutral(pin_model)
     joint = pin_model.joints[body]
     axis: Array = pin.computeJointJacobian(pin_model, data, q, body)[:, joint.idx_v]

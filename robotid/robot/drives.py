@@ -60,11 +60,11 @@ class DriveMotion:
     rate: Array
     begins: Array | None = None
 
-    def of(self, drive: int) -> "DriveMotion":
-        """Return the motion of one drive, of arrays with a row for each.
+    def of(self, drive: int | list[int]) -> "DriveMotion":
+        """Return the motion of one drive or of several, of arrays with a row for each.
 
         Args:
-            drive: Which one.
+            drive: Which one, or which.
         """
         q, v, a = self.q[drive], self.v[drive], self.a[drive]
         direction, load, rate = self.direction[drive], self.load[drive], self.rate[drive]

@@ -37,7 +37,7 @@ _TIMES = 5.0  # ... if it is so many times the usual one
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Torques to plot beside a motion.
+    """Torques to plot beside a motion, or positions of drives that follow commands.
 
     Attributes:
         t: Times on the clock of the motion, shape (N,) [s].
@@ -45,13 +45,16 @@ class Torques:
         predicted: Predicted ones by the name of who predicts, shape (N, n) each, NaN where there
             is no prediction; arcs, links and the heat strip take the residual of the first.
         noise: Root mean square of each joint's residual where the first was identified, shape
-            (n,): what a residual is compared to; the torque's own root mean square if None.
+            (n,): what a residual is compared to; the torque's own root mean square if None. Of
+            positions: that of the command's error.
+        quantity: "torque" or "position", whose units are the joints' [rad or m].
     """
 
     t: Array
     measured: Array
     predicted: Mapping[str, Array] = field(default_factory=dict)
     noise: Array | None = None
+    quantity: str = "torque"
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +137,7 @@ def replay(
     *,
     torques: Torques | None = None,
     masses: Mapping[str, Array] | None = None,
-    ghost: tuple[str, Array, Array] | None = None,
+    ghosts: Mapping[str, tuple[Array, Array]] | None = None,
     bands: Bands | None = None,
     marks: Sequence[Mark] = (),
     notes: Sequence[str] = (),
@@ -149,8 +152,8 @@ def replay(
         torques: Torques to plot, and to draw as arcs around the joints.
         masses: Standard parameters by label, shape (p,) each: centres of mass and equimomental
             ellipsoids of the links, as ``{"URDF": prior, "identified": pi}``.
-        ghost: Label, times and joint coordinates of a second motion, shown as a ghost that starts
-            when the first does.
+        ghosts: Times and joint coordinates of other motions by their label, shown as ghosts that
+            start when the first does.
         bands: Parameters over time to plot.
         marks: Moments to mark.
         notes: Sentences for the head of the page.
@@ -166,20 +169,22 @@ def replay(
     """
     _check(t, q, rate)
     moved = _moved(model, t, q, rate)
-    second = None
-    if ghost is not None:
-        _check(ghost[1], ghost[2], rate)
-        second = _moved(model, ghost[1], ghost[2], rate)
+    others = dict(ghosts or {})
+    for own in others.values():
+        _check(*own, rate)
     gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     start = float(t[0])
     scene = robot_scene(model)
     data = _data(
         model,
         scene,
-        [q] if ghost is None else [q, ghost[2]],
+        [q, *(own for _, own in others.values())],
         start=start,
         motion=_packed_motion(*moved),
-        ghost=None if second is None else {"label": ghost[0], **_packed_motion(*second)},  # type: ignore[index]
+        ghosts=[
+            {"label": label, **_packed_motion(*_moved(model, *own, rate))}
+            for label, own in others.items()
+        ],
         masses=[mass_marks(model, pi, label) for label, pi in (masses or {}).items()],
         torques=None if torques is None else _torque_data(model, torques, t),
         bands=None if bands is None else _band_data(bands, start),
@@ -217,7 +222,7 @@ def live_page(
             [q],
             start=0.0,
             motion=_packed_motion(np.zeros(0), empty),
-            ghost=None,
+            ghosts=[],
             masses=[mass_marks(model, masses, "URDF")],
             torques=_torque_rows(model, ["measured", "predicted"]),
             bands={"names": list(names), "units": list(units), "t": None, "values": None},
@@ -308,6 +313,8 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
     if noise.shape != wanted[1:]:
         raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
     full, unit = (0.5, "the torque's rms") if torques.noise is None else (6.0, "the noise")
+    if torques.quantity == "position":
+        full, unit = 0.5, "the command's error"
     scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
     strip = None
     if len(series) > 1:
@@ -316,7 +323,7 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
         strip = packed(_coded(levels, np.array(scale["of"])), "<u2")
     times, values = _plotted(torques.t - t[0], np.hstack(series))
     return {
-        **_torque_rows(model, labels),
+        **_torque_rows(model, labels, torques.quantity),
         "scale": scale,
         "strip": strip,
         "t": packed(times),
@@ -341,10 +348,15 @@ def _coded(levels: Array, of: Array) -> Array:
     return np.where(np.isnan(levels), 65_535, np.where(levels < 0, 65_534, hundredths))
 
 
-def _torque_rows(model: RobotModel, labels: Sequence[str]) -> dict[str, Any]:
+def _torque_rows(
+    model: RobotModel, labels: Sequence[str], quantity: str = "torque"
+) -> dict[str, Any]:
     """Return who is plotted, without times and values: joints, not the rows of a free base."""
     tree, units = model.pin_model, model.row_units[-len(model.joints) :]
+    if quantity == "position":
+        units = tuple("m" if joint in model.layout.prismatic else "rad" for joint in model.joints)
     return {
+        "quantity": quantity,
         "joints": [
             {"name": name, "unit": unit, "node": int(tree.getJointId(name))}
             for name, unit in zip(model.joints, units, strict=True)

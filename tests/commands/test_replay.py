@@ -2,15 +2,20 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.commanded_results import drive_entries, written_result
+from helpers.mujoco_plant import plant, recorded
 from helpers.replay_data import shown
 from helpers.synthetic import exact_log, payload_log, truth
 
 from robotid.cli import main
 from robotid.commands.replay import read_findings
+from robotid.exceptions import DataError
+from robotid.export.result import load_result
 from robotid.logs.formats import write_columns
 from robotid.logs.read import write_log
 from robotid.robot.examples import example_urdf
@@ -87,8 +92,8 @@ def test_two_results_are_called_by_their_folders(folder):
 
 def test_a_ghost_starts_with_the_motion(folder):
     _, data = run(folder, folder / "log.csv", "--ghost", folder / "log.csv")
-    assert data["ghost"]["label"] == "log.csv"
-    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+    assert data["ghosts"][0]["label"] == "log.csv"
+    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
 
 
 def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
@@ -97,7 +102,7 @@ def test_a_designed_motion_without_torques_is_a_ghost_too(folder, capsys):
     cut = [",".join(line.split(",")[k] for k in kept) for line in (header, *rows)]
     (folder / "design.csv").write_text("\n".join(cut) + "\n")
     _, data = run(folder, folder / "log.csv", "--ghost", folder / "design.csv")
-    np.testing.assert_array_equal(data["ghost"]["q"], data["motion"]["q"])
+    np.testing.assert_array_equal(data["ghosts"][0]["q"], data["motion"]["q"])
     cut[0] = cut[0].replace("q_elbow", "x_elbow")
     (folder / "design.csv").write_text("\n".join(cut) + "\n")
     assert run(folder, folder / "log.csv", "--ghost", folder / "design.csv")[0] == 1
@@ -283,3 +288,38 @@ def test_a_motion_of_a_robot_without_limits_plays_and_says_what_is_not_marked(fo
     data = shown(page.read_text(encoding="utf-8"))
     assert data["marks"] == []
     assert "Limits are not marked: arm.urdf states no limit of" in data["notes"][1]
+
+
+def test_drives_that_follow_commands_are_played_with_their_ghosts(tmp_path):
+    """Poses are the URDF's, plots what the encoders read."""
+    rng = np.random.default_rng(0)
+    arm = plant("planar", rng, zero=0.1)
+    log, _ = recorded(arm, rng, duration=3.0, rate=200.0, noise=0.0)
+    write_log(log, tmp_path / "log.csv")
+    urdf = str(arm.model.tree.path)
+    out = written_result(
+        arm, tmp_path / "out",
+        settings={"urdf": urdf, "estimator": {"name": "wls"}, "identification": [{"log": "l"}]},
+    )  # fmt: skip
+    words = ["replay", urdf, str(tmp_path / "log.csv"), str(out), "--html"]
+    assert main([*words, str(tmp_path / "page.html")]) == 0
+    data = shown((tmp_path / "page.html").read_text(encoding="utf-8"))
+    assert data["torques"]["quantity"] == "position"
+    assert data["torques"]["labels"] == ["measured", "simulated", "commanded"]
+    assert [joint["unit"] for joint in data["torques"]["joints"]] == ["rad", "rad"]
+    assert [ghost["label"] for ghost in data["ghosts"]] == ["simulated", "commanded"]
+    simulated, commanded = (ghost["q"] for ghost in data["ghosts"])
+    assert np.abs(simulated - data["motion"]["q"]).max() < 2e-3  # MuJoCo's robot is the true one
+    assert np.abs(commanded - data["motion"]["q"]).max() > 0.1
+    np.testing.assert_allclose(commanded[0], log.q_ref[0] + 0.1, atol=1e-6)
+    error = np.sqrt(np.mean((log.q_ref - log.q) ** 2, axis=0))
+    np.testing.assert_allclose(data["torques"]["scale"]["of"], error, rtol=1e-6)
+    assert data["torques"]["scale"]["unit"] == "the command's error"
+    assert data["notes"][0] == "Motion: log.csv, as measured; ghosts on its commands."
+
+    bare = [e for e in drive_entries(arm) if not e["name"].endswith((".kp", ".kd"))]
+    other = load_result(written_result(arm, tmp_path / "bare", drive_parameters=bare))
+    with pytest.raises(DataError, match="has no gains of drives: it cannot follow commands"):
+        other.follow_commands(log)
+    with pytest.raises(DataError, match="log has no commands, columns qref_ of each joint"):
+        load_result(out).follow_commands(replace(log, q_ref=None))

@@ -94,14 +94,111 @@ def test_bad_surroundings_are_refused(slider, tmp_path):
         Clearance(RobotModel.from_urdf(tmp_path / "bare.urdf"))
 
 
-def test_links_that_are_made_at_the_clearance_are_left_to_it():
-    # a pair of links of the SO-101 is 20 to 22 mm apart in almost every posture
+# a plate that tilts 15 mm above the base: nearer than the clearance in every pose, and its edge
+# hits the base if it tilts far; a pin of the plate goes through the base
+TILTED = """
+<robot name="tilted">
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="axle"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="plate"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><origin xyz="0 0 0.01"/><geometry><box size="0.1 0.1 0.02"/></geometry></collision>
+  </link>
+  <link name="pin"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial>
+    <collision><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="axle"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
+  <joint name="tilt" type="revolute"><parent link="axle"/><child link="plate"/>
+    <origin xyz="0 0 0.065"/>
+    <axis xyz="1 0 0"/><limit lower="-0.35" upper="0.35" velocity="2" effort="100"/></joint>
+  <joint name="spin" type="revolute"><parent link="plate"/><child link="pin"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="100"/></joint>
+</robot>"""
+
+
+def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_are_named(tmp_path):
+    (tmp_path / "tilted.urdf").write_text(TILTED)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "tilted.urdf"), least=0.02)
+    # the pin's end is 35 + 50 mm deep in the base, 30 + 30 mm from its sides
+    (touching,) = clearance.made_to
+    assert touching.startswith("base and pin (overlap by ")
+    assert int(touching.split()[-2]) == pytest.approx(60, abs=6)
+    assert clearance.named == [("base", "plate")]
+    tilts = np.random.default_rng(1).uniform(-0.35, 0.35, 2000)
+    apart = 0.015 - 0.05 * np.sin(np.abs(tilts))
+    usual = np.median(apart[apart > 1e-3])
+    assert clearance.kept == pytest.approx(usual / 2, abs=5e-4)
+    assert clearance.room == pytest.approx(usual / 2, abs=5e-4)
+    assert clearance.built_near == [f"base and plate ({1e3 * clearance.kept[0]:.0f} mm)"]
+    assert clearance.likely.all()
+    far, less = (
+        clearance.nearest(ProgramMotion(np.array([0.0, speed, 0.0]), 2.0, np.zeros(3)), 2.0)
+        for speed in (0.3, 0.1)
+    )
+    assert {far.first, far.second} == {"base", "plate"}
+    assert far.margin < 0.0 < less.margin
+    assert far.kept == clearance.kept[0]
+
+
+def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
+    # pairs of links of the SO-101 are 9 to 16 mm apart in almost every posture
     model = RobotModel.from_urdf(example_urdf("so101.urdf"))
     clearance = Clearance(model, least=0.02)
-    assert clearance.made_to
+    assert not clearance.made_to
+    assert len(clearance.built_near) == 1  # two hulls of one link
     q = np.random.default_rng(0).uniform(
         [j.lower for j in model.limits], [j.upper for j in model.limits], (100, 6)
     )
+    near = np.isfinite(clearance.room)
     distance = clearance.near(clearance.poses(q), 0.05, clearance.everything).distance
-    assert ((distance < 0.025).mean(axis=1) < 0.99).all()  # the others can do better
-    assert (distance.min(axis=0) > 0.024).any()  # and there are postures to be in
+    assert near.sum() == 2
+    np.testing.assert_allclose(
+        clearance.kept[near], np.median(distance[near], axis=1) / 2, rtol=0.1
+    )
+    assert (clearance.kept[~near] == 0.02).all()
+    assert ((distance >= clearance.kept[:, None]).all(axis=0)).any()  # there are postures to be in
+
+
+@pytest.fixture(scope="module", params=["panda", "ur10_robot"])
+def scattered(request):
+    """A robot at random, its distances, and how far they are looked at."""
+    model = RobotModel.from_urdf(example_urdf(f"{request.param}.urdf"))
+    low, high = np.array([(j.lower, j.upper) for j in model.limits]).T
+    q = np.random.default_rng(2).uniform(low, high, (60, len(low)))
+    clearance = Clearance(model, floor=-0.05)
+    poses = clearance.poses(q)
+    return model, clearance, poses, clearance.near(poses, np.inf, clearance.everything).distance
+
+
+def test_hulls_that_are_far_apart_are_left_out_by_compiled_code(scattered):
+    pytest.importorskip("numba")
+    model, plain, poses, exact = scattered
+    fast = Clearance(model, floor=-0.05, is_fast=True)
+    found, usual = (x.near(poses, 0.05, x.everything) for x in (fast, plain))
+    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+    assert (found.distance[exact >= 0.05] >= 0.05).all()
+    assert (found.distance <= exact + 1e-6).all()
+    needed = int((exact < 0.05).sum())
+    assert len(found.pairs) - needed < 0.3 * (len(usual.pairs) - needed)
+
+
+@pytest.mark.parametrize("is_fast", [False, True])
+def test_directions_that_parted_hulls_before_spare_their_distances(scattered, is_fast):
+    if is_fast:
+        pytest.importorskip("numba")
+    model, _, poses, exact = scattered
+    clearance = Clearance(model, floor=-0.05, is_fast=is_fast)
+    hints = np.zeros((*exact.shape, 3))
+    first, again = (clearance.near(poses, 0.05, clearance.everything, hints) for _ in range(2))
+    needed = int((exact < 0.05).sum())
+    assert len(first.pairs) > needed + 1
+    assert len(again.pairs) <= needed + 1
+    for found in (first, again):
+        np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])
+        assert (found.distance <= exact + 1e-6).all()
+    wrong = np.random.default_rng(0).standard_normal(hints.shape)
+    wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
+    found = clearance.near(poses, 0.05, clearance.everything, wrong)
+    np.testing.assert_array_equal(found.distance[exact < 0.05], exact[exact < 0.05])

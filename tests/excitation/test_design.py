@@ -35,13 +35,13 @@ def design(designer):
 
 def test_the_information_is_that_of_the_regressor(wrist, designer, rng):
     C = designer.random(rng)
-    step = 4.0 / 60  # twenty instants within a third of 4 s
-    t = step * np.arange(61)
+    step = 4.0 / 42  # 14 instants within a third of 4 s
+    t = step * np.arange(43)
     q, v, a, _ = designer.basis.derivatives(t, 3) @ C
     signs = np.tanh(v / 0.01)
     W = joint_torque_regressor(wrist, q, v, a, signs)[:, designer.information.mapping.independent]
     density = 0.1 * (np.array([0.01 * 54.0, 0.7, 0.01 * 54.0])) ** 2  # 1 % of 54 N m, for 0.1 s
-    weights = np.tile(step / density, 61)[:, None]
+    weights = np.tile(step / density, 43)[:, None]
     S = designer.spread
     expected = S[:, None] * (W.T @ (weights * W)) * S + np.eye(len(S))
     rows = designer.information.rows(q, v, a)
@@ -53,10 +53,10 @@ def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, 
     around = Clearance(wrist, least=0.05, boxes=[Box("post", (0.9, 0.2, -0.5), (1.0, 0.4, 0.5))])
     designer = replace(designer, name=name, clearance=around)
     C, D = 1.5 * designer.random(rng), rng.standard_normal((5, 3))
-    shape = (len(LIMITS), 61, 3)
-    multipliers = _Multipliers(0.2)
-    multipliers._limits = rng.uniform(0.0, 0.05, shape)
-    h = 1e-6
+    shape = (len(LIMITS), 43, 3)
+    pairs = (len(around.pairs), 43)
+    held = rng.uniform(0.0, 0.05, shape), rng.uniform(0.0, 0.1, pairs) * (rng.random(pairs) < 0.3)
+    multipliers, h = _Multipliers(0.2, *held), 1e-6
     up, down = (designer._lagrangian(C + s * h * D, multipliers)[0] for s in (1, -1))
     slope = np.sum(designer._lagrangian(C, multipliers)[1] * D)
     assert slope == pytest.approx((up - down) / (2 * h), rel=1e-4)
@@ -64,7 +64,7 @@ def test_the_gradient_of_the_lagrangian_is_that_of_differences(designer, wrist, 
 
 def test_a_design_tells_more_than_random_motions_within_the_same_limits(designer, design):
     rng = np.random.default_rng(1)
-    random = [designer._looked_at(designer.random(rng))[0] for _ in range(100)]
+    random = [designer._objective(designer.random(rng)) for _ in range(100)]
     assert design.objective < min(random) - 0.2
     assert design.used.max() <= 1.0
     assert (design.used.max(axis=1) > 0.9).sum() >= 2  # it goes to its limits
@@ -97,7 +97,7 @@ def test_what_is_known_already_is_not_asked_for_again(designer, design):
     rows = designer.information.rows(*(design.motion.evaluate(np.linspace(0, 4.0, 61))))
     told = designer.matrix(rows)
     next_one = replace(designer, given=told)
-    again = next_one._looked_at(design.motion.coefficients)[0]
+    again = next_one._objective(design.motion.coefficients)
     fresh = next_one.design(np.random.default_rng(4), starts=1)
     assert fresh.objective < again - 0.02
 
@@ -128,10 +128,10 @@ def test_a_design_keeps_clear_of_what_stands_around(wrist, designer):
     wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
     around = Clearance(wrist, least=0.01, boxes=[wall])
     found = replace(designer, clearance=around).design(np.random.default_rng(5), starts=1)
-    assert found.contact is None or found.contact.distance >= 0.01
+    assert found.contact is None or found.contact.margin >= 0.0
     t = np.linspace(0.0, 4.0, 4001)
     near = around.near(around.poses(found.motion.evaluate(t)[0]), 0.05, around.everything)
-    assert near.distance.min() >= 0.01
+    assert (near.distance.min(axis=1) >= around.kept).all()
 
 
 def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
@@ -141,7 +141,7 @@ def test_what_keeps_a_robot_from_resting_is_named(wrist, designer):
     with pytest.raises(SettingsError, match=r"wrist_1_joint needs \d+ % of its torque limit"):
         replace(designer, limits=limits).design(np.random.default_rng(0), starts=1)
     inside = Clearance(wrist, boxes=[Box("room", (-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))])
-    with pytest.raises(SettingsError, match="the nearest links or obstacles are at most"):
+    with pytest.raises(SettingsError, match=r"in the best of them \w+ and room are -\d+"):
         replace(designer, clearance=inside).design(np.random.default_rng(0), starts=1)
 
 
@@ -161,20 +161,58 @@ def test_a_motion_whose_middle_collides_is_mixed_with_one_that_keeps_the_limits(
     C[0] += np.pi / 2 * np.array([1.0, 1.0, 0.0])  # the middle, about which it would be scaled
     assert not near.can_rest(C[:1])[0]
     mixed = near._towards(kept, C, 0.997)
-    _, used, distance, _ = near._looked_at(mixed)
+    used, margin, _ = near._kept(mixed, 1.0)
     share = np.linalg.norm(mixed - kept) / np.linalg.norm(C - kept)
     assert 0.0 < share < 1.0
     assert np.abs(used).max() <= 0.997
-    assert distance >= 0.01
+    assert margin >= 0.0
+    used, margin, _ = near._kept(mixed + 2e-3 * (C - kept), 1.0)
+    assert np.abs(used).max() > 0.995 or margin < 1e-3  # it can hardly go farther
 
 
 def test_multipliers_push_as_hard_on_a_finer_grid():
-    coarse = _Multipliers(0.2)
-    coarse._limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
-    coarse._distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))
-    fine = coarse.finer(3)
-    assert fine._limits.shape == (6, 181, 3)
-    np.testing.assert_allclose(fine._limits[:, ::3], coarse._limits / 3)
-    between = (2 * coarse._distances[:, :-1] + coarse._distances[:, 1:]) / 9
-    np.testing.assert_allclose(fine._distances[:, 1::3], between)
+    limits = np.random.default_rng(0).uniform(0.0, 0.1, (6, 61, 3))
+    distances = np.random.default_rng(1).uniform(0.0, 0.1, (4, 61))
+    fine = _Multipliers(0.2, limits, distances).finer(3)
+    assert fine.limits.shape == (6, 181, 3)
+    np.testing.assert_allclose(fine.limits[:, ::3], limits / 3)
+    between = (2 * distances[:, :-1] + distances[:, 1:]) / 9
+    np.testing.assert_allclose(fine.distances[:, 1::3], between)
     assert fine.weight == pytest.approx(0.2 / 3)
+
+
+def test_distances_without_a_cost_are_not_looked_at_and_change_nothing(wrist, designer):
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    around = Clearance(wrist, least=0.01, boxes=[wall])
+    near, rng = replace(designer, clearance=around), np.random.default_rng(2)
+    C = near.random(rng)
+    _, _, rows = near._kept(C)
+    pairs = len(around.pairs), 43
+    held = _Multipliers(0.2, 0.0, rng.uniform(0.0, 0.05, pairs) * (rng.random(pairs) < 0.5))
+    aim = near._wanted
+    some, every = (
+        held.of_distances(around.near(rows.state, within).distance, aim)
+        for within in (held.reach(aim), np.inf)
+    )
+    assert some[0] == pytest.approx(every[0], rel=1e-12)
+    np.testing.assert_allclose(some[1], every[1], atol=1e-12)
+    looked_at = len(around.near(rows.state, held.reach(aim)).pairs)
+    assert 0 < looked_at < len(around.near(rows.state, np.inf).pairs) / 2
+
+
+def test_the_compiled_way_finds_the_same(wrist, designer):
+    pytest.importorskip("numba")
+    wall = Box("wall", (-2.0, 0.35, -2.0), (2.0, 0.40, 2.0))
+    plain, fast = (
+        replace(
+            designer,
+            clearance=Clearance(wrist, least=0.01, boxes=[wall], is_fast=is_fast),
+            information=replace(designer.information, is_fast=is_fast),
+        )
+        for is_fast in (False, True)
+    )
+    C = 1.5 * plain.random(np.random.default_rng(6))
+    held = _Multipliers(0.2)
+    one, other = plain._lagrangian(C, held), fast._lagrangian(C, held)
+    assert other[0] == pytest.approx(one[0], rel=1e-9)
+    np.testing.assert_allclose(other[1], one[1], rtol=1e-9, atol=1e-9 * np.abs(one[1]).max())

@@ -3,8 +3,9 @@ import pytest
 
 from robotid.excitation.basis import FourierBasis
 from robotid.excitation.clearance import Clearance
+from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
-from robotid.excitation.limits import MotionLimits
+from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.routes import Route, design_stands, design_sweeps
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -38,6 +39,11 @@ def test_a_route_rests_cruises_and_its_derivatives_are_true():
 
 def test_sweeps_go_both_ways_at_each_speed_while_the_others_rest(designer, rng):
     design = design_sweeps(designer, rng, speeds=(0.1, 0.4))
+    # the page shows what was checked, at the same instants
+    kinds = [k for k, kind in enumerate(LIMITS) if kind != "jerk"]
+    shown = Course.of_design(designer, design)
+    np.testing.assert_allclose(shown.largest[kinds], design.used[kinds], rtol=1e-9)
+    assert len(shown.t) - 1 == round(100 * design.duration)
     assert design.used.max() <= 1.0
     assert design.contact is None or design.contact.distance >= 0.01
     t = np.arange(0.0, design.motion.duration, 0.01)

@@ -1,7 +1,11 @@
 """Writers of log files as robots write them: each format by its own library."""
 
+import json
+
 import hdf5storage
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import scipy.io
 from mcap.writer import Writer as McapLibraryWriter
 from mcap_ros2.writer import Writer as McapWriter
@@ -194,3 +198,37 @@ def write_idl_controller(path, log):
             writer.add_message(channel, to_ns(t), bytes(raw), to_ns(t))
         writer.finish()
     return path
+
+
+def write_lerobot(folder, episodes, names, *, version="v2.1", rate=50):
+    """Write {episode: (state, action)} as a LeRobot dataset: version 2 has a file per episode."""
+    width = next(iter(episodes.values()))[0].shape[1]
+    features = {
+        name: {"dtype": "float32", "shape": [width], "names": names[name]}
+        for name in ("observation.state", "action")
+    }
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    info = {"codebase_version": version, "total_episodes": len(episodes), "fps": rate}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info | {"features": features}))
+    chunk = folder / "data" / "chunk-000"
+    chunk.mkdir(parents=True)
+    tables = {}
+    for number, (state, action) in episodes.items():
+        frames = np.arange(len(state))
+        vectors = pa.list_(pa.float32(), width)
+        tables[number] = pa.table(
+            {
+                "observation.state": pa.array(list(state.astype(np.float32)), vectors),
+                "action": pa.array(list(action.astype(np.float32)), vectors),
+                "timestamp": pa.array((frames / rate).astype(np.float32)),
+                "frame_index": frames,
+                "episode_index": np.full(len(state), number),
+            }
+        )
+    if version.startswith("v3"):
+        pq.write_table(pa.concat_tables(tables.values()), chunk / "file-000.parquet")
+        return folder
+    for number, table in tables.items():
+        pq.write_table(table, chunk / f"episode_{number:06d}.parquet")
+    return folder

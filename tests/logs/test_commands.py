@@ -1,5 +1,6 @@
 """Logs of what was commanded: read of every format, with torque or without, or refused by name."""
 
+import json
 import sqlite3
 from dataclasses import replace
 
@@ -13,8 +14,10 @@ from helpers.recorders import (
     write_bag2,
     write_controller,
     write_idl_controller,
+    write_lerobot,
 )
 
+from robotid.commands.convert import convert
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.survey import survey_log
 from robotid.logs.data import COLUMNS, Log
@@ -383,3 +386,87 @@ def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
     write_log(make_log(), tmp_path / "run.csv")
     with pytest.raises(SettingsError, match=r"the topic of a bag, but run\.csv is none"):
         read_log(tmp_path / "run.csv", JOINTS, needs="commands", source=COMMANDS)
+
+
+# --- LeRobot --------------------------------------------------------------------------------------
+
+DEGREES = LogUnits(angle="deg")
+MOTORS = {
+    "v2.0": {"observation.state": {"motors": list(JOINTS)}, "action": {"motors": list(JOINTS)}},
+    "v2.1": {key: list(JOINTS) for key in ("observation.state", "action")},
+    "v3.0": {key: [f"{j}.pos" for j in JOINTS] for key in ("observation.state", "action")},
+}
+
+
+def dataset(folder, version="v2.1", episodes=(0,)):
+    logs = {number: make_log(100 + number) for number in episodes}
+    moves = {n: (np.rad2deg(log.q) + n, np.rad2deg(log.q_ref)) for n, log in logs.items()}
+    return write_lerobot(folder / "arm", moves, MOTORS[version], version=version)
+
+
+@pytest.mark.parametrize("version", MOTORS)
+def test_an_episode_of_lerobot_is_read(tmp_path, version):
+    path, log = dataset(tmp_path, version), make_log(100)
+    back = read_log(path, JOINTS[::-1], needs="commands", units=DEGREES).select(JOINTS)
+    np.testing.assert_allclose(back.t, np.arange(100) / 50, atol=1e-6)
+    np.testing.assert_allclose(back.q, log.q, atol=1e-6)
+    np.testing.assert_allclose(back.q_ref, log.q_ref, atol=1e-6)
+    assert (back.has_torque, back.v_ref) == (False, None)
+    assert back.notes == (
+        "episode 0; its time stamps are the numbers of the frames over their rate, so what was "
+        "sent and measured may be a frame apart",
+    )
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_one_episode_of_several_is_stated(tmp_path, version):
+    path = dataset(tmp_path, version, episodes=(0, 3, 12))
+    with pytest.raises(DataError, match=r"arm holds 3 episodes: episode_0, episode_12, episode_3"):
+        read_log(path, JOINTS, needs="commands", units=DEGREES)
+    for topic in ("episode_3", "3", "episode_000003"):
+        source = LogSource(topic=topic)
+        log = read_log(path, JOINTS, needs="commands", units=DEGREES, source=source)
+        assert len(log.t) == 103
+        np.testing.assert_allclose(log.q, make_log(103).q + np.deg2rad(3), atol=1e-6)
+    with pytest.raises(
+        DataError, match=r"no episode 'episode_4'; episodes: episode_0, episode_3, "
+    ):
+        read_log(path, JOINTS, units=DEGREES, source=LogSource(topic="episode_4"))
+
+
+def test_a_dataset_is_converted_without_its_unit(tmp_path):
+    done = convert(dataset(tmp_path), tmp_path / "run.csv")
+    assert done.joints == JOINTS
+    back = read_log(tmp_path / "run.csv", JOINTS, needs="commands", units=DEGREES)
+    np.testing.assert_allclose(back.q_ref, make_log(100).q_ref, atol=1e-6)
+
+
+def test_normalised_positions_are_no_angles(tmp_path):
+    with pytest.raises(DataError) as error:
+        read_log(dataset(tmp_path), JOINTS, needs="commands")
+    assert error.value.code == "angle_unit"
+    assert str(error.value).startswith(
+        "arm: the unit of LeRobot's positions is not in its files. By default they are normalised"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (
+            lambda info: info["features"]["action"].update(names=None),
+            "no names of the motors in ac",
+        ),
+        (lambda info: info["features"]["action"].update(names=["a", *JOINTS]), "at least 3 motors"),
+        (lambda info: info.pop("features"), "is no description of a LeRobot dataset of version 2"),
+        (lambda info: info.update(features={"image": {}}), "neither observation.state nor action"),
+    ],
+)
+def test_datasets_that_do_not_fit_are_refused(tmp_path, change, text):
+    path = dataset(tmp_path)
+    file = path / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    change(info)
+    file.write_text(json.dumps(info))
+    with pytest.raises(DataError, match=text):
+        read_log(path, JOINTS, needs="commands", units=DEGREES)

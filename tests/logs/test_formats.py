@@ -315,7 +315,8 @@ def test_messages_that_do_not_fit_together_are_refused(tmp_path):
 
 def test_a_folder_that_is_no_bag_is_refused(tmp_path):
     with refused(
-        f"{tmp_path.name} is a folder without metadata.yaml, so not a ROS 2 bag; name the .mcap or "
+        f"{tmp_path.name} is a folder without metadata.yaml, so not a ROS 2 bag, and without "
+        "meta/info.json, so not a LeRobot dataset; name the .mcap or "
         ".db3 file in it, or restore it with 'ros2 bag reindex'"
     ):
         read_log(tmp_path, JOINTS)

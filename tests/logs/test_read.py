@@ -510,7 +510,8 @@ def test_other_suffixes_are_refused(tmp_path):
     known = ".csv, .parquet, .npz, .h5, .hdf5, .mat"
     for path in (tmp_path / "run.xlsx", "run.xlsx"):
         with refused(
-            f"run.xlsx: logs are {known}, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag, "
+            f"run.xlsx: logs are {known}, .mcap, .db3 or .bag files, or the folder of a ROS 2 bag "
+            "or of a LeRobot dataset, "
             "not '.xlsx'; convert it"
         ):
             read_log(path, ["a"])

@@ -57,3 +57,17 @@ def test_a_floating_base_is_refused():
     model = RobotModel.from_urdf(URDF / "planar_2r.urdf", free_flyer=True)
     with pytest.raises(DataError, match="the base floats"):
         MotionRegressor(model)
+
+
+def test_the_compiled_way_gives_the_same_rows_and_gradient(model):
+    pytest.importorskip("numba")
+    rng = np.random.default_rng(3)
+    *_, motion = states(model, rng, samples=7)
+    plain, fast = MotionRegressor(model), MotionRegressor(model, is_fast=True)
+    one, other = plain(*motion), fast(*motion)
+    np.testing.assert_allclose(other.rows, one.rows, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(other.p, one.p, atol=1e-12)
+    weights = rng.standard_normal(one.rows.shape)
+    expected = plain.pull(one, weights)
+    size = np.abs(np.array(expected)).max()
+    np.testing.assert_allclose(fast.pull(other, weights), expected, rtol=1e-9, atol=1e-12 * size)

@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 from helpers.browsing import until
 from helpers.browsing import visit as visit_large
+from helpers.paths import URDF
 from helpers.synthetic import payload_log
 from PIL import Image
 
@@ -55,7 +56,7 @@ def page(ur5, tmp_path_factory):
         ur5, T, q,
         torques=Torques(T, tau, {"fit": FIT}, NOISE),
         masses={"URDF": pi, "fit": heavier},
-        ghost=("designed </script>", T, q + 0.3),
+        ghosts={"designed </script>": (T, q + 0.3)},
         bands=Bands(T, ["elbow.m", "wrist.m"], ["kg", "kg"], theta, 0.1 + 0 * theta),
         marks=[Mark(T[0] + 3.0, "payload <b>2 kg</b>", "payload", ur5.joints[2])],
     )  # fmt: skip
@@ -111,16 +112,16 @@ def test_the_robot_is_drawn_where_pinocchio_says(still, ur5):
     seen = still
     for row in (0, 130, 400):
         seen.page.evaluate(f"replay.seek({T[row]})")
-        for which, shift in (("robot", 0.0), ("ghost", 0.3)):
+        for which, shift in (("robot", 0.0), ("ghosts[0]", 0.3)):
             pin.forwardKinematics(ur5.pin_model, data, q[row] + shift)
             for M, drawn in zip(list(data.oMi), poses(seen, which), strict=True):
                 # keyframes are 1/30 s apart, and straight lines between them
                 np.testing.assert_allclose(drawn, M.homogeneous, atol=2e-3)
     shown = pixels(seen)
-    seen.page.evaluate("replay.robot.root.visible = replay.ghost.root.visible = false")
+    seen.page.evaluate("replay.robot.root.visible = replay.ghosts[0].root.visible = false")
     seen.page.evaluate("replay.viewer.set_dirty()")
     differs = np.abs(shown - pixels(seen)).max(axis=2) > 30
-    seen.page.evaluate("replay.robot.root.visible = replay.ghost.root.visible = true")
+    seen.page.evaluate("replay.robot.root.visible = replay.ghosts[0].root.visible = true")
     assert 0.01 < differs.mean() < 0.6
 
 
@@ -550,3 +551,47 @@ def test_the_live_page_follows_a_running_tracker_and_ends_on_ctrl_c(browser, pan
         run.wait()
         run.stderr.close()
         run.stdout.close()
+
+
+def test_ghosts_of_positions_may_stand_farther_away(browser, arm_page):
+    """Positions have no torque arcs; the difference of a ghost is shown ten times as large."""
+    with visit(browser, arm_page) as seen:
+        seen.page.evaluate("replay.pause()")
+        seen.page.wait_for_timeout(300)
+        assert seen.errors == []
+        said = seen.page.locator("#switches").inner_text()
+        assert "ghost: simulated" in said
+        assert "ghost: commanded" in said
+        assert "torque" not in said
+        assert not seen.page.locator("#arcs").is_visible()
+        assert seen.page.locator("#plots h2").inner_text() == "Position"
+        seen.page.evaluate("replay.seek(0)")
+        turned = [relative_turn(seen, which) for which in ("ghosts[0]", "ghosts[1]")]
+        np.testing.assert_allclose(turned, [0.01, 0.05], atol=1e-4)
+        seen.page.get_by_label("ghosts 10 × as far away").click()
+        seen.page.evaluate("replay.seek(0)")
+        np.testing.assert_allclose(relative_turn(seen, "ghosts[0]"), 0.1, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def arm_page(tmp_path_factory):
+    """A planar arm, its first joint simulated 0.01 rad and commanded 0.05 rad farther."""
+    arm = RobotModel.from_urdf(URDF / "planar_2r.urdf")
+    t = np.linspace(0.0, 2.0, 100)
+    q = np.stack([np.sin(t), np.cos(t)], axis=1)
+    others = {
+        label: q + np.array([x, 0.0]) for label, x in (("simulated", 0.01), ("commanded", 0.05))
+    }
+    made = replay(
+        arm, t, q,
+        torques=Torques(t, q, others, np.array([0.05, 0.05]), "position"),
+        ghosts={label: (t, x) for label, x in others.items()},
+    )  # fmt: skip
+    return made.write(tmp_path_factory.mktemp("positions") / "page.html")
+
+
+def relative_turn(seen, which):
+    """Return by how much the first joint of a ghost is turned against the robot's [rad]."""
+    own, other = poses(seen, "robot")[1], poses(seen, which)[1]
+    R = own[:3, :3].T @ other[:3, :3]
+    return np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))

@@ -76,11 +76,11 @@ def test_the_page_fetches_nothing_and_cannot_be_injected(page):
 def test_text_from_files_stays_text(arm, motion):
     bad = "</script><img src=x onerror=alert(1)>"
     marks = [Mark(5.5, bad, "payload")]
-    html = replay(arm, *motion, marks=marks, notes=[bad], ghost=(bad, *motion)).html
+    html = replay(arm, *motion, marks=marks, notes=[bad], ghosts={bad: motion}).html
     assert "<img" not in html
     assert html.count("</script>") == 5
     data = shown(html)
-    assert (data["marks"][0]["label"], data["ghost"]["label"]) == (bad, bad)
+    assert (data["marks"][0]["label"], data["ghosts"][0]["label"]) == (bad, bad)
     assert data["marks"][0]["t"] == pytest.approx(5.5)
 
 
@@ -196,11 +196,11 @@ def test_bands_are_those_of_their_parameter(arm, motion):
 
 def test_the_ghost_is_the_second_motion(arm, motion):
     t, q = motion
-    data = shown(replay(arm, t, q, ghost=("old", t + 3.0, 0.5 * q + 0.25)).html)
-    assert data["ghost"]["label"] == "old"
-    np.testing.assert_allclose(data["ghost"]["q"][-1], 0.5 * q[-1] + 0.25, rtol=1e-5)
+    data = shown(replay(arm, t, q, ghosts={"old": (t + 3.0, 0.5 * q + 0.25)}).html)
+    assert data["ghosts"][0]["label"] == "old"
+    np.testing.assert_allclose(data["ghosts"][0]["q"][-1], 0.5 * q[-1] + 0.25, rtol=1e-5)
     np.testing.assert_allclose(data["motion"]["q"][-1], q[-1], rtol=1e-5)
-    assert data["ghost"]["t"][0] == 0.0
+    assert data["ghosts"][0]["t"][0] == 0.0
 
 
 def test_marks_are_told_in_order_with_their_kind(arm, motion):

@@ -72,7 +72,7 @@ class Arc { // around a joint's axis, or a bar along it; grows with the torque f
 
 const arcs = [];
 let showsArcs = true, tints = false;
-if (torques && viewer) {
+if (isTorque && viewer) {
   const crowd = Math.min(1, 3 / Math.sqrt(count)); // many joints have small arcs
   const radius = crowd * Math.max(0.06 * data.scene.reach, 0.05 * data.view.radius);
   torques.joints.forEach(({ node }) => {
@@ -85,12 +85,14 @@ if (torques && viewer) {
 }
 
 function showArcs(row) {
-  arcs.forEach(({ measured, predicted }, j) => {
+  torques.joints.forEach(({ node }, j) => {
+    const colour = residualColour(residualShare(row, j));
+    if (tints) robot.tint(node, colour);
+    if (!arcs.length) return;
+    const { measured, predicted } = arcs[j];
     measured.show(row[j] / (largest[j] || 1));
     if (predicted) predicted.show(row[count + j] / (largest[j] || 1));
-    const colour = residualColour(residualShare(row, j));
     measured.material.color.set(colour);
-    if (tints) robot.tint(torques.joints[j].node, colour);
   });
 }
 

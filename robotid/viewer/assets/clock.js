@@ -5,7 +5,7 @@ const SLOW = 0.045; // [s] a frame
 const COARSEST = 0.5; // share of the pixels' width that a slow processor draws at least
 const clock = { time: data.start, playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
   speed: 1, loop: true, follow: Boolean(data.live), start: data.start, end: 0, frames: 0, at: 0 };
-clock.end = Math.max(motion.end, ghostMotion ? ghostMotion.end : data.start);
+clock.end = Math.max(motion.end, ...ghostMotions.map(({ end }) => end));
 const slider = byId("time"), clockText = byId("clock"), playButton = byId("play");
 let shown = null, told = null, spoken = -Infinity;
 const digits = (time) => time.toFixed(2);
@@ -24,8 +24,11 @@ function showRobot(time) {
   const row = motion.at(time);
   robot.pose(row);
   follow(row);
-  if (ghost) ghost.pose(ghostMotion.at(time));
-  if (arcs.length && torqueTable.rows.length) showArcs(torqueTable.at(time));
+  ghosts.forEach((ghost, k) => {
+    const own = ghostMotions[k].at(time); // how far it is from the robot may be shown larger
+    ghost.pose(boost === 1 ? own : own.map((x, i) => row[i] + boost * (x - row[i])));
+  });
+  if (torques && torqueTable.rows.length) showArcs(torqueTable.at(time));
   viewer.set_dirty();
 }
 

@@ -54,15 +54,23 @@ function drawSwitches() {
   const add = (label, checked, act) => place.append(box(label, checked, act).label);
   if (viewer) {
     add("see through the robot", false, (on) => { seeThrough = on; showMasses(); });
-    if (arcs.length) add("torque arcs", true, (on) => { showsArcs = on; chooseArcs(); });
+    if (isTorque) add("torque arcs", true, (on) => { showsArcs = on; chooseArcs(); });
     if (predictions) add("links coloured by residual", false, tint);
-    if (ghost) add(`ghost: ${data.ghost.label}`, true, (on) => { ghost.root.visible = on; });
+    ghosts.forEach((ghost, k) => {
+      const made = box(`ghost: ${data.ghosts[k].label}`, true, (on) => { ghost.root.visible = on; });
+      made.label.style.setProperty("--key", GHOSTS[k % GHOSTS.length]);
+      made.label.classList.add("key");
+      place.append(made.label);
+    });
+    if (torques && !isTorque && !floats)
+      add(`ghosts ${BOOST} × as far away`, false, (on) => { boost = on ? BOOST : 1; shown = null; });
     if (floats) add("camera follows the robot", true, (on) => { follows = on; });
     add(`grid of ${cell} m`, true, (on) => { ground.visible = on; });
     add("frames", false, showFrames);
     add("names", false, showNames);
   }
   byId("residuals").hidden = !predictions;
+  byId("arcs").hidden = !isTorque;
   byId("most").textContent = `${scale.full} × ${scale.unit}`;
   if (masses.length) place.after(massTable());
 }

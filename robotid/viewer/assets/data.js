@@ -56,11 +56,12 @@ class Table { // times of the log and rows of numbers; in the page times are fro
 }
 
 const motion = new Table(data.motion.t, data.motion.q);
-const ghostMotion = data.ghost ? new Table(data.ghost.t, data.ghost.q) : null;
+const ghostMotions = data.ghosts.map(({ t, q }) => new Table(t, q));
 const torques = data.torques;
 // one row: measured of every joint, then each prediction of every joint
 const torqueTable = torques ? new Table(torques.t, torques.values) : null;
 const count = torques ? torques.joints.length : 0;
+const isTorque = torques && torques.quantity === "torque"; // else positions, which have no arcs
 const predictions = torques ? torques.labels.length - 1 : 0;
 const bands = data.bands;
 const bandTable = bands ? new Table(bands.t, bands.values) : null; // values, then standard errors

@@ -39,9 +39,10 @@ function torqueRows(j) { // measured, predicted, and what the first prediction l
 }
 
 function drawTorques() {
-  const tones = torques.labels.map((_, k) => ["text", "predicted"][k] || `tone-${k + 1}`);
+  const tones = torques.labels.map((label, k) => ["text", "predicted"][k]
+    || (label === "commanded" ? "tone-5" : `tone-${k + 1}`));
   const marks = data.marks.map(({ t }) => t);
-  const section = element("section", {}, element("h2", {}, "Torque"));
+  const section = element("section", {}, element("h2", {}, isTorque ? "Torque" : "Position"));
   byId("plots").append(section);
   torques.joints.forEach(({ name, unit, node }, j) => {
     const heading = element("button", { type: "button", class: "plain" }, name);
@@ -53,8 +54,8 @@ function drawTorques() {
       ({ label, tone: tones[k], kind: "line", y: ys[k], half: null, faint: k > 1 }));
     if (predictions) series.push(
       { label: "residual", tone: "residual", kind: "line", y: ys[ys.length - 1], half: null });
-    torqueCharts.push(new charts.Chart(place, { title: `torque of ${name} over time`, link: "time",
-      x: torqueTable.t, series, x_label: "time [s]", y_label: `torque [${unit}]`,
+    torqueCharts.push(new charts.Chart(place, { title: `${torques.quantity} of ${name} over time`, link: "time",
+      x: torqueTable.t, series, x_label: "time [s]", y_label: `${torques.quantity} [${unit}]`,
       spans: levels ? resting(j) : [], marks, logarithmic: "", height: 100 }));
   });
 }

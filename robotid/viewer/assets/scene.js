@@ -110,8 +110,12 @@ class Robot { // the nodes of one robot in the viewer's tree, posed by a row of 
 }
 
 const robot = viewer && new Robot("robot", (color, side) => new THREE.MeshLambertMaterial({ color, side }));
-const ghost = viewer && ghostMotion && new Robot("ghost", () => new THREE.MeshPhongMaterial(
-  { color: "#3b82f6", transparent: true, opacity: 0.3, depthWrite: false }));
+const GHOSTS = ["#3b82f6", "#d9820f", "#3a9d5d"];
+const BOOST = 10;
+let boost = 1; // times that a ghost stands away from the robot
+const ghosts = !viewer ? [] : ghostMotions.map((_, k) => new Robot(`ghost ${k}`,
+  () => new THREE.MeshPhongMaterial({ color: GHOSTS[k % GHOSTS.length], transparent: true,
+    opacity: 0.3, depthWrite: false })));
 const floats = data.scene.nodes.some((node) => node.kind === "free");
 
 // ---- light and ground ------------------------------------------------------------------------

@@ -20,7 +20,7 @@ requestAnimationFrame(tick);
 // for scripts and notebooks: the clock, and the world pose of every node as 16 numbers by columns
 window.replay = { clock, seek, play, pause, pick, draw, pace, viewer, motion, arcs, masses,
   level, bins, torqueCharts, bandCharts,
-  ghost, robot, get picked() { return picked && data.scene.nodes[picked].name; },
+  ghosts, robot, get picked() { return picked && data.scene.nodes[picked].name; },
   poses: (which = robot) => {
     which.root.updateMatrixWorld(true);
     const inverse = viewer.scene.matrixWorld.clone().invert();

@@ -1,0 +1,212 @@
+"""Drives that follow position commands, as an identification from commands found them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.findings import listed
+from robotid.logs.data import Log
+from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.robot.model import RobotModel
+from robotid.robot.tree import Joint
+from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
+
+__all__ = [
+    "CommandedDrive",
+    "commanded_drives",
+    "follow_commands",
+    "limit_of",
+    "loops_of",
+    "with_mean_friction",
+]
+
+_POSITIONS = 200  # at which friction that depends on the position is averaged
+#: Parameters of a joint's controller, 0 where a result has none.
+_OF_CONTROLLER = ("kd", "delay", "zero")
+_OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
+
+
+@dataclass(frozen=True)
+class CommandedDrive:
+    """A joint whose drive follows a position command.
+
+    The drive gives tau = kp (q_ref(t - delay) - q) - kd v, within +-effort_limit, and moves the
+    bodies with tau - armature a - viscous v - coulomb sign(v) - offset. Its encoder reads
+    q = q_urdf - zero.
+
+    Attributes:
+        joint: Its name.
+        kp: Torque per error [N m/rad or N/m].
+        kd: Torque per speed [N m s/rad or N s/m].
+        delay: How late a command acts [s].
+        zero: Position of the URDF at which the encoder reads 0 [rad or m].
+        armature: Inertia of the rotor behind its gear [kg m^2 or kg].
+        viscous: Viscous friction [N m s/rad or N s/m].
+        coulomb: Coulomb friction [N m or N].
+        offset: Constant torque [N m or N].
+        effort_limit: The most that it gives, inf if the controller states none [N m or N].
+    """
+
+    joint: str
+    kp: float
+    kd: float
+    delay: float
+    zero: float
+    armature: float
+    viscous: float
+    coulomb: float
+    offset: float
+    effort_limit: float
+
+
+def commanded_drives(
+    model: RobotModel, pi: Array, content: Mapping[str, Any], name: str
+) -> tuple[CommandedDrive, ...]:
+    """Return the drives of a result that has gains, joint by joint; none if it has no gains.
+
+    Args:
+        model: The identified robot.
+        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        content: Content of its result.json.
+        name: The file, for messages.
+
+    Raises:
+        DataError: If some joints have gains and others none, or a gain or a delay is impossible.
+    """
+    stated = {entry["name"]: float(entry["value"]) for entry in content["drive_parameters"]}
+    if not any(f"{joint}.kp" in stated for joint in model.joints):
+        return ()
+    missing = [joint for joint in model.joints if f"{joint}.kp" not in stated]
+    if missing:
+        raise DataError(
+            f"{name} has gains of some joints and no kp of {listed(missing)}; identify again with "
+            "[controller] gains of every joint"
+        )
+    for joint in model.joints:
+        for term, wanted, is_right in (
+            ("kp", "more than 0", stated[f"{joint}.kp"] > 0),
+            ("kd", "0 or more", stated.get(f"{joint}.kd", 0.0) >= 0),
+            ("delay", "0 or more", stated.get(f"{joint}.delay", 0.0) >= 0),
+        ):
+            if not is_right:
+                value = stated[f"{joint}.{term}"]
+                raise DataError(f"{name}: {joint}.{term} is {value:g}, wanted {wanted}")
+    controller = content.get("simulation", {}).get("controller", {})
+    efforts = controller.get("effort_limit") or {}
+    found = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    return tuple(
+        CommandedDrive(
+            joint,
+            stated[f"{joint}.kp"],
+            **{key: stated.get(f"{joint}.{key}", 0.0) for key in _OF_CONTROLLER},
+            **{key: found.get(f"{joint}.{key}", 0.0) for key in _OF_DRIVE},
+            effort_limit=stated.get(f"{joint}.limit") or efforts.get(joint, np.inf),
+        )
+        for joint in model.joints
+    )
+
+
+def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> Loops:
+    """Return bodies, drives and loops as roll-outs take them.
+
+    Args:
+        model: The identified robot.
+        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        drives: Its drives; armature, friction and offset are those of pi.
+    """
+    layout, n = model.layout, model.layout.n_inertial
+    terms: list[list[DriveTerm]] = [[] for _ in drives]
+    values: list[list[float]] = [[] for _ in drives]
+    for (d, term), value in zip(layout.drive_parameters, pi[n:].tolist(), strict=True):
+        if not term.is_inertia:
+            terms[d].append(term)
+            values[d].append(value)
+    figures = {
+        key: np.array([getattr(drive, key) for drive in drives])
+        for key in ("armature", "kp", "kd", "delay", "zero")
+    }
+    return Loops(
+        bodies=pi[:n].reshape(-1, 10),
+        limit=np.array([drive.effort_limit for drive in drives]),
+        terms=tuple(map(tuple, terms)),
+        values=np.concatenate(values),
+        **figures,
+    )
+
+
+def follow_commands(
+    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], log: Log
+) -> Array:
+    """Return the positions that a robot takes on the commands of a log, in open loop.
+
+    It starts as the log does, and again after each gap.
+
+    Args:
+        model: The identified robot.
+        pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        drives: Its drives.
+        log: The log, of its joints in its order, with commands.
+
+    Returns:
+        Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
+
+    Raises:
+        MissingDependencyError: If Numba is not installed.
+        NotConvergedError: If a step has no solution.
+        SettingsError: If a term of the drives cannot be rolled out.
+    """
+    robot, q = LoopedRobot(model), np.full_like(log.q, np.nan)
+    for out in robot.roll_out(loops_of(model, pi, drives), cut_windows(log, np.inf, 0.0)):
+        q[out.window.counted] = out.q
+    return q
+
+
+def limit_of(drive: CommandedDrive, joint: Joint) -> float:
+    """Return the most that a drive gives: the controller's limit, else the URDF's, else inf.
+
+    Args:
+        drive: The drive.
+        joint: Its joint as the URDF describes it.
+    """
+    return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)
+
+
+def with_mean_friction(model: RobotModel, pi: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return parameters whose Coulomb friction has the mean of what depends on the position.
+
+    Simulators have no friction that depends on the position. Its mean over the positions seen is
+    added to Coulomb's friction, and its own parameters become 0.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+
+    Returns:
+        Parameters, shape (p,), and a sentence on each joint that was changed.
+    """
+    layout, names, values, said = model.layout, model.layout.names, pi.copy(), []
+    means: dict[str, float] = {}
+    for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+        name = layout.drives[d].name
+        if term.guards == "q" and term.follows_direction and f"{name}.coulomb" in names and pi[k]:
+            means[name] = means.get(name, 0.0) + float(pi[k]) * _mean(term)
+            values[k] = 0.0
+    for name, mean in means.items():
+        values[names.index(f"{name}.coulomb")] += mean
+        said.append(
+            f"{name}: friction has {mean:+.3g} of what depends on the position, its mean over the "
+            "positions seen"
+        )
+    return values, tuple(said)
+
+
+def _mean(term: DriveTerm) -> float:
+    """Return the mean of a term's column over the positions seen, as it slides up."""
+    low, high = term.seen
+    q = low + (high - low) * (np.arange(_POSITIONS) + 0.5) / _POSITIONS
+    one = np.ones_like(q)
+    return float(np.mean(term.column(DriveMotion(q, one, 0 * q, one, 0 * q, 0 * q))))

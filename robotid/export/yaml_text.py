@@ -1,0 +1,45 @@
+"""YAML of plain values, written by hand so that no reader of YAML need be installed."""
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+__all__ = ["yaml_text"]
+
+_WIDEST = 120  # characters of a table in one line
+
+
+def yaml_text(table: Mapping[str, Any], head: str) -> str:
+    """Return a table as YAML, below a comment.
+
+    Args:
+        table: Tables, lists, text, numbers, booleans and None.
+        head: The comment's lines.
+    """
+    lines = [f"# {line}".rstrip() for line in head.splitlines()]
+    return "\n".join([*lines, *_lines(table, "")]) + "\n"
+
+
+def _lines(value: Mapping[str, Any], indent: str) -> Iterator[str]:
+    """Yield the lines of a table: one for each that holds no other table and fits a line."""
+    for key, entry in value.items():
+        name = f"{indent}{json.dumps(key, ensure_ascii=False)}:"
+        if isinstance(entry, Mapping) and (
+            any(isinstance(x, Mapping) for x in entry.values()) or len(_flow(entry)) > _WIDEST
+        ):
+            yield name
+            yield from _lines(entry, indent + "  ")
+        else:
+            yield f"{name} {_flow(entry)}"
+
+
+def _flow(entry: Any) -> str:  # noqa: ANN401
+    """Return a figure, a name, a list or a table in one line."""
+    if isinstance(entry, Mapping):
+        return "{" + ", ".join(f"{key}: {_flow(x)}" for key, x in entry.items()) + "}"
+    if isinstance(entry, list):
+        return "[" + ", ".join(map(_flow, entry)) + "]"
+    if isinstance(entry, float):  # YAML 1.1 reads 1e-05 as text, and 1.0e-05 as a number
+        mantissa, e, exponent = f"{entry:.6g}".partition("e")
+        return mantissa + (".0" if e and "." not in mantissa else "") + e + exponent
+    return json.dumps(entry, ensure_ascii=False)

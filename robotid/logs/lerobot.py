@@ -1,0 +1,167 @@
+"""LeRobot datasets, folders of version 2 or 3: an episode as a table of named columns."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.findings import listed
+from robotid.logs.data import suggestion
+from robotid.logs.parquet_files import load_pyarrow
+from robotid.logs.settings import LogSource
+from robotid.logs.table import Format, Table, choose, told
+
+__all__ = ["LeRobotFormat"]
+
+#: How the columns of each feature start, by what the names in it end with.
+_FEATURES: Mapping[str, Mapping[str, str]] = {
+    "observation.state": {"": "q", "pos": "q", "q": "q", "vel": "dq", "dq": "dq",
+                          "torque": "tau", "tau": "tau", "effort": "tau"},
+    "observation.velocity": {"": "dq"},
+    "observation.effort": {"": "tau"},
+    "action": {"": "qref", "pos": "qref", "q": "qref", "vel": "dqref", "dq": "dqref",
+               "torque": "tauref", "tau": "tauref", "effort": "tauref"},
+}  # fmt: skip
+_NORMALISED = (
+    "the unit of LeRobot's positions is not in its files. By default they are normalised, -100 to "
+    "100 over the calibrated range of each joint (a gripper's always, 0 to 100), and those are no "
+    "angles: record with use_degrees = true, or convert them with the robot's calibration. If "
+    'they are angles, state the unit: angle = "deg" or "rad" (job file table [units], CLI '
+    '--angle-unit deg, Python units=LogUnits(angle="deg"))'
+)
+
+
+class LeRobotFormat(Format):
+    """LeRobot datasets: positions of ``observation.state``, commanded ones of ``action``.
+
+    Time stamps are those of the episode, which LeRobot computes from the number of the frame. The
+    topic of the source is the episode, as ``episode_3``, where there are several.
+    """
+
+    def open(self, path: Path, source: LogSource) -> Table:
+        pa = load_pyarrow("reading LeRobot datasets")
+        columns = _columns(path, _features(path))
+        parts: dict[int, list[Path]] = {}  # files that hold an episode, by its number
+        with told(path, "LeRobot"):
+            for file in sorted(path.glob("data/**/*.parquet")):
+                numbers = pa.parquet.read_table(file, columns=["episode_index"])
+                for number in np.unique(numbers.column(0).to_numpy()):
+                    parts.setdefault(int(number), []).append(file)
+        number = _episode(path, sorted(parts), source.topic)
+        return Table(
+            ["time", *columns],
+            partial(_read, path, parts[number], number, columns),
+            notes=(
+                f"episode {number}; its time stamps are the numbers of the frames over their rate, "
+                "so what was sent and measured may be a frame apart",
+            ),
+            angle_unit=_NORMALISED,
+        )
+
+
+@dataclass(frozen=True)
+class _Column:
+    feature: str
+    place: int  # in its vectors
+
+
+def _features(path: Path) -> dict[str, Any]:
+    """Return what the dataset says of its columns."""
+    try:
+        info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+        features: dict[str, Any] = info["features"]
+        if not isinstance(features, dict):
+            raise TypeError(f"features is {features!r}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path.name}: meta/info.json is no description of a LeRobot dataset of version 2 or 3 "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    return features
+
+
+def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
+    """Return the columns of the motors that the dataset names, by standard name."""
+    columns: dict[str, _Column] = {}
+    for feature, starts in _FEATURES.items():
+        if feature not in features:
+            continue
+        names = features[feature].get("names")
+        if isinstance(names, dict):  # {"motors": [...]}, and the same in other words
+            names = [name for group in names.values() for name in group]
+        if not names:
+            raise DataError(
+                f"{path.name}: meta/info.json gives no names of the motors in {feature}; add "
+                f"their names, in the order of its {features[feature].get('shape')} values"
+            )
+        for place, name in enumerate(names):
+            joint, dot, end = str(name).rpartition(".")
+            if not dot or end not in starts:
+                joint, end = str(name), ""
+            columns[f"{starts[end]}_{joint}"] = _Column(feature, place)
+    if not columns:
+        raise DataError(
+            f"{path.name} has neither observation.state nor action; features: {listed(features)}"
+        )
+    return columns
+
+
+def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:
+    """Return the episode that is wanted, or the only one."""
+    names = [f"episode_{number}" for number in numbers]
+    if not names:
+        raise DataError(f"{path.name} has no episode: no data/**/*.parquet holds a row")
+    if wanted is None:
+        listing = f"each is a log of its own, {len(names)} in all"
+        chosen = names[0] if len(names) == 1 else choose(path.name, names, "episodes", listing)
+        return numbers[names.index(chosen)]
+    found = re.fullmatch(r"(?:episode_)?0*(\d+)", wanted)
+    if not found or int(found[1]) not in numbers:
+        raise DataError(
+            f"{path.name} has no episode {wanted!r}; episodes: {listed(names)}"
+            f"{suggestion(wanted, names)}"
+        )
+    return int(found[1])
+
+
+def _read(
+    path: Path,
+    files: Sequence[Path],
+    number: int,
+    columns: Mapping[str, _Column],
+    wanted: Sequence[str],
+) -> dict[str, Array]:
+    """Return columns of an episode, in the order of its frames."""
+    pa = load_pyarrow("reading LeRobot datasets")
+    used = {columns[name].feature for name in wanted if name != "time"}
+    names = ["timestamp", "episode_index", "frame_index", *sorted(used)]
+    with told(path, "LeRobot"):
+        parts = [pa.parquet.read_table(file, columns=names) for file in files]
+        table = pa.concat_tables(parts)
+        rows = np.flatnonzero(table.column("episode_index").to_numpy() == number)
+        rows = rows[np.argsort(table.column("frame_index").to_numpy()[rows], kind="stable")]
+        vectors = {
+            feature: np.array(table.column(feature).take(rows).to_pylist(), dtype=np.float64)
+            for feature in used
+        }
+        t = table.column("timestamp").to_numpy()[rows].astype(np.float64).ravel()
+    found: dict[str, Array] = {"time": t}
+    for name in wanted:
+        if name == "time":
+            continue
+        column = columns[name]
+        values = vectors[column.feature]
+        if values.ndim != 2 or column.place >= values.shape[1]:
+            raise DataError(
+                f"{path.name}: {column.feature} has vectors of shape {values.shape[1:]}, but "
+                f"meta/info.json names at least {column.place + 1} motors in it"
+            )
+        found[name] = values[:, column.place]
+    return {name: found[name] for name in wanted}

@@ -1,0 +1,481 @@
+"""The report of drives found from commands and positions: how well they follow, what they are."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotid._files import write_text
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.export.ranges import stated_ranges
+from robotid.findings import Finding, grouped, listed
+from robotid.identification.advice import Origin
+from robotid.pages.charts import Chart, Series, chart_html
+from robotid.pages.html import Cell, Section, code, folded, number, page, table, text, with_error
+from robotid.report.causes import causes_html
+from robotid.versions import __version__
+
+__all__ = ["Followed", "write_commanded_report"]
+
+#: What predicts a position beside the identified robot: key of its error, name, tone.
+_OTHERS = {
+    "second_order_rmse": ("second order", "tone-3"),
+    "urdf_rmse": ("URDF", "urdf"),
+    "command_rmse": ("command", "quiet"),
+}
+_ROWS = 24_000  # of all charts together: about half a MB
+_LONGEST = 3000  # rows of one chart
+_OPEN = 3  # joints whose charts are open at first
+_NAMED = 7  # joints whose errors over the horizon are drawn
+_FIRST = 3  # reasons of the verdict that are seen at once
+_SMALL = 1e-3  # of rad and m, which errors are shown in
+_ROLES = {"validation": "kept apart", "identification": "fitted"}
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A log of commands beside what the identified robot does on the same commands.
+
+    Attributes:
+        name: Its file and window, for captions.
+        is_kept: Whether it was kept apart from the fit.
+        t: Times, shape (N,) [s].
+        q_ref: Commanded positions, shape (N, n) [rad or m].
+        q: Measured ones, likewise.
+        q_sim: Simulated ones, likewise: an open loop from the first sample on.
+    """
+
+    name: str
+    is_kept: bool
+    t: Array
+    q_ref: Array
+    q: Array
+    q_sim: Array
+
+    def __post_init__(self) -> None:
+        for key in ("q_ref", "q", "q_sim"):
+            shape = getattr(self, key).shape
+            if shape != self.q.shape or len(shape) != 2 or shape[0] != len(self.t):
+                raise DataError(
+                    f"{self.name}: {key} has shape {shape}, wanted ({len(self.t)}, n) as q has"
+                )
+
+
+def write_commanded_report(
+    content: Mapping[str, Any],
+    followed: Sequence[Followed],
+    target: str | Path,
+    *,
+    files: Mapping[str, str] | None = None,
+    origin: Origin | None = None,
+) -> Path:
+    """Write what drives were found from commands and positions, as one HTML file.
+
+    The file fetches nothing. It is made beside its target and then put in place.
+
+    Args:
+        content: Content of the result.json.
+        followed: The logs to show.
+        target: The file to write.
+        files: Files beside it to link to, by what they are, as "URDF".
+        origin: Where the results are, for the commands that it shows; none if not said.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        DataError: If a log has other joints than the result, or the target has no folder.
+    """
+    joints = content["joints"]
+    for log in followed:
+        if log.q.shape[1] != len(joints):
+            raise DataError(f"{log.name} has {log.q.shape[1]} joints, the result {len(joints)}")
+    worst = [*_shown(content)["per_joint"]]
+    sections = {
+        "errors": Section("Errors", _errors(content)),
+        "positions": Section("Positions", _positions(content, followed, worst)),
+        "drives": Section("Drives", _drives(content)),
+        "open": Section("What cannot be told", _undetermined(content)),
+        "findings": Section("Findings", _findings(content)),
+        "appendix": Section("Appendix", _appendix(content)),
+    }
+    header = _verdict(content) + _facts(content, files or {}) + _first_charts(content)
+    header += _next(content, origin or Origin())
+    return write_text(page(f"{content['robot']}: drives from commands", header, sections), target)
+
+
+def _entries(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return errors by recording with its role, those kept apart first."""
+    found = content["simulation"]
+    return [(role, entry) for role in _ROLES for entry in found.get(role, [])]
+
+
+def _shown(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the errors that the first screen shows: kept apart, else fitted; worst joint first."""
+    entry = _entries(content)[0][1]
+    order = sorted(entry["per_joint"].items(), key=lambda item: -item[1]["rmse"])
+    return {**entry, "per_joint": dict(order)}
+
+
+def _name(entry: Mapping[str, Any]) -> str:
+    return f"{Path(entry['log']).name}, {entry['start']:.4g} to {entry['end']:.4g} s"
+
+
+def _unit(entry: Mapping[str, Any]) -> str:
+    """Return the unit that errors are shown in, "mrad or mm" if some joints slide."""
+    units = dict.fromkeys(each["unit"] for each in entry["per_joint"].values())
+    return " or ".join(f"m{unit}" for unit in units)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Return the geometric mean; None if a value is missing."""
+    if any(value is None or not value > 0 for value in values):
+        return None
+    return math.exp(float(np.mean(np.log(np.array(values, dtype=float)))))
+
+
+def _verdict(content: Mapping[str, Any]) -> str:
+    verdict = content["verdict"]
+    items = [f"<li>{escape(reason)}</li>" for reason in verdict["reasons"]]
+    more = "".join(items[_FIRST:])
+    if more:
+        title = f"{len(items) - _FIRST} more reason{'s' if len(items) > _FIRST + 1 else ''}"
+        more = f"<details><summary>{title}</summary><ul>{more}</ul></details>"
+    status = verdict["status"]
+    return (
+        f'<div class="verdict {status.replace(" ", "-")}"><h1>{escape(content["robot"])} '
+        f"<span>Verdict: <strong>{status}</strong></span></h1>"
+        f"<ul>{''.join(items[:_FIRST])}</ul>{more}</div>\n"
+    )
+
+
+def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
+    role, entry = _entries(content)[0]
+    joints = entry["per_joint"].values()
+    ours = _mean([each["rmse"] for each in joints])
+    size = number(ours and ours / _SMALL, ".3g").html
+    facts = {
+        f"Open-loop position error, {_ROLES[role]}": (
+            f"<strong>{size} {_unit(entry)}</strong>, geometric mean of {len(joints)} "
+            f"joint{'s' if len(joints) > 1 else ''}"
+        )
+    }
+    times = [
+        f"{label} {theirs / ours:.2g} ×"
+        for key, (label, _) in _OTHERS.items()
+        if ours and (theirs := _mean([each.get(key) for each in joints]))
+    ]
+    if times:
+        facts["By comparison, times that error"] = escape(", ".join(times))
+    found = sum(entry.get("std_error") is not None for entry in content["drive_parameters"])
+    stated = len(content["drive_parameters"]) - found
+    facts["Drive parameters"] = f"{found} found, {stated} stated or held"
+    if files:
+        facts["Files"] = ", ".join(
+            f'<a href="{escape(path)}">{escape(kind)}</a>' for kind, path in files.items()
+        )
+    cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in facts.items())
+    return f'<dl class="facts">{cells}</dl>\n'
+
+
+def _first_charts(content: Mapping[str, Any]) -> str:
+    """Return errors by joint beside those of models, and errors over the horizon."""
+    role, shown = _entries(content)[0][0], _shown(content)
+    joints = shown["per_joint"]
+    kinds = {"rmse": ("identified", "predicted"), **_OTHERS}
+    series = tuple(
+        Series(label, np.array([_scaled(each.get(key)) for each in joints.values()]), tone, "bars")
+        for key, (label, tone) in kinds.items()
+        if key != "command_rmse" and any(each.get(key) is not None for each in joints.values())
+    )
+    bars = Chart(
+        "open-loop position error of each joint", np.arange(len(joints), dtype=float), series,
+        "", f"RMSE [{_unit(shown)}]", height=220, x_names=tuple(joints),
+    )  # fmt: skip
+    said = f"{escape(_name(shown))}, {_ROLES[role]}"
+    return (
+        f'<div class="plots">\n{chart_html(bars, f"Position missed in open loop: {said}")}'
+        f"{_horizon_chart(shown, said)}</div>\n"
+    )
+
+
+def _next(content: Mapping[str, Any], origin: Origin) -> str:
+    """Return what may be done with the result, as commands to copy."""
+    urdf, log = (
+        next((x["path"] for x in content["inputs"] if x["role"] == role), "")
+        for role in ("urdf", "identification")
+    )
+    result, robot = f"{origin.folder}/result.json", content["robot"] or "robot"
+    uses = {
+        "See commanded, measured and simulated robot.": ("replay", urdf, log, result),
+        "Simulate it in MuJoCo, gains and delays included.": (
+            "export", result, "--format", "mjcf", "--out", f"{robot}.xml",
+        ),
+        "Train with it in Isaac Lab.": (
+            "export", result, "--format", "isaac", "--out", f"{robot}_actuators.yaml",
+        ),
+        "Draw its drives at random, within their intervals.": (
+            "export", result, "--format", "ranges", "--out", f"{robot}_ranges.yaml",
+        ),
+    }  # fmt: skip
+    steps = "".join(
+        f'<li><p>{escape(words)}</p><div class="copy"><pre class="command">{escape(block)}</pre>'
+        "</div></li>\n"
+        for words, command in uses.items()
+        for block in origin.using(*command)
+    )
+    return f'<h2 id="next">Do next</h2>\n<ol class="next">{steps}</ol>\n' if steps else ""
+
+
+def _findings(content: Mapping[str, Any]) -> str:
+    findings = [
+        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
+        for entry in content.get("warnings", [])
+    ]
+    return causes_html(grouped(findings, content["joints"]))
+
+
+def _scaled(value: float | None) -> float:
+    return math.nan if value is None else value / _SMALL
+
+
+def _horizon_chart(entry: Mapping[str, Any], said: str) -> str:
+    """Return the chart of errors over how long the open loop has run, of the worst joints."""
+    horizons = {float(key): errors for key, errors in entry.get("horizons", {}).items()}
+    joints = entry["per_joint"]
+    horizons[entry["end"] - entry["start"]] = {name: x["rmse"] for name, x in joints.items()}
+    x = np.array(sorted(horizons))
+    errors = {name: [horizons[h].get(name) for h in x.tolist()] for name in joints}
+    means = [_mean([own[k] for own in errors.values()]) for k in range(len(x))]
+    lines = [
+        Series(name, np.array([_scaled(y) for y in ys]), f"tone-{k + 1}", is_faint=True)
+        for k, (name, ys) in enumerate([*errors.items()][:_NAMED])
+    ]
+    mean = Series("geometric mean of all", np.array([_scaled(y) for y in means]), "text")
+    chart = Chart(
+        "position error over the horizon of the open loop", x, (*lines, mean),
+        "time since the open loop began [s]", f"RMSE [{_unit(entry)}]", logarithmic="xy",
+        height=220,
+    )  # fmt: skip
+    worst = f"the worst {_NAMED} joints, " if len(errors) > _NAMED else ""
+    return chart_html(chart, f"Error over horizon, {worst}the whole stretch last: {said}")
+
+
+def _errors(content: Mapping[str, Any]) -> str:
+    return (
+        "<p>The identified robot starts where the log starts and then hears the commands alone. "
+        "RMSE of its position over the whole stretch, and over horizons after which it is put "
+        "back to what was measured. Baselines: the command taken for the position, the URDF with "
+        "the stated gains and neither friction nor delay, and a model of second order for each "
+        "joint by itself.</p>\n"
+        + "".join(_error_table(role, entry) for role, entry in _entries(content))
+    )
+
+
+def _error_table(role: str, entry: Mapping[str, Any]) -> str:
+    joints, horizons = entry["per_joint"], entry.get("horizons", {})
+    others = [key for key in _OTHERS if any(each.get(key) is not None for each in joints.values())]
+    headers = ["joint", "RMSE", "% of command's", *(_OTHERS[key][0] for key in others)]
+    headers += [f"over {float(h):g} s" for h in horizons]
+
+    def cells(first: Cell, own: Mapping[str, Any], short: Sequence[float | None]) -> list[Cell]:
+        share = None
+        if own.get("rmse") and own.get("command_rmse"):
+            share = 100 * own["rmse"] / own["command_rmse"]
+        values = [own.get("rmse"), *(own.get(key) for key in others), *short]
+        ours, *rest = (number(x if x is None else x / _SMALL, "#.3g") for x in values)
+        return [first, ours, number(share, ".1f"), *rest]
+
+    rows = [
+        cells(code(name), own, [errors.get(name) for errors in horizons.values()])
+        for name, own in joints.items()
+    ]
+    means = {key: _mean([own.get(key) for own in joints.values()]) for key in ("rmse", *others)}
+    short = [_mean([errors.get(name) for name in joints]) for errors in horizons.values()]
+    foot = cells(text("geometric mean"), means, short)
+    caption = f"{_name(entry)}, {_ROLES[role]}: errors in {_unit(entry)}"
+    return table(caption, headers, rows, foot, is_data=True)
+
+
+def _positions(
+    content: Mapping[str, Any], followed: Sequence[Followed], worst: Sequence[str]
+) -> str:
+    """Return charts of each joint in every log, the worst joints open."""
+    joints = content["joints"]
+    if not followed:
+        return "<p>No log is at hand to be shown.</p>\n"
+    points = min(_LONGEST, max(200, _ROWS // (2 * len(joints) * len(followed))))
+    units = {name: each["unit"] for _, entry in _entries(content)
+             for name, each in entry["per_joint"].items()}  # fmt: skip
+    parts = [
+        "<p>Commanded, measured and simulated position, the simulation in open loop from the first "
+        "sample; below, what is left. Drag to zoom; double-click or Escape shows all.</p>\n"
+    ]
+    for joint in [*worst, *(name for name in joints if name not in worst)]:
+        j = joints.index(joint)
+        charts = "".join(
+            _charts(log, j, joint, units.get(joint, "rad"), link=f"log {k}", points=points)
+            for k, log in enumerate(followed)
+        )
+        summary, is_open = f"<strong>{code(joint).html}</strong>", joint in worst[:_OPEN]
+        parts.append(folded(f"position-{j}", summary, charts, is_open=is_open))
+    return "".join(parts)
+
+
+def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: int) -> str:
+    """Return positions of a joint in a log, and how far they are from what was measured."""
+    q_ref, q, q_sim = log.q_ref[:, j], log.q[:, j], log.q_sim[:, j]
+    positions = (
+        Series("commanded", q_ref, "tone-5"),
+        Series("measured", q, "text"),
+        Series("simulated", q_sim, "predicted"),
+    )
+    left = (
+        Series("measured − commanded", (q - q_ref) / _SMALL, "tone-5", is_hidden=True),
+        Series("measured − simulated", (q - q_sim) / _SMALL, "residual"),
+    )
+    rmse = float(np.sqrt(np.nanmean((q - q_sim) ** 2))) / _SMALL
+    kind = "kept apart" if log.is_kept else "fitted"
+    above = Chart(
+        f"position of {joint}", log.t, positions, "time [s]", f"position [{unit}]", link=link
+    )
+    below = Chart(
+        f"position error of {joint}", log.t, left, "time [s]", f"error [m{unit}]",
+        link=link, height=110,
+    )  # fmt: skip
+    caption = f"{escape(log.name)}, {kind}: RMSE {rmse:.3g} m{unit}"
+    return chart_html(above, caption, points=points) + chart_html(below, "", points=points)
+
+
+def _drives(content: Mapping[str, Any]) -> str:
+    """Return a table of drives, joint by joint, and one of all parameters with intervals."""
+    entries = content["drive_parameters"]
+    by_joint: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for entry in entries:
+        joint, _, term = entry["name"].rpartition(".")
+        by_joint.setdefault(joint, {})[term] = entry
+    terms, units = _terms(entries), dict[str, str]()
+    for entry in entries:
+        units.setdefault(entry["name"].rpartition(".")[2], entry["unit"])
+    rows = [
+        [code(joint), *(_short(own.get(term)) for term in terms)] for joint, own in by_joint.items()
+    ]
+    headers = [
+        "joint",
+        *(f"{term} [{'ms' if units[term] == 's' else units[term]}]" for term in terms),
+    ]
+    ranges, lines = stated_ranges(content)["drives"], []
+    for joint, own in by_joint.items():
+        for term, entry in own.items():
+            ends = ranges[joint][term]
+            value, error = with_error(entry["value"], _error(entry))
+            low, high = (number(ends.get(end), ".4g") for end in ("low", "high"))
+            lines.append(
+                [
+                    code(entry["name"]), value, error, low, high,
+                    text(ends["source"]), text(entry["unit"]),
+                ]
+            )  # fmt: skip
+    heads = ["parameter", "value", "standard error", "low", "high", "from", "unit"]
+    every = table("All drive parameters with their 95 % intervals", heads, lines, is_data=True)
+    return (
+        "<p>τ = kp (q<sub>ref</sub>(t − delay) − q) + kd (v<sub>ref</sub> − v) moves the joint "
+        "against armature, friction and offset; where an encoder reads 0, the joint is at zero "
+        "in the URDF. Value ± standard error; what has none was stated or is held.</p>\n"
+        + table("Drives, joint by joint", headers, rows, is_data=True)
+        + folded("intervals", "All drive parameters with their intervals", every)
+    )
+
+
+def _error(entry: Mapping[str, Any]) -> float:
+    error = entry.get("std_error")
+    return math.nan if error is None else float(error)
+
+
+def _terms(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the parameters that drives have, but for those that are 0 and held of all of them."""
+    said = [entry for entry in entries if entry["value"] or entry.get("std_error") is not None]
+    return list(dict.fromkeys(entry["name"].rpartition(".")[2] for entry in said))
+
+
+def _short(entry: Mapping[str, Any] | None) -> Cell:
+    """Return a parameter with its standard error in one cell; times in ms."""
+    if entry is None:
+        return number(None)
+    scale = 1e3 if entry["unit"] == "s" else 1.0
+    value, error = with_error(scale * entry["value"], scale * _error(entry))
+    if error.value is None:
+        return value
+    return Cell(f"{value.html} ± {error.html}", "number", value.value)
+
+
+def _undetermined(content: Mapping[str, Any]) -> str:
+    """Return what positions and commands alone do not determine."""
+    structure = content["structure"]
+    names = structure["undetermined"]
+    parts = []
+    if names:
+        items = "".join(f"<li>{escape(name)}</li>" for name in names)
+        parts.append(f"<p>The logs leave these open:</p>\n<ul>{items}</ul>\n")
+    else:
+        parts.append("<p>The logs determine all that was to be found.</p>\n")
+    for entry in structure.get("not_told_apart", []):
+        parts.append(f"<p>{escape(_told(entry))}</p>\n")
+    parts.append(
+        "<p>Positions and commands tell torques up to one factor: with gains, inertias, frictions "
+        "and masses all larger by it, the motion is the same. What was stated or is held sets it: "
+        f"{escape(_held(content))}.</p>\n"
+    )
+    return "".join(parts)
+
+
+def _held(content: Mapping[str, Any]) -> str:
+    """Return which drive parameters were stated or are held, those of all joints by their term."""
+    held: dict[str, list[str]] = {}
+    for entry in content["drive_parameters"]:
+        if entry["value"] and entry.get("std_error") is None:
+            joint, _, term = entry["name"].rpartition(".")
+            held.setdefault(term, []).append(joint)
+    every = len(content["joints"])
+    said = [
+        f"{term} of {'every joint' if len(joints) == every else listed(joints, 4)}"
+        for term, joints in held.items()
+    ]
+    return listed([*said, "masses of the URDF"])
+
+
+def _told(entry: Any) -> str:  # noqa: ANN401
+    """Return in words parameters that are known only together."""
+    if isinstance(entry, Mapping):
+        names = entry.get("names") or entry.get("parameters") or list(map(str, entry.values()))
+        return f"Only together: {listed(map(str, names))}."
+    return f"Only together: {entry}."
+
+
+def _appendix(content: Mapping[str, Any]) -> str:
+    controller = content["simulation"]["controller"]
+    rows = [[text(key), text(_words(value))] for key, value in controller.items()]
+    inputs = [
+        [text(entry["role"]), code(entry["path"]), code((entry["sha256"] or "")[:16])]
+        for entry in content["inputs"]
+    ]
+    versions = {"robotid": content["robotid"], **content.get("versions", {})}
+    return (
+        table("Controller", ["setting", "value"], rows)
+        + table("Inputs", ["role", "file", "SHA-256 begins with"], inputs)
+        + table("Versions", ["of", "version"], [[text(k), text(v)] for k, v in versions.items()])
+        + f'<p class="note">Written by robotid {__version__}.</p>\n'
+    )
+
+
+def _words(value: Any) -> str:  # noqa: ANN401
+    if value is None:
+        return "none"
+    if isinstance(value, Mapping):
+        return listed(f"{key} {_words(x)}" for key, x in value.items())
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,81 @@
+"""Results of an identification from commands and positions, made of known drives."""
+
+import json
+
+import numpy as np
+
+from robotid.export.urdf import write_urdf
+from robotid.robot.drives import PositionCoulomb
+
+_UNITS = {
+    "kp": "N m/rad", "kd": "N m s/rad", "delay": "s", "zero": "rad", "armature": "kg m^2",
+    "viscous": "N m s/rad",
+}  # fmt: skip
+_STATED = ("kp", "kd")  # by the job
+
+
+def by_position(slope, curve, low, high):
+    """Return terms and parameters of Coulomb friction that depends on the position."""
+    terms = [PositionCoulomb(seen=(low, high), order=k, centre=0.5 * (low + high)) for k in (1, 2)]
+    return terms, (slope, curve)
+
+
+def drive_entries(plant, relative=0.1):
+    """Return the drive parameters as result.json has them; gains were stated, not found."""
+    return [
+        {
+            "name": name,
+            "value": value,
+            "std_error": None if name.endswith(_STATED) else relative * abs(value) + 1e-6,
+            "unit": _UNITS.get(name.rpartition(".")[2], "N m"),
+        }
+        for name, value in plant.truth.items()
+    ]
+
+
+def written_result(plant, folder, *, position=None, limits=None, **changes):
+    """Write the result of a plant whose drives were found exactly; return its folder.
+
+    Args:
+        plant: The robot.
+        folder: Where.
+        position: Friction that depends on the position by joint, as of ``by_position``.
+        limits: Effort limits of the controller by joint.
+        changes: Keys of result.json that are otherwise.
+    """
+    position = position or {}
+    model = plant.model.with_terms({joint: terms for joint, (terms, _) in position.items()})
+    values = dict(zip(model.layout.names, model.standard_parameters(), strict=True))
+    values |= {name: x for name, x in plant.truth.items() if name in values}
+    entries = drive_entries(plant)
+    for joint, (terms, parameters) in position.items():
+        for term, x in zip(terms, parameters, strict=True):
+            values[f"{joint}.{term.name}"] = x
+            name = f"{joint}.{term.name}"
+            entries.append({"name": name, "value": x, "std_error": 0.1 * abs(x), "unit": "N m"})
+    folder.mkdir(exist_ok=True)
+    sidecar = write_urdf(model, np.array([*values.values()]), folder / "robot.urdf")
+    recording = {"path": "log.csv", "sha256": None, "start": 0.0, "end": 1.0, "rows_used": 100}
+    content = {
+        "schema_version": 1,
+        "robotid": "0",
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": {"estimator": {"name": "simulation"}},
+        "inputs": [
+            {"role": "urdf", "path": model.tree.path, "sha256": None},
+            {"role": "identification", "signals": {}, **recording},
+        ],
+        "outputs": {"urdf": "robot.urdf", "sidecar": sidecar.name},
+        "structure": {"base": 0, "undetermined": []},
+        "consistency": {"is_consistent": True},
+        "base_parameters": [],
+        "standard_parameters": [],
+        "drive_parameters": entries,
+        "identification": {"per_joint": {}},
+        "validation": [],
+        "verdict": {"status": "good", "reasons": ["it follows"]},
+        "simulation": {"controller": {"kind": "pd", "effort_limit": limits}},
+    }
+    (folder / "result.json").write_text(json.dumps(content | changes))
+    return folder

@@ -1,0 +1,172 @@
+"""Robots in MuJoCo that follow position commands, with known drives: a plant that is not ours."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from helpers.paths import URDF
+from robotid.export.commanded import CommandedDrive
+from robotid.export.mjcf import write_mjcf
+from robotid.logs.data import Log
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+
+LEG = ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint")
+_STEP = 0.001  # [s] of MuJoCo, at most
+_SETTLES = 1.0  # [s] that the first command is held before the log begins
+_TONES = 12  # of a multi-sine
+#: URDF, joints that move (None: all), middle and reach of the commands [rad], and the scale of the
+#: drives [N m/rad]: kp; the others are shares of it.
+ROBOTS = {
+    "planar": ("planar_2r.urdf", None, (0.3, 0.4), (0.6, 0.8), (600.0, 250.0)),
+    "arm": (
+        "ur5_robot.urdf", None, (0.0, -1.2, 1.4, -0.6, 0.4, 0.0), (0.5, 0.4, 0.5, 0.6, 0.6, 0.6),
+        (2000.0, 2000.0, 1200.0, 200.0, 200.0, 150.0),
+    ),
+    "leg": ("go2.urdf", LEG, (0.0, 1.0, -1.9), (0.3, 0.5, 0.5), (20.0, 20.0, 20.0)),
+    "quadruped": (
+        "go2.urdf", None, 4 * (0.0, 1.0, -1.9), 4 * (0.3, 0.5, 0.5), 12 * (20.0,),
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A robot whose drives are known.
+
+    Attributes:
+        model: The robot as its URDF says, whose bodies are the truth.
+        drives: Its drives.
+        middle, reach: Of the commands, shape (n,) [rad].
+    """
+
+    model: RobotModel
+    drives: tuple[CommandedDrive, ...]
+    middle: np.ndarray
+    reach: np.ndarray
+
+    @property
+    def truth(self) -> dict[str, float]:
+        """The parameters of the drives by name, as those of a result are named."""
+        return {
+            f"{drive.joint}.{key}": value
+            for drive in self.drives
+            for key, value in asdict(drive).items()
+            if key not in ("joint", "effort_limit")
+        }
+
+
+def plant(name, rng, **changes):
+    """Return one of these robots with drives drawn about their usual values.
+
+    Args:
+        name: Which one.
+        rng: Source of the drives.
+        changes: Figures of every drive that are stated instead, as ``delay=0.01``.
+    """
+    file, joints, middle, reach, scale = ROBOTS[name]
+    path = URDF / file
+    urdf = path if path.is_file() else example_urdf(file)
+    model = RobotModel.from_urdf(urdf, **({"joints": list(joints)} if joints else {}))
+    drives = []
+    for joint, kp in zip(model.joints, scale, strict=True):
+        a, b, c, d, e = rng.uniform(0.7, 1.3, 5).tolist()
+        drive = CommandedDrive(
+            joint, kp=kp, kd=0.06 * kp * a, delay=0.006 * b, zero=0.0, armature=1e-3 * kp * c,
+            viscous=5e-3 * kp * d, coulomb=0.01 * kp * e, offset=0.0,
+            effort_limit=np.inf,
+        )  # fmt: skip
+        drives.append(replace(drive, **changes))
+    return Plant(model, tuple(drives), np.array(middle), np.array(reach))
+
+
+def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None):
+    """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
+
+    Args:
+        plant: The robot.
+        rng: Source of the motion and of the encoders' noise.
+        duration: Length [s].
+        rate: Rows per second, each a command that is held until the next [Hz].
+        noise: Standard deviation of the encoders [rad].
+        torque: Standard deviation of the drives' logged torques [N m]; None: none are logged.
+    """
+    t = np.arange(round(duration * rate)) / rate
+    q_ref = multisine(t, plant.middle, plant.reach, rng)
+    q, force = rolled_out(loaded(plant, rate), q_ref, rate)
+    q = q + noise * rng.standard_normal(q.shape)
+    tau = np.zeros_like(q)
+    if torque is not None:  # of the drive, whose offset does not reach the joint
+        tau = force + [drive.offset for drive in plant.drives]
+        tau += torque * rng.standard_normal(q.shape)
+    log = Log(t, q, tau, plant.model.joints, q_ref=q_ref, has_torque=torque is not None)
+    return log, plant.truth
+
+
+def multisine(t, middle, reach, rng, lowest=0.1, highest=4.0):
+    """Return sines of random phase and of falling size about the middle, shape (N, n)."""
+    f = np.geomspace(lowest, highest, _TONES)[:, None] * rng.uniform(0.9, 1.1, len(middle))
+    phase = rng.uniform(0.0, 2 * np.pi, f.shape)
+    waves = (f**-0.5) * np.sin(2 * np.pi * f * t[:, None, None] + phase)  # (N, tones, n)
+    shape = waves.sum(axis=1) / np.sqrt((1.0 / f).sum(axis=0))
+    return middle + 0.5 * reach * shape * np.minimum(1.0, t)[:, None]  # from rest
+
+
+def loaded(plant, rate, step=_STEP):
+    """Return MuJoCo's model of a plant, without shapes, its time step a part of the period."""
+    pi = plant.model.standard_parameters()
+    names = plant.model.layout.names
+    for drive in plant.drives:
+        for term in ("armature", "viscous", "coulomb", "offset"):
+            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
+    exact = 1.0 / rate / np.ceil(1.0 / rate / step - 1e-9)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "plant.xml"
+        write_mjcf(plant.model, pi, path, commanded=plant.drives, step=exact)
+        top = ET.parse(path).getroot()
+    for parent in [*top.iter()]:
+        for shape in [*parent.findall("geom"), *parent.findall("mesh")]:
+            parent.remove(shape)
+    sensors = ET.SubElement(top, "sensor")
+    for drive in plant.drives:
+        ET.SubElement(sensors, "actuatorfrc", actuator=drive.joint)
+    return mujoco.MjModel.from_xml_string(ET.tostring(top, encoding="unicode"))
+
+
+def followed(robot, q_ref, rate, settles=_SETTLES):
+    """Return the positions of MuJoCo's robot as of ``rolled_out``."""
+    return rolled_out(robot, q_ref, rate, settles)[0]
+
+
+def rolled_out(robot, q_ref, rate, settles=_SETTLES):
+    """Return positions and forces of MuJoCo's robot, shape (N, n), at the times of held commands.
+
+    Args:
+        robot: MuJoCo's model; its actuators are in the order of the commands.
+        q_ref: Commands, shape (N, n) [rad].
+        rate: Commands per second [Hz].
+        settles: How long the first command is held before [s].
+    """
+    held = round(1.0 / rate / robot.opt.timestep)
+    at = robot.jnt_qposadr[robot.actuator_trnid[:, 0]]
+    data = mujoco.MjData(robot)
+    data.qpos[at] = q_ref[0]
+    for k in range(robot.nu):
+        if robot.actuator_delay[k]:
+            mujoco.mj_initCtrlHistory(
+                robot, data, k, None, [q_ref[0, k]] * robot.actuator_history[k, 0]
+            )
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.empty(mujoco.mj_stateSize(robot, kind))
+    mujoco.mj_getState(robot, data, state, kind)
+    before = round(settles / robot.opt.timestep)
+    control = np.vstack([np.repeat(q_ref[:1], before, axis=0), np.repeat(q_ref, held, axis=0)])
+    states, forces = rollout.rollout(robot, data, state[None], control[None])
+    qpos = states[0, :, 1 : 1 + robot.nq]  # after the time; a row after each step
+    q = qpos[before - 1 :][: held * len(q_ref) : held, at]
+    return q, forces[0, before::held]  # which a step tells of the state that it begins with

@@ -1,0 +1,143 @@
+"""The page of drives found from commands: its figures are those of the result and the logs."""
+
+import re
+
+import numpy as np
+import pytest
+from helpers.commanded_results import by_position, written_result
+from helpers.mujoco_plant import LEG, plant
+from helpers.pages import chart, charts, tables
+
+from robotid.exceptions import DataError
+from robotid.export.result import load_result
+from robotid.identification.advice import Origin
+from robotid.report.commanded_page import Followed, write_commanded_report
+
+ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
+REASON = "the calf is <i>off</i>"
+
+
+def entry(log, scale):
+    per_joint = {
+        joint: {"unit": "rad", **{key: scale * xs[j] for key, xs in ERRORS.items()}}
+        for j, joint in enumerate(LEG)
+    }
+    short = {"0.1": dict.fromkeys(LEG, 1e-3 * scale), "0.5": dict.fromkeys(LEG, 2e-3 * scale)}
+    window = {"log": f"logs/{log}", "start": 1.0, "end": 5.0}
+    return {**window, "per_joint": per_joint, "horizons": short}
+
+
+@pytest.fixture(scope="module")
+def followed():
+    t, rng = np.linspace(1.0, 5.0, 400), np.random.default_rng(0)
+    q = np.cumsum(rng.standard_normal((400, 3)), axis=0) * 0.01
+    return Followed("kept.csv", True, t, q + 0.03, q, q - 0.002 * np.arange(1, 4))
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    leg = plant("leg", np.random.default_rng(0), coulomb=0.25)
+    simulation = {
+        "controller": {"kind": "pd", "effort_limit": {LEG[0]: 23.0}},
+        "validation": [entry("kept.csv", 1.0)],
+        "identification": [entry("fitted.csv", 0.5)],
+    }
+    folder = written_result(
+        leg,
+        tmp_path_factory.mktemp("page") / "leg",
+        position={LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)},
+        simulation=simulation,
+        structure={"base": 0, "undetermined": ["FL_calf.Ixx"]},
+        verdict={"status": "usable", "reasons": [REASON]},
+        warnings=[
+            {
+                "code": "saturation",
+                "severity": "warning",
+                "where": LEG[2],
+                "message": f"{LEG[2]} saturates",
+            }
+        ],
+    )
+    return load_result(folder).content
+
+
+@pytest.fixture(scope="module")
+def page(content, followed, tmp_path_factory):
+    target = tmp_path_factory.mktemp("pages") / "report.html"
+    page = write_commanded_report(
+        content, [followed], target, files={"URDF": "a.urdf"}, origin=Origin((), "out")
+    )
+    return page.read_text()
+
+
+def test_errors_are_those_of_the_result_in_mrad(page):
+    kept = tables(page)["kept.csv, 1 to 5 s, kept apart: errors in mrad"]
+    head = ["joint", "RMSE", "% of command's", "URDF", "command", "over 0.1 s", "over 0.5 s"]
+    assert kept.headers == head
+    assert kept.rows[1] == [LEG[1], "4.00", "8.0", "10.0", "50.0", "1.00", "2.00"]
+    assert kept.foot[:2] == ["geometric mean", "4.00"]  # of 2, 4 and 8
+    fitted = tables(page)["fitted.csv, 1 to 5 s, fitted: errors in mrad"]
+    assert fitted.column("RMSE") == ["1.00", "2.00", "4.00"]
+    assert "<strong>4 mrad</strong>, geometric mean of 3 joints" in page
+    assert "URDF 2.5 ×, command 11 ×" in page  # (20 50 80)^(1/3) / 4
+    assert REASON not in page
+    assert "&lt;i&gt;off" in page
+
+
+def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(page, followed):
+    bars = chart(page, "open-loop position error of each joint")
+    assert bars["x_names"] == [*LEG[::-1]]
+    np.testing.assert_allclose(bars["series"][0]["y"], [8.0, 4.0, 2.0], rtol=1e-4)
+    horizon = chart(page, "position error over the horizon")
+    np.testing.assert_allclose(horizon["x"], [0.1, 0.5, 4.0], rtol=1e-6)
+    mean = horizon["series"][-1]
+    assert mean["label"] == "geometric mean of all"
+    np.testing.assert_allclose(mean["y"], [1.0, 2.0, 4.0], rtol=1e-4)
+    shown = [c for c in charts(page) if c["title"].startswith("position of")]
+    assert [c["title"] for c in shown] == [f"position of {joint}" for joint in LEG[::-1]]
+    lines = {series["label"]: series["y"] for series in shown[0]["series"]}
+    for label, values in (
+        ("commanded", followed.q_ref), ("measured", followed.q), ("simulated", followed.q_sim),
+    ):  # fmt: skip
+        np.testing.assert_allclose(lines[label], values[:, 2], atol=1e-4)
+    error = chart(page, f"position error of {LEG[2]}")
+    left = {series["label"]: series["y"] for series in error["series"]}
+    np.testing.assert_allclose(left["measured − simulated"], 6.0, atol=1e-3)  # [mrad]
+    assert "kept.csv, kept apart: RMSE 6 mrad" in page
+
+
+def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content):
+    drives = tables(page)["Drives, joint by joint"]
+    assert "coulomb_q2 [N m]" in drives.headers
+    rows = drives.by_name()
+    assert rows[LEG[0]]["coulomb [N m]"] == "0.250 ± 0.025"
+    assert rows[LEG[0]]["coulomb_q1 [N m]"] == "–"
+    assert "±" not in rows[LEG[0]]["kp [N m/rad]"]
+    late = next(e for e in content["drive_parameters"] if e["name"] == f"{LEG[0]}.delay")
+    assert float(rows[LEG[0]]["delay [ms]"].split()[0]) == pytest.approx(
+        1e3 * late["value"], rel=0.01
+    )
+    every = tables(page)["All drive parameters with their 95 % intervals"].by_name()
+    assert every[f"{LEG[1]}.kp"]["from"] == "stated"
+    assert every[f"{LEG[1]}.coulomb"]["low"] == "0.201"
+    said = page[page.index("The logs leave these open") :]
+    assert "FL_calf.Ixx" in said
+    assert "kp of every joint, kd of every joint, masses of the URDF" in said
+
+
+def test_findings_and_commands_are_shown(page):
+    assert f"<p>{LEG[2]} saturates</p>" in page
+    assert 'class="cause warning"' in page
+    commands = re.findall(r'<pre class="command">(.*?)</pre>', page)
+    assert "robotid export out/result.json --format isaac" in commands[2]
+    assert [words.split()[1] for words in commands] == ["replay", "export", "export", "export"]
+
+
+def test_logs_that_do_not_fit_are_refused(content, followed, tmp_path):
+    other = Followed("b.csv", True, followed.t, *[x[:, :2] for x in 3 * [followed.q]])
+    with pytest.raises(DataError, match=r"b.csv has 2 joints, the result 3"):
+        write_commanded_report(content, [other], tmp_path / "a.html")
+    with pytest.raises(DataError, match=r"c.csv: q_sim has shape \(399, 3\), wanted \(400, n\)"):
+        Followed("c.csv", True, followed.t, followed.q_ref, followed.q, followed.q_sim[1:])
+    write_commanded_report(content, [], tmp_path / "a.html")
+    assert "No log is at hand" in (tmp_path / "a.html").read_text()
