@@ -11,6 +11,7 @@ from robotid.commands.job import Job
 from robotid.exceptions import SettingsError
 from robotid.export.result import build_commanded
 from robotid.export.urdf import write_urdf
+from robotid.identification.advice import Origin
 from robotid.identification.settings import SimulationSettings
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.robot.drives import AUTO
@@ -60,7 +61,13 @@ def run_commanded(
         write_urdf(found.model, found.standard, partial / name, dynamics=job.dynamics)
         if job.report:
             files = {"result": "result.json", "urdf": name, "sidecar": sidecar}
-            write_commanded_report(content, followed(found), partial / "report.html", files=files)
+            write_commanded_report(
+                content,
+                followed(found),
+                partial / "report.html",
+                files=files,
+                origin=Origin((), str(target)),
+            )
         write_json(content, partial / "result.json")
     return found, content
 
