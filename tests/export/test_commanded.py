@@ -85,7 +85,7 @@ def test_mujoco_follows_a_chirp_as_the_closed_loop_does(changes, commands):
     """Within 1 mrad of 0.6 to 1.3 rad at 5 rad/s; half of it are the steps of 1 ms."""
     leg = plant("leg", np.random.default_rng(1), **changes)
     wanted = reference(leg.drives, commands)
-    found = followed(loaded(leg, RATE), commands, RATE, settles=0.3)
+    found = followed(loaded(leg, RATE, as_exported=True), commands, RATE, settles=0.3)
     assert np.abs(found - wanted).max() < 1e-3
     assert np.abs(wanted - commands).max() > 0.05  # the drives matter
     for key in ("delay", "coulomb", "armature", "viscous", "kd"):  # and each of their figures
