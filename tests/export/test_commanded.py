@@ -85,12 +85,12 @@ def test_mujoco_follows_a_chirp_as_the_closed_loop_does(changes, commands):
     """Within 1 mrad of 0.6 to 1.3 rad at 5 rad/s; half of it are the steps of 1 ms."""
     leg = plant("leg", np.random.default_rng(1), **changes)
     wanted = reference(leg.drives, commands)
-    found = followed(loaded(leg, RATE, as_exported=True), commands, RATE, settles=0.3)
+    found = followed(loaded(leg, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
     assert np.abs(found - wanted).max() < 1e-3
     assert np.abs(wanted - commands).max() > 0.05  # the drives matter
     for key in ("delay", "coulomb", "armature", "viscous", "kd"):  # and each of their figures
         other = replace(leg, drives=tuple(replace(d, **{key: 0.0}) for d in leg.drives))
-        missed = followed(loaded(other, RATE), commands, RATE, settles=0.3)
+        missed = followed(loaded(other, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
         assert np.abs(missed - wanted).max() > 2e-3, key
 
 
@@ -150,7 +150,7 @@ def test_the_plant_logs_the_torques_of_its_drives():
     kp, kd = (np.array([getattr(drive, key) for drive in leg.drives]) for key in ("kp", "kd"))
     late = 3  # rows
     by_hand = kp * (log.q_ref[:-late] - log.q[late:]) - kd * v[late:]
-    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.035)
+    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.05)
     assert np.ptp(by_hand, axis=0).min() > 0.8
 
 
@@ -206,7 +206,7 @@ def test_mujoco_rolls_out_what_our_own_roll_out_does():
             pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
     robot = LoopedRobot(leg.model, step=1e-3)
     (found,) = robot.roll_out(loops_of(leg.model, pi, leg.drives), cut_windows(log, np.inf, 0.0))
-    assert np.abs(found.q - log.q).max() < 1e-3
+    assert np.abs(found.q - log.q).max() < 3e-4
     assert np.abs(log.q - log.q_ref).max() > 0.05
 
 

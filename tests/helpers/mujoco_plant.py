@@ -17,7 +17,7 @@ from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
 LEG = ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint")
-_STEP = 0.001  # [s] of MuJoCo, at most
+_STEP = 0.0005  # [s] of MuJoCo, at most
 _SETTLES = 1.0  # [s] that the first command is held before the log begins
 _TONES = 12  # of a multi-sine
 #: URDF, joints that move (None: all), middle and reach of the commands [rad], and the scale of the
