@@ -142,6 +142,19 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     assert far.kept == clearance.kept[0]
 
 
+def test_links_that_touch_in_almost_every_pose_but_not_at_zero_are_watched(tmp_path):
+    # a plate that is driven into the base, from 4 mm above it
+    driven = TILTED.replace('name="tilt" type="revolute"', 'name="tilt" type="prismatic"')
+    driven = driven.replace('<axis xyz="1 0 0"/><limit lower="-0.35" upper="0.35"',
+                            '<axis xyz="0 0 -1"/><limit lower="0" upper="0.1"')  # fmt: skip
+    driven = driven.replace('<origin xyz="0 0 0.065"/>', '<origin xyz="0 0 0.054"/>')
+    (tmp_path / "driven.urdf").write_text(driven)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "driven.urdf"))
+    assert len(clearance.made_to) == 1  # the pin
+    assert clearance.named == [("base", "plate")]
+    assert 0.0005 < clearance.kept[0] < 0.002  # half of what lies between 1 and 4 mm
+
+
 def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():
     # pairs of links of the SO-101 are 9 to 16 mm apart in almost every posture
     model = RobotModel.from_urdf(example_urdf("so101.urdf"))
