@@ -24,10 +24,13 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
+import numpy as np
 from helpers.corruptions import CASES, ROBOTS, clean_log, robot, table_of
+from helpers.servos import bandwidth, faulty_logs, good_commands, record, some_servos
 
 from robotid.commands.job import Job, LogEntry, read_job
 from robotid.commands.logs import examine
+from robotid.doctor.command_channels import check_commands
 from robotid.doctor.diagnosis import diagnose
 from robotid.logs.formats import write_columns
 from robotid.logs.settings import SignalSettings
@@ -48,6 +51,7 @@ def main():
     spoilt(seeds)
     same_motion(seeds)
     payload(seeds)
+    commands(seeds)
     recordings()
     speed()
     print(
@@ -122,12 +126,32 @@ def payload(seeds):
 
 
 def loaded_log(model, seed, mass):
-    import numpy as np
-
     pi = another_robot(model, np.random.default_rng(seed))
     last = pi[: model.layout.n_inertial].reshape(-1, len(INERTIAL_TERMS))[-1]
     last += mass * np.array([1, 0, 0.05, 0.1, 0.02, 0, 0.02, 0, 0, 0.02])
     return clean_log(model, seed, pi=pi)
+
+
+def commands(seeds):
+    """Print what is found in logs of commands of three joints, with servos drawn at random."""
+    logs, false, faulty = 0, Counter(), {}
+    for seed in seeds:
+        rng = np.random.default_rng(1000 + seed)
+        servos = some_servos(rng)
+        rate = 15 * max(bandwidth(servo) for servo in servos)
+        for told in good_commands(rng, servos).values():
+            logs += 1
+            false.update(loud(check_commands(record(told, servos, rate=max(rate, 100.0)))))
+        for name, code, log in faulty_logs(rng):
+            seen = loud(check_commands(log))
+            found, other = faulty.setdefault((name, code), (Counter(), Counter()))
+            found[code] += code in seen
+            other.update(seen - {code})
+    print(f"\nclean logs of commands: {logs}; findings above a note: {dict(false) or 'none'}")
+    print("\n| commands | wanted | found | other findings above a note |\n|---|---|---|---|")
+    for (name, code), (found, other) in faulty.items():
+        side = ", ".join(f"{x} {count}/{len(seeds)}" for x, count in other.most_common())
+        print(f"| {name} | {code} | {found[code]}/{len(seeds)} | {side or '-'} |")
 
 
 def recordings():

@@ -180,7 +180,7 @@ def _identify(options: argparse.Namespace) -> int:
         source = source_words(options.words)
         found, result = run_job(job, options.out, plan=plan, source=source)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
-    if not options.json:
+    if not (options.json or "simulation" in result):
         print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["alarms"] else 0
 

@@ -24,6 +24,7 @@ LINES = [
     "estimators simulation workers",
     "doctor",
     "identification",
+    "commanded",
     "online export viewer excitation",
     "report",
     "commands paper",

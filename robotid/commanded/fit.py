@@ -101,7 +101,10 @@ def fit_loops(
     has_speeds = all(log.v_ref is not None for log in logs)
     unknowns = _unknowns(model, loop, groups, base, usual, has_speeds=has_speeds)
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
-    estimator = OutputError(whitens=settings.whiten, progress=progress)
+    dt = max(float(np.median(np.diff(log.t))) for log in logs)
+    estimator = OutputError(
+        whitens=settings.whiten, most=np.exp(-dt / plain.time_constant), progress=progress
+    )
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
     few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
@@ -188,7 +191,8 @@ def _usual(
     measure = np.maximum(bodies, _LIGHTEST * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
     speed = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
-    return _Usual(plain.inertia * scale, bodies, plain.torque * scale, speed, scale)
+    inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
+    return _Usual(inertia, bodies, plain.torque * scale, speed, scale)
 
 
 def _begin(model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual) -> Loops:
@@ -235,7 +239,7 @@ def _unknowns(
     }
     spread = {
         "armature": usual.inertia,
-        "kp": base.kp,
+        "kp": base.kp / _WIDE,
         "kd": usual.torque / usual.speed,
         "limit": usual.torque,
     }

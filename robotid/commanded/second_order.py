@@ -50,6 +50,14 @@ class SecondOrder:
         """Inertia J of each joint [kg m^2 or kg]."""
         return self.loops.armature
 
+    @property
+    def time_constant(self) -> Array:
+        """How fast each joint follows [s]: the slower of its damping and its swing."""
+        loops = self.loops
+        damped = (loops.kd + self.friction("viscous")) / loops.kp
+        slow: Array = np.maximum(damped, np.sqrt(loops.armature / loops.kp))
+        return slow
+
     def friction(self, name: str) -> Array:
         """Return "viscous", "coulomb" or "offset" of each joint.
 

@@ -19,6 +19,10 @@ from robotid.robot.drives import TERMS
 
 __all__ = ["export_result"]
 
+_GRAVITY = (
+    "the controller adds the torque of gravity by the URDF, for which there is no place; add it to "
+    "what the actuators give (in MuJoCo, gravcomp = 1 of each body is near it)"
+)
 #: What says something of which formats.
 _OPTIONS = {
     "step": ("mjcf", "isaac"),
@@ -63,6 +67,8 @@ def export_result(
     if mean_friction:
         pi, said = with_mean_friction(model, pi)
         commanded = commanded_drives(model, pi, result.content, result.path.name)
+    if commanded and result.content["settings"].get("controller", {}).get("gravity_compensation"):
+        said = (*said, _GRAVITY)
     sources = (entry["path"] for entry in result.content["inputs"] if entry["role"] == "urdf")
     files, original = [str(goal)], next(sources, None)
     given: dict[str, Any] = {"step": step, "delay": delay}

@@ -8,6 +8,8 @@ from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._typing import report_stage
+from robotid.commanded.identify import Commanded
+from robotid.commands.commanded import run_commanded
 from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
@@ -19,6 +21,7 @@ from robotid.identification.evaluation import Evaluation
 from robotid.identification.findings import locked_findings
 from robotid.identification.pipeline import Identification, conclude
 from robotid.identification.recordings import Recordings
+from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import check_ignored
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.report.document import write_report
@@ -40,7 +43,7 @@ def run_job(
     plan: WorkPlan | None = None,
     source: Sequence[str] = (),
     beside: Mapping[str, str] | None = None,
-) -> tuple[Identification, dict[str, Any]]:
+) -> tuple[Identification | Commanded, dict[str, Any]]:
     """Run an identification and write result.json, report.html and the URDF with its sidecar.
 
     A job may want no report, and an impossible result has no URDF. Every file is made in a folder
@@ -65,6 +68,8 @@ def run_job(
         WorkerError: If a worker ends before its work.
     """
     chosen = plan or WorkPlan(job.workers or 1)
+    if isinstance(job.estimator, SimulationSettings):
+        return run_commanded(job, folder, progress=chosen.progress)
     report_stage(chosen.progress, "reading logs")
     model, target = job.model(), Path(folder)
     check_folder(target, ["result.json", *_names(model)])

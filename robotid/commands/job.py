@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid._files import missing_file
+from robotid.commanded.settings import LoopSettings
 from robotid._settings import Entries, Range, Settings, check_keys, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -178,6 +179,11 @@ class Job(Settings):
     units: LogUnits = setting(LogUnits(), "units of the logs, if not SI")
     estimator: EstimatorSettings = setting(
         ConsistentSettings(), "which estimator, and its own settings"
+    )
+    controller: LoopSettings = setting(
+        LoopSettings(),
+        "the loop of the drives, for the estimator 'simulation'",
+        dump=lambda loop: None if loop == LoopSettings() else loop.to_dict(),
     )
     dynamics: bool = setting(
         False,

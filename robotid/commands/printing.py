@@ -132,6 +132,9 @@ def _some(count: int, what: str) -> str:
 def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
     from robotid.identification.summary import error_lines, friction_lines
 
+    if "simulation" in result:
+        _print_commanded(result, is_verbose=is_verbose)
+        return
     structure, wls, width = result["structure"], result["wls"], terminal_width()
     before, after, _ = result["witness"]["masses"]
     say(
@@ -157,6 +160,35 @@ def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
         said=verdict["reasons"],
     )
     _print_verdict(verdict)
+
+
+def _print_commanded(result: dict[str, Any], *, is_verbose: bool) -> None:
+    """Print what was found from commands: open loops beside plainer models, drives, the verdict."""
+    found = result["simulation"]
+    say(
+        f"\n{result['robot']}: {len(result['joints'])} joints, {found['fit']['parameters']} unknowns; "
+        f"{found['fit']['message']}"
+    )
+    kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
+             "command_rmse": "command"}  # fmt: skip
+    for role, words in (("identification", "fitted"), ("validation", "not fitted")):
+        for run in found[role]:
+            say(f"\n{words}: {_window(Path(run['log']).name or 'log', run)}, position missed", "  ")
+            rows = []
+            for joint, own in run["per_joint"].items():
+                sizes = (own[key] for key in kinds)
+                shown = ("-" if x is None else f"{1e3 * x:.2f}" for x in sizes)
+                rows.append((joint, *shown, f"m{own['unit']}"))
+            print("\n".join(columns(("joint", *kinds.values(), ""), rows)))
+    rows = []
+    for entry in result["drive_parameters"]:
+        error = entry["std_error"]
+        if error is not None:
+            rows.append((entry["name"], f"{entry['value']:.4g}", f"{error:.2g}", entry["unit"]))
+    heads = ("parameter", "value", "+-", "unit")
+    print("\n" + "\n".join(columns(heads, rows)) + "\n")
+    _print_causes(result["warnings"], result["joints"], is_verbose=is_verbose)
+    _print_verdict(result["verdict"])
 
 
 def _recordings(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:

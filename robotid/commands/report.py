@@ -69,10 +69,13 @@ def rewrite_report(
         if what != "report" and goal.resolve().with_name(name) == (folder / name).resolve()
         if (folder / name).is_file()
     }
+    origin = Origin((), str(folder))
     if found is None:
-        write_commanded_report(content, followed_logs(loaded, job), goal, files=files)
+        write_commanded_report(
+            content, followed_logs(loaded, job), goal, files=files, origin=origin
+        )
     else:
-        write_report(found, goal, files=files, origin=Origin((), str(folder)))
+        write_report(found, goal, files=files, origin=origin)
     return {"result": str(loaded.path), "report": str(goal)}
 
 

@@ -33,6 +33,7 @@ _LEVELS = 20  # values from which a command is no series of steps
 _PAUSE = 20  # rows from which it rests, by intent
 _APART = 0.1  # [s] over which changes of commands are compared
 _FOLLOWED = 0.5  # share of slow sweeps that a joint should follow
+_STUCK = 0.2  # ... where its lag is not known, so neither is what is slow
 _SLOW = 5.0  # lags that a sweep must last to be slow
 _FEW = 10.0  # steps of an encoder that a sweep should have
 _SWEEPS = 4  # sweeps from which a joint is judged by them
@@ -140,9 +141,12 @@ class _Loop:
     @cached_property
     def bandwidth(self) -> float:
         """Frequency at which it follows half the power [Hz]; nan if it follows all excited."""
-        f, H, _ = self.response
-        weak = np.abs(H) < _HALF_POWER * np.abs(H[:3]).max() if len(f) else np.zeros(0, bool)
-        return float(f[np.argmax(weak)]) if weak.any() else np.nan
+        f, size = self.response[0], np.abs(self.response[1])
+        if not len(f):
+            return np.nan
+        slow = int(np.argmax(size[:3]))  # the very first may be that of a drift
+        weak = np.flatnonzero(size[slow:] < _HALF_POWER * size[slow])
+        return float(f[slow + weak[0]]) if len(weak) else np.nan
 
     @cached_property
     def lag(self) -> tuple[float, float]:
@@ -338,7 +342,7 @@ def _small(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
         (far, gone), step = loop.sweeps, quantum(log.q[:, loop.joint])
         usual = float(np.ptp(loop.told))
         share = float(np.median(gone / far)) if len(far) >= _SWEEPS else 1.0
-        if share < _FOLLOWED:
+        if share < (_FOLLOWED if loop.lag[0] > 0 else _STUCK):
             usual, lost = float(np.median(far)), float(np.median(far - gone))
             message = (
                 f"{loop.name} follows {100 * share:.0f} % of sweeps of {usual:.3g}, slow as they "

@@ -29,9 +29,10 @@ __all__ = ["CODES", "check_logs", "diagnose", "findings_to_dict"]
 
 #: Codes of findings that are errors only in the doctor's eyes, and can be ignored.
 CODES = (
-    "gravity", "gravity_compensated", "joint_axis", "joint_order", "locked_position",
-    "position_offset", "position_order", "position_sign", "spikes", "torque_order", "torque_sign",
-    "unlike_velocity", "unsigned_torque", "velocity_order", "velocity_scale",
+    "gravity", "gravity_compensated", "joint_axis", "joint_order", "late_command",
+    "locked_position", "position_offset", "position_order", "position_sign", "spikes",
+    "torque_order", "torque_sign", "unlike_velocity", "unsigned_torque", "velocity_order",
+    "velocity_scale",
 )  # fmt: skip
 
 

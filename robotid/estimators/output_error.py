@@ -100,6 +100,8 @@ class OutputError:
 
     Attributes:
         whitens: Whether the residual's correlation is estimated and taken out.
+        most: Largest correlation of one sample with the next that is taken out, shape (n,): beyond
+            the loop's own, whitening takes away what the loop shows. 0.95 if None.
         rows: Further rows [A b] that A theta = b should fit, unit weight, shape (m, c + 1), as
             those of torques; none if None.
         steps: Most steps in a round.
@@ -112,6 +114,7 @@ class OutputError:
     """
 
     whitens: bool = True
+    most: Array | None = None
     rows: Array | None = None
     steps: int = _STEPS
     rounds: int = _ROUNDS
@@ -151,11 +154,12 @@ class OutputError:
         found = simulator.residuals(theta, with_slopes=False)
         n = 1 + max(int(r.joints.max()) for r in found)
         rho, sigma = np.zeros(n), np.ones(n)
+        most = np.full(n, _MOST_RHO) if self.most is None else self.most
         for j in range(n):
             own = [r.e[:, k] for r in found for k in np.flatnonzero(r.joints == j)]
             if self.whitens:
                 along = sum(float(x[1:] @ x[:-1]) for x in own)
-                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, _MOST_RHO)
+                rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, most[j])
             size = sum(len(x) - 1 for x in own)
             level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
             sigma[j] = max(level, 1e-12)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,8 @@ from robotid._files import file_sha256, read_json
 from robotid._settings import Range
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
+from robotid.commanded.errors import OpenLoop
+from robotid.commanded.identify import Commanded
 from robotid.export.commanded import CommandedDrive, commanded_drives, follow_commands
 from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
@@ -40,6 +42,7 @@ from robotid.versions import __version__, versions
 
 __all__ = [
     "Result",
+    "build_commanded",
     "build_preview",
     "build_result",
     "load_result",
@@ -159,6 +162,211 @@ def build_result(
         },
         "witness": identification.witness.to_dict(),
         "verdict": identification.verdict.to_dict(),
+    }
+
+
+def build_commanded(
+    found: Commanded, settings: Mapping[str, Any], outputs: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Return the content of result.json of what was found from commands and positions.
+
+    Args:
+        found: What was found.
+        settings: The job, in the shape of its file.
+        outputs: Files written beside it, by kind.
+    """
+    model, layout, estimate = found.model, found.model.layout, found.fitted.estimate
+    mapping = structural_mapping(model)
+    variances = np.diag(found.standard_covariance)
+    errors = np.sqrt(np.maximum(variances, 0.0))
+    prior = model.standard_parameters()
+    standard = [
+        {
+            "name": name,
+            "value": float(found.standard[i]),
+            "std_error": float(errors[i]) if errors[i] > 0 else None,
+            "unit": layout.units[i],
+            "prior": float(prior[i]),
+            "source": _source_of(found, name, errors[i]),
+        }
+        for i, name in enumerate(layout.names)
+    ]
+    spread = mapping.K @ found.standard_covariance @ mapping.K.T
+    base = zip(
+        mapping.base_names, mapping.expressions, mapping.to_base(found.standard),
+        np.sqrt(np.maximum(np.diag(spread), 0.0)), mapping.independent, strict=True,
+    )  # fmt: skip
+    bodies = pseudo_inertia(found.standard[: layout.n_inertial])
+    smallest = np.linalg.eigvalsh(bodies)[:, 0]
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "robotid": __version__,
+        "versions": versions(),
+        "robot": model.name,
+        "joints": list(model.joints),
+        "settings": dict(settings),
+        "inputs": [
+            {"role": "urdf", **_source(model.tree.path)},
+            *(_commanded_input(run, "identification") for run in found.errors),
+            *(_commanded_input(run, "validation") for run in found.kept),
+        ],
+        "outputs": dict(outputs or {}),
+        "structure": {
+            "standard": layout.n_inertial,
+            "base_inertial": len(structural_mapping(model, inertial_only=True).K),
+            "base": len(mapping.K),
+            "rank": estimate.rank,
+            "condition": _finite(estimate.condition),
+            "undetermined": list(found.undetermined),
+            "not_told_apart": [{"names": [a, b]} for a, b, _ in found.told_together],
+        },
+        "base_parameters": [
+            {
+                "name": name,
+                "expression": expression,
+                "value": float(value),
+                "std_error": _finite(error),
+                "unit": layout.units[i],
+            }
+            for name, expression, value, error, i in base
+        ],
+        "uncertainty": {
+            "method": "scatter of the scores of stretches of the whitened residual",
+            "inflation": estimate.details["inflation"],
+        },
+        "standard_parameters": standard[: layout.n_inertial],
+        "drive_parameters": [*standard[layout.n_inertial :], *_loop_parameters(found)],
+        "own_terms": model.options["own_terms"],
+        "consistency": {
+            "is_consistent": bool((smallest >= 0).all()),
+            "links": [
+                {"name": body, "mass": float(J[3, 3]), "min_eigenvalue": float(low)}
+                for body, J, low in zip(layout.bodies, bodies, smallest, strict=True)
+            ],
+            "total_mass": float(bodies[:, 3, 3].sum()),
+        },
+        "identification": {
+            "per_joint": {
+                joint: _commanded_joint(found, found.errors, j)
+                for j, joint in enumerate(model.joints)
+            }
+        },
+        "validation": [
+            {
+                "log": run.log.path,
+                "per_joint": {
+                    joint: _commanded_joint(found, (run,), j)
+                    for j, joint in enumerate(model.joints)
+                },
+            }
+            for run in found.kept
+        ],
+        "simulation": {
+            "controller": {"kind": found.loop.kind, "effort_limit": _stated_limits(found)},
+            "fit": {
+                "message": estimate.message,
+                "converged": estimate.converged,
+                "parameters": len(estimate.theta),
+                "correlation": [float(rho) for rho in estimate.details["correlation"]],
+            },
+            "friction_tried": [dataclasses.asdict(tried) for tried in found.fitted.tried],
+            "identification": [_open_loop(found, run) for run in found.errors],
+            "validation": [_open_loop(found, run) for run in found.kept],
+        },
+        "warnings": [
+            {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
+            for f in found.findings
+        ],
+        "verdict": found.verdict.to_dict(),
+    }
+
+
+def _source_of(found: Commanded, name: str, error: float) -> str:
+    """Return what determined a parameter: "data", "mixed", "prior", or "bound"."""
+    if not error > 0:
+        return "prior"
+    if name in found.fitted.estimate.details["at_bound"]:
+        return "bound"
+    share = dict(zip(found.fitted.simulator.names, found.shrunk, strict=True)).get(name)
+    if share is None:  # of a body, or of drives that share it
+        return "mixed"
+    return "data" if share < 0.3 else "mixed" if share < 0.9 else "prior"
+
+
+def _commanded_input(run: OpenLoop, role: str) -> dict[str, Any]:
+    log, dt = run.log, float(np.median(np.diff(run.log.t)))
+    return {
+        "role": role, **_source(log.path), "samples": len(log.t), "rate": 1.0 / dt,
+        "start": float(log.t[0]), "end": float(log.t[-1]), "rows_used": len(log.t), "segments": 1,
+        "signals": {},
+    }  # fmt: skip
+
+
+def _loop_parameters(found: Commanded) -> list[dict[str, Any]]:
+    """Return gains, delay, limit and zero of each joint, those that were stated without error."""
+    loops, simulator = found.fitted.loops, found.fitted.simulator
+    errors = {
+        (unknown.what, j): float(error)
+        for unknown, error in zip(simulator.unknowns, found.fitted.estimate.std_error, strict=True)
+        for j in unknown.joints
+    }
+    entries = []
+    for j, joint in enumerate(found.model.limits):
+        force, way = ("N", "m") if joint.type == "prismatic" else ("N m", "rad")
+        units = {
+            "kp": f"{force}/{way}", "kd": f"{force} s/{way}", "delay": "s", "limit": force,
+            "zero": way,
+        }  # fmt: skip
+        for what, unit in units.items():
+            value = float(getattr(loops, what)[j])
+            if math.isfinite(value):
+                error = errors.get((what, j))
+                entries.append(
+                    {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
+                     "unit": unit, "source": "stated" if error is None else "data"}
+                )  # fmt: skip
+    return entries
+
+
+def _stated_limits(found: Commanded) -> dict[str, float] | None:
+    limits = dict(zip(found.model.joints, found.fitted.loops.limit.tolist(), strict=True))
+    return {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+
+
+def _unit_of(found: Commanded, j: int) -> str:
+    return "m" if found.model.limits[j].type == "prismatic" else "rad"
+
+
+def _commanded_joint(found: Commanded, runs: Sequence[OpenLoop], j: int) -> dict[str, Any]:
+    """Return how far the open loop of a joint runs from logs: no torque was there to compare."""
+    rmse = float(np.sqrt(np.mean([run.rmse[j] ** 2 for run in runs])))
+    size = float(np.sqrt(np.mean([run.spread[j] ** 2 for run in runs])))
+    share = 100 * rmse / size if size > 0 else None
+    return {"relative_error_pct": share, "rmse": rmse, "unit": _unit_of(found, j)}
+
+
+def _open_loop(found: Commanded, run: OpenLoop) -> dict[str, Any]:
+    """Return the errors of open loops on one log, joint by joint and by horizon."""
+    others = {
+        "command_rmse": run.command, "urdf_rmse": run.urdf, "second_order_rmse": run.second_order
+    }  # fmt: skip
+    joints = found.model.joints
+    return {
+        "log": run.log.path,
+        "start": float(run.log.t[0]),
+        "end": float(run.log.t[-1]),
+        "per_joint": {
+            joint: {
+                "rmse": float(run.rmse[j]),
+                "unit": _unit_of(found, j),
+                **{key: None if x is None else float(x[j]) for key, x in others.items()},
+            }
+            for j, joint in enumerate(joints)
+        },
+        "horizons": {
+            f"{h:g}": dict(zip(joints, map(float, errors), strict=True))
+            for h, errors in run.horizons.items()
+        },
     }
 
 

@@ -8,7 +8,7 @@ from robotid.identification.pipeline import Identification
 from robotid.pages.html import Cell, code, table
 from robotid.report.summary_screen import joint_errors
 
-__all__ = ["findings_line", "findings_section"]
+__all__ = ["causes_html", "findings_line", "findings_section"]
 
 
 def findings_line(found: Identification) -> str:
@@ -35,9 +35,16 @@ def findings_section(found: Identification) -> str:
         found: The identification.
     """
     causes = grouped(found.findings, found.model.joints)
-    if not causes:
-        return "<p>None.</p>\n"
-    return _by_joint(found, causes) + "".join(_cause(cause) for cause in causes)
+    return _by_joint(found, causes) + causes_html(causes)
+
+
+def causes_html(causes: Sequence[Cause]) -> str:
+    """Return causes with what was found, in their order.
+
+    Args:
+        causes: The causes.
+    """
+    return "".join(_cause(cause) for cause in causes) or "<p>None.</p>\n"
 
 
 def _cause(cause: Cause) -> str:

@@ -13,9 +13,11 @@ from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
-from robotid.findings import listed
+from robotid.findings import Finding, grouped, listed
+from robotid.identification.advice import Origin
 from robotid.pages.charts import Chart, Series, chart_html
 from robotid.pages.html import Cell, Section, code, folded, number, page, table, text, with_error
+from robotid.report.causes import causes_html
 from robotid.versions import __version__
 
 __all__ = ["Followed", "write_commanded_report"]
@@ -70,6 +72,7 @@ def write_commanded_report(
     target: str | Path,
     *,
     files: Mapping[str, str] | None = None,
+    origin: Origin | None = None,
 ) -> Path:
     """Write what drives were found from commands and positions, as one HTML file.
 
@@ -80,6 +83,7 @@ def write_commanded_report(
         followed: The logs to show.
         target: The file to write.
         files: Files beside it to link to, by what they are, as "URDF".
+        origin: Where the results are, for the commands that it shows; none if not said.
 
     Returns:
         Path of the file.
@@ -97,9 +101,11 @@ def write_commanded_report(
         "positions": Section("Positions", _positions(content, followed, worst)),
         "drives": Section("Drives", _drives(content)),
         "open": Section("What cannot be told", _undetermined(content)),
+        "findings": Section("Findings", _findings(content)),
         "appendix": Section("Appendix", _appendix(content)),
     }
     header = _verdict(content) + _facts(content, files or {}) + _first_charts(content)
+    header += _next(content, origin or Origin())
     return write_text(page(f"{content['robot']}: drives from commands", header, sections), target)
 
 
@@ -196,6 +202,42 @@ def _first_charts(content: Mapping[str, Any]) -> str:
         f'<div class="plots">\n{chart_html(bars, f"Position missed in open loop: {said}")}'
         f"{_horizon_chart(shown, said)}</div>\n"
     )
+
+
+def _next(content: Mapping[str, Any], origin: Origin) -> str:
+    """Return what may be done with the result, as commands to copy."""
+    urdf, log = (
+        next((x["path"] for x in content["inputs"] if x["role"] == role), "")
+        for role in ("urdf", "identification")
+    )
+    result, robot = f"{origin.folder}/result.json", content["robot"] or "robot"
+    uses = {
+        "See commanded, measured and simulated robot.": ("replay", urdf, log, result),
+        "Simulate it in MuJoCo, gains and delays included.": (
+            "export", result, "--format", "mjcf", "--out", f"{robot}.xml",
+        ),
+        "Train with it in Isaac Lab.": (
+            "export", result, "--format", "isaac", "--out", f"{robot}_actuators.yaml",
+        ),
+        "Draw its drives at random, within their intervals.": (
+            "export", result, "--format", "ranges", "--out", f"{robot}_ranges.yaml",
+        ),
+    }  # fmt: skip
+    steps = "".join(
+        f'<li><p>{escape(words)}</p><div class="copy"><pre class="command">{escape(block)}</pre>'
+        "</div></li>\n"
+        for words, command in uses.items()
+        for block in origin.using(*command)
+    )
+    return f'<h2 id="next">Do next</h2>\n<ol class="next">{steps}</ol>\n' if steps else ""
+
+
+def _findings(content: Mapping[str, Any]) -> str:
+    findings = [
+        Finding(entry["code"], entry["severity"], entry["where"], entry["message"])
+        for entry in content.get("warnings", [])
+    ]
+    return causes_html(grouped(findings, content["joints"]))
 
 
 def _scaled(value: float | None) -> float:

@@ -98,8 +98,8 @@ _BODY = f"""\
 <aside id="side" aria-label="what is shown, and plots" hidden>
 <section id="events" hidden><h2>Events</h2><ul id="marks"></ul></section>
 <div id="switches"></div>
-<p id="residuals" class="quiet"><span id="arcs">Arcs: measured torque from its tick at zero, 270° is
-a joint's largest; the inner one is predicted, unless the joint stands still. </span>Colour: residual,
-<span class="ramp"></span> from 0 to <span id="most"></span>.</p>
+<p id="residuals" class="quiet"><span id="arcs">Arcs: measured torque from its tick at zero, 270°
+is a joint's largest; the inner one is predicted, unless the joint stands still.
+</span>Colour: residual, <span class="ramp"></span> from 0 to <span id="most"></span>.</p>
 <div id="plots"></div>
 </aside>"""

@@ -16,8 +16,9 @@ from robotid.exceptions import DataError
 from robotid.logs.data import Log
 from robotid.logs.formats import write_columns
 from robotid.logs.read import read_log, write_log
-from robotid.logs.settings import SignalSettings
+from robotid.logs.settings import LogSource, SignalSettings
 from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 GOOD = (Servo(), Servo(coulomb=2.0, delay=0.03))
 FOLDERS = (os.environ.get("ROBOTID_DATA"), Path(__file__).resolve().parents[3] / "shared" / "data")
@@ -291,6 +292,22 @@ def test_sizes_of_loads_taken_for_torques_are_an_error(ur5):
     sizes = np.round(np.abs(3 * v + 10 * log.q + 0.1 * rng.standard_normal(v.shape)) / 0.05) * 0.05
     findings = check_logs(ur5, replace(log, tau=sizes, has_torque=True))
     assert {"unsigned_torque"} <= {f.code for f in findings if f.severity == "error"}
+
+
+@real
+def test_loads_of_a_servo_arm_mapped_to_torques_are_an_error():
+    model = RobotModel.from_urdf(example_urdf("so101.urdf"))
+    names = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+    path = DATA / "commands" / "so101" / "multisine.parquet"
+    source = LogSource(joints=dict(zip(model.joints, names, strict=True)))
+    with pytest.raises(DataError, match=r"no column 'tau_Rotation'.* Its commands are enough"):
+        read_log(path, model.joints, source=source)
+    loads = {
+        f"tau_{joint}": f"loadsize_{name}" for joint, name in zip(model.joints, names, strict=True)
+    }
+    log = read_log(path, model.joints, source=source, columns=loads)
+    errors = {f.code for f in check_logs(model, log) if f.severity == "error"}
+    assert errors == {"unsigned_torque", "velocity_scale"}  # the jaw's dq is its motor's
 
 
 def test_velocities_of_a_log_without_torque_are_judged_without_it(ur5):

@@ -141,6 +141,19 @@ def test_the_plant_is_quick_and_its_truth_says_what_it_does(name):
     assert np.std(noisy - exact) == pytest.approx(1e-3, rel=0.05)
 
 
+def test_the_plant_logs_the_torques_of_its_drives():
+    """kp (q_ref(t - delay) - q) - kd v, from the log itself, and the offset of the equation."""
+    leg = plant("leg", np.random.default_rng(0), delay=0.006, offset=0.7)
+    log, _ = recorded(leg, np.random.default_rng(1), duration=2.0, noise=0.0, torque=0.0)
+    assert log.has_torque
+    v = np.gradient(log.q, log.t, axis=0)
+    kp, kd = (np.array([getattr(drive, key) for drive in leg.drives]) for key in ("kp", "kd"))
+    late = 3  # rows
+    by_hand = kp * (log.q_ref[:-late] - log.q[late:]) - kd * v[late:]
+    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.035)
+    assert np.ptp(by_hand, axis=0).min() > 0.8
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     leg = plant("leg", np.random.default_rng(0), coulomb=0.2, offset=0.1, zero=0.02, delay=0.0063)
@@ -241,6 +254,19 @@ def test_mjcf_of_a_result_says_what_it_lacks(result, tmp_path, capsys):
     robot = mujoco.MjModel.from_xml_path(str(tmp_path / "b.xml"))
     assert robot.opt.timestep == 0.002
     np.testing.assert_allclose(robot.dof_frictionloss, [0.2, 0.2, 0.4 + mean], rtol=1e-4)
+
+
+def test_a_controller_that_carries_the_weight_is_named(tmp_path, capsys):
+    settings = {"estimator": {"name": "wls"}, "controller": {"gravity_compensation": True}}
+    folder = written_result(
+        plant("planar", np.random.default_rng(0)), tmp_path / "out", settings=settings
+    )
+    for kind in ("mjcf", "isaac"):
+        code, out, _ = export(folder, kind, tmp_path / "a", capsys)
+        assert code == 0
+        assert "the controller adds the torque of gravity by the URDF" in out
+        said = " ".join((tmp_path / "a").read_text().split())
+        assert "adds the torque of gravity by the URDF" in said
 
 
 def test_mean_friction_changes_nothing_without_such_friction():

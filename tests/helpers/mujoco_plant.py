@@ -29,6 +29,9 @@ ROBOTS = {
         (2000.0, 2000.0, 1200.0, 200.0, 200.0, 150.0),
     ),
     "leg": ("go2.urdf", LEG, (0.0, 1.0, -1.9), (0.3, 0.5, 0.5), (20.0, 20.0, 20.0)),
+    "quadruped": (
+        "go2.urdf", None, 4 * (0.0, 1.0, -1.9), 4 * (0.3, 0.5, 0.5), 12 * (20.0,),
+    ),
 }  # fmt: skip
 
 
@@ -82,7 +85,7 @@ def plant(name, rng, **changes):
     return Plant(model, tuple(drives), np.array(middle), np.array(reach))
 
 
-def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4):
+def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None):
     """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
 
     Args:
@@ -91,12 +94,17 @@ def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4):
         duration: Length [s].
         rate: Rows per second, each a command that is held until the next [Hz].
         noise: Standard deviation of the encoders [rad].
+        torque: Standard deviation of the drives' logged torques [N m]; None: none are logged.
     """
     t = np.arange(round(duration * rate)) / rate
     q_ref = multisine(t, plant.middle, plant.reach, rng)
-    q = followed(loaded(plant, rate), q_ref, rate)
+    q, force = rolled_out(loaded(plant, rate), q_ref, rate)
     q = q + noise * rng.standard_normal(q.shape)
-    log = Log(t, q, np.zeros_like(q), plant.model.joints, q_ref=q_ref, has_torque=False)
+    tau = np.zeros_like(q)
+    if torque is not None:  # of the drive, whose offset does not reach the joint
+        tau = force + [drive.offset for drive in plant.drives]
+        tau += torque * rng.standard_normal(q.shape)
+    log = Log(t, q, tau, plant.model.joints, q_ref=q_ref, has_torque=torque is not None)
     return log, plant.truth
 
 
@@ -124,11 +132,19 @@ def loaded(plant, rate, step=_STEP):
     for parent in [*top.iter()]:
         for shape in [*parent.findall("geom"), *parent.findall("mesh")]:
             parent.remove(shape)
+    sensors = ET.SubElement(top, "sensor")
+    for drive in plant.drives:
+        ET.SubElement(sensors, "actuatorfrc", actuator=drive.joint)
     return mujoco.MjModel.from_xml_string(ET.tostring(top, encoding="unicode"))
 
 
 def followed(robot, q_ref, rate, settles=_SETTLES):
-    """Return the positions of MuJoCo's robot at the times of commands that are held, shape (N, n).
+    """Return the positions of MuJoCo's robot as of ``rolled_out``."""
+    return rolled_out(robot, q_ref, rate, settles)[0]
+
+
+def rolled_out(robot, q_ref, rate, settles=_SETTLES):
+    """Return positions and forces of MuJoCo's robot, shape (N, n), at the times of held commands.
 
     Args:
         robot: MuJoCo's model; its actuators are in the order of the commands.
@@ -150,6 +166,7 @@ def followed(robot, q_ref, rate, settles=_SETTLES):
     mujoco.mj_getState(robot, data, state, kind)
     before = round(settles / robot.opt.timestep)
     control = np.vstack([np.repeat(q_ref[:1], before, axis=0), np.repeat(q_ref, held, axis=0)])
-    states, _ = rollout.rollout(robot, data, state[None], control[None])
+    states, forces = rollout.rollout(robot, data, state[None], control[None])
     qpos = states[0, :, 1 : 1 + robot.nq]  # after the time; a row after each step
-    return qpos[before - 1 :][: held * len(q_ref) : held, at]
+    q = qpos[before - 1 :][: held * len(q_ref) : held, at]
+    return q, forces[0, before::held]  # which a step tells of the state that it begins with

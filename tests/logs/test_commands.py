@@ -17,6 +17,7 @@ from helpers.recorders import (
     write_lerobot,
 )
 
+from robotid.commands.convert import convert
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.survey import survey_log
 from robotid.logs.data import COLUMNS, Log
@@ -431,6 +432,13 @@ def test_one_episode_of_several_is_stated(tmp_path, version):
         DataError, match=r"no episode 'episode_4'; episodes: episode_0, episode_3, "
     ):
         read_log(path, JOINTS, units=DEGREES, source=LogSource(topic="episode_4"))
+
+
+def test_a_dataset_is_converted_without_its_unit(tmp_path):
+    done = convert(dataset(tmp_path), tmp_path / "run.csv")
+    assert done.joints == JOINTS
+    back = read_log(tmp_path / "run.csv", JOINTS, needs="commands", units=DEGREES)
+    np.testing.assert_allclose(back.q_ref, make_log(100).q_ref, atol=1e-6)
 
 
 def test_normalised_positions_are_no_angles(tmp_path):

@@ -1,5 +1,7 @@
 """The page of drives found from commands: its figures are those of the result and the logs."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers.commanded_results import by_position, written_result
@@ -8,6 +10,7 @@ from helpers.pages import chart, charts, tables
 
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
+from robotid.identification.advice import Origin
 from robotid.report.commanded_page import Followed, write_commanded_report
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
@@ -46,6 +49,14 @@ def content(tmp_path_factory):
         simulation=simulation,
         structure={"base": 0, "undetermined": ["FL_calf.Ixx"]},
         verdict={"status": "usable", "reasons": [REASON]},
+        warnings=[
+            {
+                "code": "saturation",
+                "severity": "warning",
+                "where": LEG[2],
+                "message": f"{LEG[2]} saturates",
+            }
+        ],
     )
     return load_result(folder).content
 
@@ -53,7 +64,10 @@ def content(tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(content, followed, tmp_path_factory):
     target = tmp_path_factory.mktemp("pages") / "report.html"
-    return write_commanded_report(content, [followed], target, files={"URDF": "a.urdf"}).read_text()
+    page = write_commanded_report(
+        content, [followed], target, files={"URDF": "a.urdf"}, origin=Origin((), "out")
+    )
+    return page.read_text()
 
 
 def test_errors_are_those_of_the_result_in_mrad(page):
@@ -109,6 +123,14 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     said = page[page.index("The logs leave these open") :]
     assert "FL_calf.Ixx" in said
     assert "kp of every joint, kd of every joint, masses of the URDF" in said
+
+
+def test_findings_and_commands_are_shown(page):
+    assert f"<p>{LEG[2]} saturates</p>" in page
+    assert 'class="cause warning"' in page
+    commands = re.findall(r'<pre class="command">(.*?)</pre>', page)
+    assert "robotid export out/result.json --format isaac" in commands[2]
+    assert [words.split()[1] for words in commands] == ["replay", "export", "export", "export"]
 
 
 def test_logs_that_do_not_fit_are_refused(content, followed, tmp_path):

@@ -1,0 +1,82 @@
+"""A job of commands and positions from its files to the folder of results."""
+
+from pathlib import Path
+from typing import Any
+
+from robotid._files import check_folder, folder_beside, write_json
+from robotid._typing import ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.fit import STAGES
+from robotid.commanded.identify import Commanded, identify_commands
+from robotid.commands.job import Job
+from robotid.exceptions import SettingsError
+from robotid.export.result import build_commanded
+from robotid.export.urdf import write_urdf
+from robotid.identification.settings import SimulationSettings
+from robotid.report.commanded_page import Followed, write_commanded_report
+from robotid.robot.drives import AUTO
+
+__all__ = ["run_commanded"]
+
+
+def run_commanded(
+    job: Job, folder: str | Path, *, progress: ProgressCallback | None = None
+) -> tuple[Commanded, dict[str, Any]]:
+    """Identify from commands and write result.json, report.html and the URDF with its sidecar.
+
+    Args:
+        job: What to do; its estimator is "simulation".
+        folder: Where to write; made if it is missing.
+        progress: Told of the stages.
+
+    Returns:
+        What was found, and the content of result.json.
+
+    Raises:
+        DataError: If a log cannot be used.
+        MissingDependencyError: If Numba is not installed.
+        NotConvergedError: If the loops cannot be rolled out.
+        SettingsError: If a setting does not fit.
+    """
+    if not isinstance(job.estimator, SimulationSettings):
+        raise SettingsError(f"the estimator is {job.estimator.name!r}, wanted 'simulation'")
+    told = progress or ignore_progress
+    report_stage(told, "reading logs", STAGES)
+    model, target = job.model(), Path(folder)
+    name = f"{Path(model.tree.path).stem}.identified.urdf"
+    sidecar = str(Path(name).with_suffix(".drive.json"))
+    check_folder(target, ["result.json", "report.html", name, sidecar])
+    logs, kept = (
+        [job.read(entry, model, needs="commands") for entry in entries]
+        for entries in (job.identification, job.validation)
+    )
+    found = identify_commands(
+        model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms, progress=told
+    )
+    report_stage(told, "writing", STAGES)
+    outputs = {"urdf": name, "sidecar": sidecar} | ({"report": "report.html"} if job.report else {})
+    content = build_commanded(found, job.to_dict(), outputs)
+    target.mkdir(parents=True, exist_ok=True)
+    with folder_beside(target) as partial:
+        write_urdf(found.model, found.standard, partial / name, dynamics=job.dynamics)
+        if job.report:
+            files = {"result": "result.json", "urdf": name, "sidecar": sidecar}
+            write_commanded_report(content, followed(found), partial / "report.html", files=files)
+        write_json(content, partial / "result.json")
+    return found, content
+
+
+def followed(found: Commanded) -> list[Followed]:
+    """Return the logs beside their open loops, those kept apart first, as the report shows them.
+
+    Args:
+        found: What was found.
+    """
+    shown = []
+    for is_kept, runs in ((True, found.kept), (False, found.errors)):
+        for run in runs:
+            t = run.log.t
+            name = f"{run.log.name}, {t[0]:.4g} to {t[-1]:.4g} s"
+            q_ref = run.log.q_ref
+            if q_ref is not None:
+                shown.append(Followed(name, is_kept, t, q_ref, run.log.q, run.q))
+    return shown
