@@ -37,8 +37,8 @@ __all__ = [
 ]
 
 LANES = 8
-THETA = 0.52  # 0.5 is exact to second order, a little more damps what dt cannot follow
-_SIGN = 1e-3  # [rad/s or m/s]: the speed over which friction turns
+THETA = 0.5  # of a step, where its forces act: exact to second order
+_SIGN = 1e-4  # [rad/s or m/s]: the speed over which friction turns
 _NEWTON = 60  # steps, of which three or four are usual
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
