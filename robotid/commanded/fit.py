@@ -179,11 +179,10 @@ def _torque_rows(model: RobotModel, base: Loops, logs: Sequence[Log]) -> TorqueR
 
 
 def _zeros(model: RobotModel, encoders: Encoders) -> list[Unknown]:
-    """Return the zeros of encoders of joints that turn, near where they were found."""
+    """Return the zeros of encoders that are not the URDF's, near where they were found."""
     return [
-        Unknown(f"{joint.name}.zero", "zero", (j,), float(encoders.zero[j]), _TURN)
-        for j, joint in enumerate(model.limits)
-        if joint.type != "prismatic"
+        Unknown(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
+        for j in np.flatnonzero(encoders.gain > 0)
     ]
 
 

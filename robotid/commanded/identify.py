@@ -300,7 +300,7 @@ def _judge(found: Commanded) -> Verdict:
     if not found.kept:
         reasons.insert(0, "no log was kept apart: nothing tests the open loop; add [[validation]]")
     if status == "good":
-        worst = max(float((run.rmse / run.spread).max()) for run in shown)
+        worst = max(_share(shown, j) for j in range(len(joints)))
         reasons = [
             f"open loops miss at most {100 * worst:.2g} % of the motion of any joint on logs kept "
             "apart, and less than the plainer models"
@@ -309,8 +309,8 @@ def _judge(found: Commanded) -> Verdict:
 
 
 def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) -> JointVerdict:
-    """Return the verdict on one joint, by its worst log."""
-    share = max(float(run.rmse[j] / max(run.spread[j], 1e-12)) for run in runs)
+    """Return the verdict on one joint, by all logs together."""
+    share = _share(runs, j)
     said = f"{joint}: the open loop misses {100 * share:.2g} % of its motion"
     beaten = [
         name
@@ -332,6 +332,11 @@ def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) ->
     if share > GOOD or beaten:
         return JointVerdict("usable", (said,))
     return JointVerdict("good", (said,))
+
+
+def _share(runs: Sequence[OpenLoop], j: int) -> float:
+    """Return the share of a joint's motion that open loops miss, all logs together."""
+    return _mean(run.rmse[j] for run in runs) / max(_mean(run.spread[j] for run in runs), 1e-12)
 
 
 def _mean(values: Iterator[float]) -> float:

@@ -2,7 +2,8 @@
 
 A servo's position loop is held off its command by the torque of its load, q_ref - q = tau / kp +
 friction. So the error of the loops, regressed on the URDF's torques, tells at which angles and in
-which sense the URDF's joints stand where the encoders read what they do.
+which sense the URDF's joints stand where the encoders read what they do. Joints with parallel
+axes cannot be told from their mirror image: gravity holds both off alike.
 """
 
 from collections.abc import Sequence
@@ -22,8 +23,7 @@ _ANGLES = np.deg2rad(np.arange(-180.0, 180.0, 15.0))  # zeros that are tried
 _SAMPLES = 400  # of all logs together
 _SWEEPS = 4  # over the joints, until none moves any more
 _CUTOFF = 4.0  # [Hz] of the motion that is looked at
-_GAIN = 0.05  # of the squared error: what a joint must gain to leave the URDF's zero
-_SIGN_GAIN = 0.1  # ... and its sense
+_GAIN = 0.15  # of the squared error: what a joint must gain to leave the URDF's zero or sense
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,7 @@ def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
                 trial_sign, trial_zero = sign.copy(), zero.copy()
                 trial_sign[j], trial_zero[j] = s, z
                 value = _cost(model, q, v, a, error, trial_sign, trial_zero)
-                least = _SIGN_GAIN if s != sign[j] else _GAIN
-                if value < best and value < cost + np.log1p(-least) * len(q):
+                if value < best and value < cost + np.log1p(-_GAIN) * len(q):
                     best, found = value, (s, z)
             if best < cost:
                 gain[j] += 1.0 - np.exp((best - cost) / len(q))
