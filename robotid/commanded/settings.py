@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from robotid._settings import Range, Settings, setting
+from robotid._settings import Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
@@ -29,15 +29,14 @@ class LoopSettings(Settings):
         "which it is one, if not stated", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
-        None, "largest torque of the drive [N m or N], likewise; none if not stated, and found if "
-        "it is 'find'",
+        None,
+        "largest torque of the drive [N m or N], likewise; none if not stated, found if 'find'",
         reads=(int, float, dict, str),
-        within=Range(
-            "positive numbers, or 'find'", lambda x: x == "find" or GAIN["within"].holds(x)
-        ),
-    )  # fmt: skip
+        within=GAIN["within"],
+        among=("find",),
+    )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found, one for all joints, if not stated",
+        None, "how late the command acts [s], likewise; found, one for each group of joints, if not stated",
         **LEVEL,
     )  # fmt: skip
     gravity_compensation: bool = setting(

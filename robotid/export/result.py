@@ -197,7 +197,7 @@ def build_commanded(
             "rank": estimate.rank,
             "condition": _finite(estimate.condition),
             "undetermined": list(found.undetermined),
-            "not_told_apart": [{"names": [a, b]} for a, b, _ in found.told_together],
+            "not_told_apart": [{"names": list(names)} for names in found.told_together],
         },
         "base_parameters": _commanded_base(found, mapping),
         "uncertainty": {
@@ -215,6 +215,7 @@ def build_commanded(
         ],
         "simulation": {
             "controller": {"kind": found.loop.kind, "effort_limit": _stated_limits(found)},
+            "signs": dict(zip(model.joints, found.fitted.encoders.sign.tolist(), strict=True)),
             "fit": {
                 "message": estimate.message,
                 "converged": estimate.converged,
@@ -495,7 +496,9 @@ class Result:
             raise DataError(f"{self.path.name} has no gains of drives: it cannot follow commands")
         if log.q_ref is None:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
-        return follow_commands(*self.identified, self.commanded, log)
+        signs = self.content["simulation"].get("signs", {})
+        sign = np.array([signs.get(joint, 1.0) for joint in log.joints])
+        return sign * follow_commands(*self.identified, self.commanded, log.turned(sign))
 
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None
