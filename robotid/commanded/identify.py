@@ -220,7 +220,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"{listed(at_zero, _NAMED)} came out as 0, the least that can be: the motion shows "
             "none, or another parameter has taken it",
         )
-    if "delay" in at_zero:
+    if any(name.endswith("delay") for name in at_zero):
         yield Finding(
             "no_delay",
             "warning",
@@ -228,8 +228,8 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             "the delay came out as 0: commands and positions may not be of one clock, or the "
             "motion is too slow to show it; command a faster one",
         )
-    for names in found.told_together:
-        told = listed(names, _NAMED)
+    for told_names in found.told_together:
+        told = listed(told_names, _NAMED)
         yield Finding(
             "told_together",
             "note",

@@ -36,7 +36,7 @@ class LoopSettings(Settings):
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found, one for each group of joints, if not stated",
+        None, "how late the command acts [s], likewise; found, one for each group, if not stated",
         **LEVEL,
     )  # fmt: skip
     gravity_compensation: bool = setting(

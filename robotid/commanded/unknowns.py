@@ -194,8 +194,9 @@ class LoopSimulator:
                 slopes[first : first + 10, k] = next(changes)
                 continue
             for j in unknown.joints:
-                if (i := place.get((j, unknown.term or unknown.what))) is not None:
-                    slopes[i, k] = 1.0
+                row = place.get((j, unknown.term or unknown.what))
+                if row is not None:
+                    slopes[row, k] = 1.0
         return pi, slopes
 
     def residuals(self, theta: Array, *, with_slopes: bool) -> list[Residual]:

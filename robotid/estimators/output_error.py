@@ -80,13 +80,13 @@ class Simulator(Protocol):
         """
 
     def rows(self, theta: Array) -> tuple[Array, Array]:
-        """Return further residuals b of unit weight, shape (m,), as of torques, and what lowers them.
+        """Return further residuals of unit weight, as of torques, and what lowers them.
 
         Args:
             theta: Parameters, shape (c,).
 
         Returns:
-            A, shape (m, c), and b: parameters theta + x leave b - A x of them.
+            A, shape (m, c), and b, shape (m,): parameters theta + x leave b - A x.
         """
 
 
