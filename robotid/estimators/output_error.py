@@ -240,6 +240,11 @@ class OutputError:
         scale = 1.0 / np.sqrt(np.diag(H))
         values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
         bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
+        rows = sum(r.e.size for r in simulator.residuals(theta, with_slopes=False))
+        if rows < len(theta):
+            raise DataError(
+                f"{rows} samples of position for {len(theta)} parameters; record a longer motion"
+            )
         stretches = _stretches(simulator, weights, theta)
         meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
         if len(stretches) >= FEWEST_STRETCHES:
@@ -256,11 +261,6 @@ class OutputError:
         undetermined = tuple(
             name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
         )
-        rows = sum(r.e.size for r in simulator.residuals(theta, with_slopes=False))
-        if rows < len(theta):
-            raise DataError(
-                f"{rows} samples of position for {len(theta)} parameters; record a longer motion"
-            )
         state = "settled" if converged else "not settled"
         return Estimate(
             theta=theta,

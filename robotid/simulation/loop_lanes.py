@@ -501,8 +501,9 @@ def _newton(work, n, at, drives, terms, step, command):
             for lane in range(LANES):
                 before = _get(work, u + i, lane)
                 after = before - share * _get(work, G + i, lane)
-                after = 0.0 if after * before < 0.0 else after
-                if not abs(after - before) <= _CLOSE * (1.0 + abs(after)):
+                halts = after * before < 0.0
+                after = 0.0 if halts else after
+                if halts or not abs(after - before) <= _CLOSE * (1.0 + abs(after)):
                     is_found = False
                 _put(work, u + i, lane, after)
     return False
@@ -547,7 +548,8 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                     asked += kd * (command[j, 2, lane] - speed) + command[j, 3, lane]
                     x = 0.0 if is_on else math.copysign(1.0, -asked)
                 elif kind == LATE:
-                    x = -is_on * (kp * command[j, 1, lane] + kd * command[j, 4, lane])
+                    x = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
+                    x *= -is_on
                 elif kind == TERM:
                     x, _, _ = term(codes[index], shapes[index], _get(work, middle + j, lane), speed)
                     x *= abs(_get(work, load + j, lane)) if codes[index] == LOAD else 1.0
@@ -650,8 +652,8 @@ def roll_out(
         first: Where the terms of a joint begin, shape (n + 1,), int.
         columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
         directions: Changes of a body's parameters, shape (D, 10).
-        command: Position, its derivative by the delay, speed, torque, and the speed's derivative
-            by the delay, on average over each step, shape (K, n, 5, LANES).
+        command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
+            and torque by the delay, on average over each step, shape (K, n, 6, LANES).
         steps: Length of each step, shape (K, LANES) [s].
         every: Steps from a sample to the next.
         start: Positions and speeds, shape (2, n, LANES).

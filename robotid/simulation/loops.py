@@ -139,7 +139,7 @@ def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
     for start, stop in pairwise(edges):
         size = stop - start if math.isinf(length) else max(2, round(length / dt))
         firsts = list(range(start, stop, size))
-        if len(firsts) > 1 and stop - firsts[-1] < _SHORT * size:
+        if len(firsts) > 1 and stop - firsts[-1] < max(_SHORT * size, 2):
             firsts.pop()
         ends = [*firsts[1:], stop]
         windows += [
@@ -326,7 +326,7 @@ class LoopedRobot:
         )
         samples = max(window.stop - window.begin for window in windows)
         size, n = (samples - 1) * every, len(part.joints)
-        command = np.zeros((size, n, 5, lanes.LANES))
+        command = np.zeros((size, n, 6, lanes.LANES))
         steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
         mean, change = np.empty(size), np.empty(size)
         for lane in range(lanes.LANES):
@@ -337,14 +337,13 @@ class LoopedRobot:
             window = windows[lane]
             log, times = window.log, _times(window, samples, every)
             steps[:, lane], start[..., lane] = np.diff(times), window.start[:, part.joints]
-            for values, places in ((log.q_ref, (0, 1)), (log.v_ref, (2, 4)), (log.tau_ref, (3,))):
+            for values, k, by_delay in ((log.q_ref, 0, 1), (log.v_ref, 2, 4), (log.tau_ref, 3, 5)):
                 if values is None:
                     continue
                 for i, j in enumerate(part.joints):
                     told = np.ascontiguousarray(values[:, j])
                     lanes.average_command(log.t, told, times, loops.delay[j], mean, change)
-                    for place, found in zip(places, (mean, change), strict=False):
-                        command[:, i, place, lane] = found
+                    command[:, i, k, lane], command[:, i, by_delay, lane] = mean, change
         return command, steps, every, start
 
 

@@ -1,0 +1,184 @@
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from robotid.estimators.output_error import OutputError, Residual, linearised
+from robotid.exceptions import DataError, NotConvergedError
+
+DT, RHO, SIGMA = 0.02, 0.9, 0.02
+TRUTH = np.array([1.5, 0.3, 0.1])  # gain, time constant [s], offset
+
+
+@dataclass(frozen=True, eq=False)
+class Lagging:
+    """First-order lags with a gain and an offset that follow held commands, window by window."""
+
+    told: np.ndarray  # (W, N), N samples of W windows
+    measured: np.ndarray  # likewise
+    prior: np.ndarray
+    prior_std: np.ndarray
+    lowest: np.ndarray
+    further: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))  # rows A theta = b
+    names: tuple[str, ...] = ("gain", "time", "offset")
+
+    def simulated(self, theta):
+        gain, time, offset = theta
+        if not time > 0:
+            raise NotConvergedError("a lag needs a time constant above 0", "no lag")
+        a = np.exp(-DT / time)
+        return gain * lfilter([0.0, 1.0 - a], [1.0, -a], self.told, axis=1) + offset
+
+    def rows(self, theta):
+        A, b = self.further[:, :-1], self.further[:, -1]
+        return A, b - A @ theta
+
+    def residuals(self, theta, *, with_slopes):
+        e = self.measured - self.simulated(theta)
+        slopes = None
+        if with_slopes:
+            gain, time, _ = theta
+            a = np.exp(-DT / time)
+            y = lfilter([0.0, 1.0 - a], [1.0, -a], self.told, axis=1)
+            # y_k = a y_(k-1) + (1 - a) u_(k-1), so dy = a dy + da (y - u)
+            late = lfilter([0.0, 1.0], [1.0, -a], y - self.told, axis=1) * a * DT / time**2
+            slopes = np.stack([y, gain * late, np.ones_like(y)], axis=-1)
+        joints, columns = np.array([0]), np.arange(3)
+        return [
+            Residual(e[w, :, None], None if slopes is None else slopes[w, :, None], joints, columns)
+            for w in range(len(e))
+        ]
+
+
+def lagging(rng, *, rho=RHO, sigma=SIGMA, windows=24, samples=120, **changes):
+    told = np.repeat(rng.standard_normal((windows, samples // 10)), 10, axis=1)
+    exact = Lagging(told, told, np.zeros(3), np.full(3, np.inf), np.full(3, -np.inf))
+    white = sigma * rng.standard_normal(told.shape)
+    white[:, 0] /= np.sqrt(1.0 - rho**2)
+    noise = lfilter([1.0], [1.0, -rho], white, axis=1)
+    return replace(exact, measured=exact.simulated(TRUTH) + noise, **changes)
+
+
+START = np.array([1.0, 0.2, 0.0])
+
+
+def test_the_slopes_of_the_lag_are_those_of_differences(rng):
+    lag, h = lagging(rng), 1e-6
+    slopes = np.stack([r.slopes[:, 0] for r in lag.residuals(TRUTH, with_slopes=True)])
+    for k in range(3):
+        up, down = TRUTH.copy(), TRUTH.copy()
+        up[k], down[k] = TRUTH[k] + h, TRUTH[k] - h
+        exact = (lag.simulated(up) - lag.simulated(down)) / (2 * h)
+        np.testing.assert_allclose(slopes[..., k], exact, atol=1e-7)
+
+
+def test_parameters_are_recovered_without_noise(rng):
+    found = OutputError().fit(lagging(rng, sigma=1e-9), START)
+    np.testing.assert_allclose(found.theta, TRUTH, rtol=1e-6)
+    assert found.converged
+    assert found.undetermined == ()
+    assert found.names == ("gain", "time", "offset")
+
+
+def test_the_noise_that_is_left_is_found(rng):
+    found = OutputError().fit(lagging(rng, windows=100), START)
+    np.testing.assert_allclose(found.details["correlation"], [RHO], atol=0.03)
+    np.testing.assert_allclose(found.sigma, [SIGMA], rtol=0.03)
+    plain = OutputError(whitens=False).fit(lagging(rng, windows=100), START)
+    np.testing.assert_allclose(plain.sigma, [SIGMA / np.sqrt(1 - RHO**2)], rtol=0.1)
+    assert plain.details["correlation"] == [0.0]
+
+
+def test_no_more_correlation_is_taken_out_than_is_allowed(rng):
+    found = OutputError(most=np.array([0.5])).fit(lagging(rng), START)
+    assert found.details["correlation"] == [0.5]
+
+
+def test_standard_errors_are_the_scatter_of_many_noises():
+    rng = np.random.default_rng(5)
+    draws = [OutputError().fit(lagging(rng), START) for _ in range(200)]
+    theta = np.array([d.theta for d in draws])
+    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
+    assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
+    bias = (theta.mean(axis=0) - TRUTH) / (theta.std(axis=0) / np.sqrt(200))
+    assert np.abs(bias).max() < 4
+
+
+def test_correlated_noise_does_not_make_plain_squares_sure(rng):
+    """Their errors come from the scatter of stretches, five times those of white noise here."""
+    found = OutputError(whitens=False).fit(lagging(rng), START)
+    assert found.details["inflation"] > 2
+
+
+def test_a_bound_holds_and_is_named(rng):
+    lag = lagging(rng, lowest=np.array([2.0, 0.0, -np.inf]))
+    found = OutputError().fit(lag, START)
+    assert found.theta[0] == 2.0
+    assert found.details["at_bound"] == ("gain",)
+    fixed = lag.measured - lag.simulated(np.array([2.0, found.theta[1], found.theta[2]]))
+    nearby = [lag.simulated(found.theta + np.array([0.0, d, 0.0])) for d in (-0.02, 0.02)]
+    whitened = [np.sum(np.diff(lag.measured - s, axis=1) ** 2) for s in nearby]
+    assert np.sum(np.diff(fixed, axis=1) ** 2) < min(whitened), "the others are at their best"
+
+
+def test_a_prior_weighs_as_an_observation(rng):
+    lag = lagging(rng)
+    free = OutputError().fit(lag, START)
+    prior, spread = free.theta + 3 * free.std_error, free.std_error
+    both = OutputError().fit(replace(lag, prior=prior, prior_std=spread), START)
+    middle = (free.theta + prior) / 2  # of two that are equally sure
+    assert (np.abs(both.theta - middle) < 0.2 * np.abs(prior - free.theta)).all()
+    assert (both.std_error < 0.9 * free.std_error).all()
+    held = OutputError().fit(replace(lag, prior=prior, prior_std=np.full(3, 1e-9)), START)
+    np.testing.assert_allclose(held.theta, prior, atol=1e-6)
+    assert held.undetermined == lag.names
+
+
+def test_rows_of_torque_weigh_in_one_estimate(rng):
+    lag = lagging(rng)
+    free = OutputError().fit(lag, START)
+    sure = 0.2 * free.std_error[0]  # a row that knows the gain five times as well
+    rows = np.array([[1.0, 0.0, 0.0, TRUTH[0]]]) / sure
+    both = OutputError().fit(replace(lag, further=rows), START)
+    assert abs(both.theta[0] - TRUTH[0]) < 3 * sure
+    np.testing.assert_allclose(both.std_error[0], sure, rtol=0.1)
+    assert both.std_error[1] < free.std_error[1], "what goes with the gain is surer, too"
+
+
+def test_it_says_that_it_has_not_settled(rng):
+    found = OutputError(steps=1, rounds=1).fit(lagging(rng), START)
+    assert not found.converged
+    assert found.message.endswith("not settled")
+    assert OutputError().fit(lagging(rng), START).message.endswith(", settled")
+
+
+def test_a_step_that_cannot_be_simulated_is_shortened(rng):
+    """From far away, the first full step leads to a time constant below 0."""
+    lag = lagging(rng, sigma=1e-6)
+    start = np.array([0.1, 5.0, 0.0])
+    found = OutputError(whitens=False, steps=80).fit(lag, start)
+    np.testing.assert_allclose(found.theta, TRUTH, rtol=1e-3)
+
+
+def test_a_start_that_cannot_be_simulated_is_refused(rng):
+    with pytest.raises(NotConvergedError, match=r"time constant above 0"):
+        OutputError().fit(lagging(rng), np.array([1.0, -1.0, 0.0]))
+
+
+def test_fewer_samples_than_parameters_are_refused(rng):
+    lag = lagging(rng, windows=1)
+    short = replace(lag, told=lag.told[:, :2], measured=lag.measured[:, :2])
+    with pytest.raises(DataError, match=r"2 samples of position for 3 parameters"):
+        OutputError(whitens=False).fit(short, START)
+
+
+def test_what_is_linearised_is_whitened(rng):
+    lag, estimator = lagging(rng), OutputError()
+    weights = estimator.weights(lag, TRUTH)
+    A, b, columns = next(iter(linearised(lag, weights, TRUTH)))
+    r = lag.residuals(TRUTH, with_slopes=True)[0]
+    rho, sigma = weights.rho[0], weights.sigma[0]
+    np.testing.assert_allclose(b, (r.e[1:, 0] - rho * r.e[:-1, 0]) / sigma)
+    np.testing.assert_allclose(A, (r.slopes[1:, 0] - rho * r.slopes[:-1, 0]) / sigma)
+    np.testing.assert_array_equal(columns, [0, 1, 2])

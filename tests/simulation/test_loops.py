@@ -1,0 +1,311 @@
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.mujoco_plant import LEG
+from helpers.paths import URDF
+from scipy.integrate import solve_ivp
+
+from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
+from robotid.logs.data import Log
+from robotid.robot.drives import (
+    Asymmetric,
+    Coulomb,
+    Cubic,
+    Harmonic,
+    Lag,
+    LoadFriction,
+    Offset,
+    PositionCoulomb,
+    Stribeck,
+    Tanh,
+    Viscous,
+)
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import Coupling
+from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
+
+RATE = 500.0  # [Hz]
+LEGS = (*LEG, *(name.replace("FL", "FR") for name in LEG))
+PLAIN = (Viscous(), Coulomb(), Offset())
+#: Every term that a roll-out has, the load of the gear last.
+TERMS = (
+    *PLAIN, PositionCoulomb(order=1, centre=0.1), PositionCoulomb(order=2, centre=0.1),
+    Stribeck(speed=0.2), Asymmetric(), Cubic(), Tanh(speed=0.3), Harmonic(order=3),
+    Harmonic(order=2, is_sine=True), LoadFriction(),
+)  # fmt: skip
+VALUES = (0.1, 0.2, 0.05, 0.1, 0.15, 0.08, 0.03, 0.002, 0.1, 0.04, 0.03, 0.1)
+
+
+@pytest.fixture(scope="module")
+def legs():
+    """Two legs, which the trunk alone joins."""
+    return RobotModel.from_urdf(example_urdf("go2.urdf"), joints=list(LEGS))
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return RobotModel.from_urdf(URDF / "planar_2r.urdf")
+
+
+def loops_of(model, terms=PLAIN, values=VALUES, *, kp=20.0, **changes):
+    n = len(model.joints)
+    found = Loops(
+        bodies=model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10),
+        armature=np.linspace(0.01, 0.02, n),
+        kp=np.full(n, kp),
+        kd=np.full(n, 0.06 * kp),
+        limit=np.full(n, np.inf),
+        delay=np.zeros(n),
+        zero=np.linspace(0.05, -0.05, n),
+        terms=(tuple(terms),) * n,
+        values=np.tile(values[: len(terms)], n),
+    )
+    return replace(found, **changes)
+
+
+def commanded(model, duration=0.4, reach=0.3, seed=0, t=None):
+    """Return a log that begins at rest away from its command, and told positions and speeds."""
+    rng, n = np.random.default_rng(seed), len(model.joints)
+    t = np.arange(round(duration * RATE)) / RATE if t is None else t
+    w, phase = 2 * np.pi * rng.uniform(1.5, 3.0, n), rng.uniform(0, 2 * np.pi, n)
+    q_ref = reach * np.sin(w * t[:, None] + phase)
+    v_ref = 0.3 * reach * w * np.cos(w * t[:, None] + phase)
+    q = np.tile(q_ref[0] + 0.05, (len(t), 1))
+    tau = np.zeros_like(q)
+    return Log(
+        t, q, tau, model.joints, q_ref=q_ref, v_ref=v_ref, tau_ref=0.2 * v_ref, has_torque=False
+    )
+
+
+def rolled(model, loops, log, step=2e-3):
+    [out] = LoopedRobot(model, step=step).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    return out
+
+
+def radau(model, loops, log, friction, share=0.0):
+    """Return positions by a stiff integration of Pinocchio's dynamics, command by command.
+
+    Gears lose a share of the torque that they pass on to the bodies.
+    """
+    engine, n = model.pin_model, len(model.joints)
+    data = engine.createData()
+
+    def change(_, y, k):
+        q, v = y[:n] + loops.zero, y[n:]
+        M = np.triu(pin.crba(engine, data, q))
+        M = M + np.triu(M, 1).T + np.diag(loops.armature)
+        torque = loops.kp * (log.q_ref[k] - y[:n]) + loops.kd * (log.v_ref[k] - v) + log.tau_ref[k]
+        torque = np.clip(torque, -loops.limit, loops.limit)
+        h = pin.nonLinearEffects(engine, data, q, v)
+        free = torque - h - friction(y[:n], v)
+        a, s = np.linalg.solve(M, free), v / np.sqrt(v * v + 1e-6)
+        for _ in range(30 if share else 0):
+            load = M @ a - loops.armature * a + h
+            a = np.linalg.solve(M, free - share * s * np.abs(load))
+        return np.concatenate([v, a])
+
+    y, found = np.concatenate([log.q[0], np.zeros(n)]), [log.q[0]]
+    for k in range(len(log.t) - 1):
+        span = (log.t[k], log.t[k + 1])
+        y = solve_ivp(change, span, y, "Radau", rtol=1e-7, atol=1e-9, args=(k,)).y[:, -1]
+        found.append(y[:n])
+    return np.array(found)
+
+
+def test_an_arm_moves_as_a_stiff_integration_of_pinocchio_says(ur5):
+    log = commanded(ur5, 0.16)
+    terms = (*PLAIN, PositionCoulomb(order=2, centre=0.1), Stribeck(speed=0.2))
+    loops = loops_of(ur5, terms, (2.0, 3.0, 0.5, 4.0, 1.0), kp=500.0, limit=np.full(6, 60.0))
+
+    def friction(q, v):
+        root = np.sqrt(v * v + 1e-6)
+        s = v / root
+        hook = np.exp(-(root - 1e-3) / 0.2)
+        return 2.0 * v + (3.0 + 4.0 * (q - 0.1) ** 2 + 1.0 * hook) * s + 0.5
+
+    exact = radau(ur5, loops, log, friction)
+    told = loops.kp * (log.q_ref - exact)
+    assert (np.abs(told) > 60.0).any(), "the limit acts"
+    steps = (2e-3, 1e-3, 5e-4)
+    errors = [np.abs(rolled(ur5, loops, log, step).q - exact).max() for step in steps]
+    assert np.ptp(exact, axis=0).min() > 0.05
+    assert errors[1] < 3e-4
+    assert errors[2] < 0.7 * errors[1] < 0.7**2 * errors[0]
+
+
+def test_a_gear_loses_a_share_of_its_load(planar):
+    log = commanded(planar, 0.1, reach=0.8)
+    loops = loops_of(planar, (Viscous(), LoadFriction()), (2.0, 0.2), kp=300.0)
+    exact = radau(planar, loops, log, lambda q, v: 2.0 * v, share=0.2)
+    without = radau(planar, loops, log, lambda q, v: 2.0 * v)
+    error = np.abs(rolled(planar, loops, log, 2.5e-4).q - exact).max()
+    assert error < 2e-3 * np.abs(exact - without).max() + 1e-4
+    assert np.abs(exact - without).max() > 5e-3
+
+
+def differences(model, loops, log, change, h):
+    """Return the derivative of the positions by central differences of fourth order."""
+    near, far = ([rolled(model, change(loops, s * x), log).q for s in (1, -1)] for x in (h, 2 * h))
+    return (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
+
+
+@pytest.mark.parametrize("name", ["ur5", "legs"])
+def test_sensitivities_are_those_of_differences(request, name):
+    model = request.getfixturevalue(name)
+    robot, log = LoopedRobot(model), commanded(model, 0.3)
+    size = 1.0 if name == "legs" else 30.0
+    n, kinds = len(model.joints), LoopedRobot(model).kinds
+    values = size * np.array([*VALUES[:-1], VALUES[-1] / size])
+    loops = loops_of(
+        model, TERMS, values, kp=20.0 * size, delay=np.full(n, 0.0047),
+        limit=np.full(n, 2.5 * size if name == "legs" else 2.0 * size),
+    )  # fmt: skip
+    columns, changes = [], []
+
+    def by(field, j):
+        def change(loops, x):
+            moved = getattr(loops, field).copy()
+            moved[j] += x
+            return replace(loops, **{field: moved})
+
+        return change
+
+    for j in (0, 1, n - 1):
+        for field in ("armature", "kp", "kd", "limit", "delay", "zero"):
+            columns.append((kinds[field], j, 0))
+            changes.append(by(field, j))
+        for k in range(len(TERMS)):
+            columns.append((kinds["term"], j, len(TERMS) * j + k))
+            changes.append(by("values", len(TERMS) * j + k))
+    for body, joint in enumerate(robot.joint_of_body):
+        k = body % 10
+        columns.append((kinds["body"], joint, 10 * body + k))
+        changes.append(by("bodies", (body, k)))
+    directions = np.tile(np.eye(10), (n, 1))
+    [out] = robot.roll_out(loops, cut_windows(log, np.inf, 0.0), columns, directions)
+    assert len(out.slopes) == (1 if name == "ur5" else 2)
+    np.testing.assert_array_equal(out.q, rolled(model, loops, log).q)
+    worst, unseen, seen = {}, set(), set()
+    for joints, places, slopes in out.slopes:
+        for c, p in enumerate(places):
+            size = np.abs(slopes[:, :, c]).max()
+            h = 3e-7 / max(size, 1e-3)  # friction turns over 1e-3 rad/s: no step may be wider
+            exact = differences(model, loops, log, changes[p], h)
+            assert not np.delete(exact, joints, axis=1).any(), "parts move by themselves"
+            scale = np.abs(exact).max()
+            if scale < 1e-9:
+                unseen.add(columns[p][0])
+            else:
+                seen.add(columns[p])
+            worst[columns[p]] = np.abs(slopes[:, :, c] - exact[:, joints]).max() / max(scale, 1e-9)
+    assert max(worst.values()) < 1e-6, worst
+    assert unseen <= {kinds["zero"], kinds["body"], kinds["limit"]}, "about the vertical, or idle"
+    assert any(kind == kinds["limit"] for kind, *_ in seen)
+
+
+def test_a_delay_is_exact_about_held_commands(legs):
+    log, n = commanded(legs), len(legs.joints)
+    late = rolled(legs, loops_of(legs, delay=np.full(n, 2.3 / RATE)), log)
+
+    def shifted(x):  # over a step, 0.3 of it is still what was told three samples ago
+        held = np.vstack([x[:1], x[:1], x[:1], x])
+        return 0.3 * held[:-3] + 0.7 * held[1:-2]
+
+    told = {name: shifted(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
+    same = rolled(legs, loops_of(legs), replace(log, **told))
+    np.testing.assert_allclose(late.q, same.q, atol=1e-12)
+    assert np.abs(late.q - rolled(legs, loops_of(legs), log).q).max() > 1e-3
+
+
+def test_no_drive_gives_more_than_its_limit(legs):
+    log, n = commanded(legs, 0.05), len(legs.joints)
+    far = replace(log, q_ref=log.q_ref + 100.0)
+    at_limit = rolled(legs, loops_of(legs, limit=np.full(n, 3.0)), far)
+    held = replace(log, q_ref=None, v_ref=None, tau_ref=np.full_like(log.q, 3.0))
+    free = rolled(legs, loops_of(legs, kp=0.0), held)
+    np.testing.assert_allclose(at_limit.q, free.q, atol=1e-12)
+    low = rolled(legs, loops_of(legs, limit=np.full(n, 3.0)), replace(log, q_ref=log.q_ref - 100.0))
+    np.testing.assert_allclose(
+        low.q, rolled(legs, loops_of(legs, kp=0.0), replace(held, tau_ref=-held.tau_ref)).q,
+        atol=1e-12,
+    )  # fmt: skip
+
+
+def test_windows_cover_each_sample_once_and_cross_no_gap(planar):
+    t = np.concatenate([np.arange(60), 80 + np.arange(301), 500 + np.arange(2)]) / RATE
+    log = commanded(planar, t=t)
+    for length, lead in ((0.1, 0.0), (0.11, 0.03), (0.5, 0.2), (np.inf, 0.0), (1e-9, 0.01)):
+        windows = cut_windows(log, length, lead)
+        counted = np.concatenate([np.arange(len(t))[w.counted] for w in windows])
+        np.testing.assert_array_equal(counted, np.arange(len(t)))
+        for w in windows:
+            assert np.diff(t[w.begin : w.stop]).max() < 1.5 / RATE
+            edge = max(e for e in (0, 60, 361) if e <= w.first)
+            assert w.begin == max(edge, w.first - round(lead * RATE))
+    sizes = [w.stop - w.first for w in cut_windows(log, 0.11, 0.0)]
+    assert sizes == [60, *5 * [55], 26, 2] or sizes == [60, *4 * [55], 81, 2]
+
+
+def test_a_sample_alone_between_gaps_is_no_window(planar):
+    t = np.array([0.0, 0.002, 0.004, 0.1, 0.2, 0.202])
+    windows = cut_windows(commanded(planar, t=t), 1.0, 0.0)
+    assert [(w.first, w.stop) for w in windows] == [(0, 3), (4, 6)]
+
+
+def test_a_window_begins_with_the_slope_of_what_was_measured(planar):
+    log = commanded(planar, 0.3)
+    t = log.t[:, None]
+    log = replace(log, q=np.hstack([0.2 + 0.5 * t - 0.3 * t**2, np.cos(5 * t)]))
+    [_, w, *_] = cut_windows(log, 0.1, 0.0)
+    q, v = w.start
+    np.testing.assert_array_equal(q, log.q[50])
+    np.testing.assert_allclose(v, [0.5 - 0.6 * 0.1, -5 * np.sin(0.5)], rtol=1e-2)
+
+
+def test_lanes_know_nothing_of_each_other(legs):
+    log = commanded(legs, 0.5)
+    robot, windows = LoopedRobot(legs), cut_windows(log, 0.042, 0.01)
+    assert len(windows) > 8, "more than a block of lanes"
+    column = [(robot.kinds["kp"], 4, 0)]
+    together = robot.roll_out(loops_of(legs), windows, column)
+    for window, out in zip(windows, together, strict=True):
+        [alone] = robot.roll_out(loops_of(legs), [window], column)
+        np.testing.assert_allclose(alone.q, out.q, atol=1e-13)  # Newton ends with the last lane
+        np.testing.assert_allclose(alone.v, out.v, atol=1e-12)
+        assert len(out.q) == window.stop - window.first
+        for mine, other in zip(alone.slopes, out.slopes, strict=True):
+            np.testing.assert_allclose(mine[2], other[2], atol=1e-12)
+
+
+def test_without_numba_the_extra_is_named(planar, monkeypatch):
+    monkeypatch.setattr("robotid.simulation.loops.is_installed", lambda: False)
+    with pytest.raises(MissingDependencyError, match=r"closed loops needs numba.*robotid\[fast\]"):
+        LoopedRobot(planar)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"free_flyer": True},
+        {"couplings": (Coupling("motor", (("wrist_2_joint", 1.0), ("wrist_3_joint", -0.5))),)},
+    ],
+)
+def test_robots_that_cannot_be_rolled_out_are_named(options):
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), **options)
+    with pytest.raises(SettingsError, match=r"a floating base.*cannot be rolled out; fix the base"):
+        LoopedRobot(model)
+
+
+def test_a_term_without_a_place_is_named(planar):
+    loops = loops_of(planar, (*PLAIN, Lag()), (0.1, 0.1, 0.0, 0.01))
+    with pytest.raises(SettingsError, match=r"the term Lag has no place in roll-outs; they have V"):
+        rolled(planar, loops, commanded(planar))
+
+
+def test_friction_below_0_has_no_solution(legs):
+    loops = loops_of(legs, PLAIN, (0.1, -5.0, 0.0))
+    with pytest.raises(NotConvergedError, match=r"FL_hip_joint.*no solution: friction below 0"):
+        rolled(legs, loops, commanded(legs))
