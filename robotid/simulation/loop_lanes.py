@@ -515,6 +515,7 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
     T_q, T_v, S, own, change = sweeps
     codes, shapes, values, first = terms
     P = len(columns)
+    _combine(work, n, at, sweeps, drives, step)
     for p in range(P):
         kind, j, index = columns[p, 0], columns[p, 1], columns[p, 2]
         for i in range(n):
@@ -522,10 +523,14 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                 _put(work, own + i, lane, 0.0)
         if kind == INERTIAL:
             _inertial_column(work, parents, joints, works, j, index, own)
-        elif kind == ZERO:
+        elif kind == ZERO:  # what position does but for gain and friction
             for i in range(n):
                 for lane in range(LANES):
                     _put(work, own + i, lane, _get(work, T_q + i * n + j, lane))
+            for lane in range(LANES):
+                kp = _get(work, gains + j, lane) * drives[j, 1]
+                x = (_get(work, by_q + j, lane) + kp) / _get(work, loss + j, lane)
+                _put(work, own + j, lane, _get(work, own + j, lane) - x)
         else:
             kp, kd = drives[j, 1], drives[j, 2]
             for lane in range(LANES):
@@ -547,7 +552,7 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                     x, _, _ = term(codes[index], shapes[index], _get(work, middle + j, lane), speed)
                     x *= abs(_get(work, load + j, lane)) if codes[index] == LOAD else 1.0
                 _put(work, own + j, lane, x / _get(work, loss + j, lane))
-        _advance_column(work, n, at, sweeps, drives, step, p, P)
+        _advance_column(work, n, at, sweeps, step, p, P)
 
 
 @compiled
@@ -577,26 +582,43 @@ def _inertial_column(work, parents, joints, works, body, index, own):
 
 
 @compiled
-def _advance_column(work, n, at, sweeps, drives, step, p, P):
-    """Advance one sensitivity: H du = D dv / span - (own + by position + by speed)."""
-    M, H, by_q, gains, loss = at[5], at[7], at[8], at[10], at[12]
-    T_q, T_v, S, own, change = sweeps
+def _combine(work, n, at, sweeps, drives, step):
+    """Write what a step's equation is by position and speed before it, into T_q and T_v.
+
+    H du = T_v dv - T_q dq - own, each row divided by its e.
+    """
+    M, by_q, gains, loss = at[5], at[8], at[10], at[12]
+    T_q, T_v = sweeps[0], sweeps[1]
     for i in range(n):
-        armature, kp = drives[i, 0], drives[i, 1]
-        for lane in range(LANES):
-            span = THETA * step[lane]
-            dq, dv = _get(work, S + i * P + p, lane), _get(work, S + (n + i) * P + p, lane)
-            x = armature / span * dv - _get(work, gains + i, lane) * kp * dq
-            x -= _get(work, by_q + i, lane) * (dq + span * dv)
-            x = x / _get(work, loss + i, lane) - _get(work, own + i, lane)
-            _put(work, change + i, lane, x)
         for j in range(n):
             for lane in range(LANES):
                 span = THETA * step[lane]
-                dq, dv = _get(work, S + j * P + p, lane), _get(work, S + (n + j) * P + p, lane)
-                x = _get(work, M + i * n + j, lane) / span * dv
-                x -= _get(work, T_q + i * n + j, lane) * (dq + span * dv)
-                x -= _get(work, T_v + i * n + j, lane) * dv
+                bent = _get(work, T_q + i * n + j, lane)
+                m = _get(work, M + i * n + j, lane) / span
+                value = m - span * bent - _get(work, T_v + i * n + j, lane)
+                _put(work, T_v + i * n + j, lane, value)
+        armature, kp, d = drives[i, 0], drives[i, 1], i * n + i
+        for lane in range(LANES):
+            span, e = THETA * step[lane], _get(work, loss + i, lane)
+            bent = _get(work, by_q + i, lane)
+            by_speed = (armature / span - span * bent) / e
+            by_position = (bent + _get(work, gains + i, lane) * kp) / e
+            _put(work, T_v + d, lane, _get(work, T_v + d, lane) + by_speed)
+            _put(work, T_q + d, lane, _get(work, T_q + d, lane) + by_position)
+
+
+@compiled
+def _advance_column(work, n, at, sweeps, step, p, P):
+    """Advance one sensitivity of position and speed over a step."""
+    H = at[7]
+    T_q, T_v, S, own, change = sweeps
+    for i in range(n):
+        for lane in range(LANES):
+            _put(work, change + i, lane, -_get(work, own + i, lane))
+        for j in range(n):
+            for lane in range(LANES):
+                x = _get(work, T_v + i * n + j, lane) * _get(work, S + (n + j) * P + p, lane)
+                x -= _get(work, T_q + i * n + j, lane) * _get(work, S + j * P + p, lane)
                 _put(work, change + i, lane, _get(work, change + i, lane) + x)
     _solve(work, n, H, change, 1)
     for i in range(n):
