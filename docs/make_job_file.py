@@ -7,6 +7,7 @@ import math
 from dataclasses import MISSING
 from pathlib import Path
 
+from robotid.commanded.settings import LoopSettings
 from robotid.commands.job import Job, LogEntry
 from robotid.identification.settings import ESTIMATORS, ConstraintSettings
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
@@ -74,6 +75,7 @@ TABLES = {
     "signals": SignalSettings,
     "log": LogSource,
     "units": LogUnits,
+    "controller": LoopSettings,
     "estimator.constraints": ConstraintSettings,
     "[transmission]": Transmission,
     "[identification]": LogEntry,
@@ -192,7 +194,7 @@ def default_of(field):
         return f'`"{value}"`'
     if isinstance(value, tuple):
         return f"`{list(value)}`"
-    return f"`{words.get(value, value)}`" if not isinstance(value, dict) else "`{}`"
+    return "`{}`" if isinstance(value, dict) else f"`{words.get(value, value)}`"
 
 
 if __name__ == "__main__":

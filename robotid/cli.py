@@ -172,6 +172,7 @@ def _identify(options: argparse.Namespace) -> int:
         report_stage(progress, "reading logs")  # before what takes the first second: its modules
         from robotid.commands.identify import run_job
         from robotid.identification.advice import Origin, next_steps
+        from robotid.identification.pipeline import Identification
         from robotid.workers.plan import WorkPlan
 
         job = job_from_flags(options)
@@ -180,7 +181,7 @@ def _identify(options: argparse.Namespace) -> int:
         source = source_words(options.words)
         found, result = run_job(job, options.out, plan=plan, source=source)
     _show(result, options, "identify", [*result["outputs"].values(), "result.json"])
-    if not (options.json or "simulation" in result):
+    if isinstance(found, Identification) and not options.json:
         print_steps(next_steps(found, Origin(source, options.out)))
     return 1 if result["verdict"]["alarms"] else 0
 

@@ -58,7 +58,7 @@ def run_open_loop(log: Log, fitted: Fitted, urdf: Loops | None) -> OpenLoop:
     q = np.full_like(log.q, np.nan)
     for out in robot.roll_out(fitted.loops, cut_windows(log, np.inf, 0.0)):
         q[out.window.counted] = out.q
-    told = log.q_ref - log.q  # type: ignore[operator]
+    told = log.q_ref - log.q
     return OpenLoop(
         log=log,
         q=q,

@@ -9,18 +9,20 @@ from robotid._typing import Array, ProgressCallback, ignore_progress, report_sta
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
-from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
+from robotid.commanded.unknowns import LoopSimulator, TorqueRows, Unknown, body_unknowns
+from robotid.commanded.zeros import Encoders, find_encoders, same_encoders
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
+from robotid.identification.pipeline import identify
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
-from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.drives import DriveTerm, Viscous
+from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
 from robotid.simulation.settings import PerJoint, by_joint
 
-__all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
+__all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops", "with_terms"]
 
 #: What the fit of a job does, from files to files.
 STAGES = (
@@ -35,6 +37,8 @@ _TURN = 0.3  # [rad or m] spread of an encoder's zero about where it was found
 _LIGHTEST = 0.3  # of the largest such inertia: small joints have a motor behind a gear, too
 _POSES = 50  # that the bodies' inertia is looked at in
 _LEAST = 0.05  # of a usual size, that an inertia begins with, or a gain keeps
+_LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins with
+_WHITE = 2.0  # whitening ends at so many times the rate at which a loop follows
 _FEW = 12  # windows that are fitted first, of many
 _PASSES = 2  # of choosing terms and fitting again
 
@@ -47,7 +51,7 @@ class Fitted:
         simulator: The robot with its unknowns, and the windows.
         estimate: The unknowns' values.
         plain: The plain model, joint by joint.
-        stated: What was stated of the loops, over the URDF's bodies.
+        encoders: How encoders stand to the URDF's joints.
         tried: Which terms were tried, and what they gained.
         groups: The group of each joint.
     """
@@ -55,7 +59,7 @@ class Fitted:
     simulator: LoopSimulator
     estimate: Estimate
     plain: SecondOrder
-    stated: Loops
+    encoders: Encoders
     tried: tuple[Tried, ...]
     groups: tuple[str, ...]
 
@@ -90,23 +94,28 @@ def fit_loops(
         SettingsError: If a setting does not fit the robot.
     """
     robot = LoopedRobot(model, step=settings.step)
+    encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
+    logs = [log.turned(encoders.sign) for log in logs]
     windows = tuple(w for log in logs for w in cut_windows(log, settings.window, settings.lead))
-    stated = stated_loops(model, loop)
+    stated = replace(stated_loops(model, loop), zero=encoders.zero)
     report_stage(progress, "trying plain loops", STAGES)
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, _likeness(model))
     has_gain = _is_stated(loop.kp, model)
     usual = _usual(robot, plain, windows, has_gain)
-    base = _begin(model, stated, plain, usual)
-    has_speeds = all(log.v_ref is not None for log in logs)
-    unknowns = _unknowns(model, loop, groups, base, usual, has_speeds=has_speeds)
+    base = _begin(model, stated, plain, usual, finds_limit=loop.limit == "find")
+    # positions alone tell the sum of kd and viscous friction
+    tells_kd = all(log.v_ref is not None or log.has_torque for log in logs)
+    unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=tells_kd)
+    unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     estimator = OutputError(
-        whitens=settings.whiten, most=np.exp(-dt / plain.time_constant), progress=progress
+        whitens=settings.whiten, most=np.exp(-_WHITE * dt / plain.time_constant), progress=progress
     )
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
+    simulator = replace(simulator, torque=_torque_rows(model, base, logs))
     few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
     begun = replace(estimator, rounds=1).fit(few, simulator.prior)
     estimate = estimator.fit(simulator, begun.theta)
@@ -125,8 +134,9 @@ def fit_loops(
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, estimate.theta, taken)
+        simulator = replace(simulator, torque=_torque_rows(model, simulator.base, logs))
         estimate = estimator.fit(simulator, theta)
-    return Fitted(simulator, estimate, plain, stated, tuple(tried), tuple(groups))
+    return Fitted(simulator, estimate, plain, encoders, tuple(tried), tuple(groups))
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
@@ -140,7 +150,7 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         SettingsError: If a joint is named that is not there.
     """
     n, joints = len(model.joints), model.joints
-    limit = None if loop.limit == "find" else loop.limit
+    limit = None if isinstance(loop.limit, str) else loop.limit  # it is to be found
     bodies = model.standard_parameters()[: model.layout.n_inertial].reshape(-1, 10)
     return Loops(
         bodies=bodies,
@@ -153,6 +163,53 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         terms=((),) * n,
         values=np.zeros(0),
     )
+
+
+def _torque_rows(model: RobotModel, base: Loops, logs: Sequence[Log]) -> TorqueRows | None:
+    """Return what the torques of logs come down to, if all have them, for the terms of loops.
+
+    Their weight is that of rows as independent as the scatter of stretches shows them to be.
+    """
+    if not all(log.has_torque for log in logs):
+        return None
+    own = with_terms(model, base)
+    found = identify(own, logs, friction="none", doctor=False)
+    weight = found.wls.sigma * np.sqrt(max(found.errors.inflation, 1.0))
+    return TorqueRows(own, found.factors.weighted(weight), found.mapping.K)
+
+
+def _zeros(model: RobotModel, encoders: Encoders) -> list[Unknown]:
+    """Return the zeros of encoders of joints that turn, near where they were found."""
+    return [
+        Unknown(f"{joint.name}.zero", "zero", (j,), float(encoders.zero[j]), _TURN)
+        for j, joint in enumerate(model.limits)
+        if joint.type != "prismatic"
+    ]
+
+
+def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
+    """Return the model with the terms of loops that it has not yet.
+
+    Args:
+        model: The robot.
+        loops: Its loops.
+    """
+    own = {
+        joint: [
+            *model.layout.own.get(joint, ()),
+            *(t for t in terms if t not in _has(model, joint)),
+        ]
+        for joint, terms in zip(model.joints, loops.terms, strict=True)
+    }
+    return RobotModel.from_urdf(
+        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
+    )
+
+
+def _has(model: RobotModel, joint: str) -> list[object]:
+    """Return the terms that the model has of a joint."""
+    layout = model.layout
+    return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
 
 
 def _likeness(model: RobotModel) -> list[tuple[object, ...]]:
@@ -173,6 +230,7 @@ class _Usual:
     inertia: Array  # [kg m^2 or kg] of the whole loop
     bodies: Array  # of the URDF's bodies in it
     torque: Array  # [N m or N]
+    largest: Array  # that the loop asked for, somewhat less [N m or N]
     speed: Array  # [rad/s or m/s]
     scale: Array  # torques over those of the plain model
 
@@ -192,10 +250,14 @@ def _usual(
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
     speed = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
     inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
-    return _Usual(inertia, bodies, plain.torque * scale, speed, scale)
+    error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
+    largest = _LIMITED * plain.loops.kp * scale * np.abs(error).max(axis=0)
+    return _Usual(inertia, bodies, plain.torque * scale, largest, speed, scale)
 
 
-def _begin(model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual) -> Loops:
+def _begin(
+    model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual, *, finds_limit: bool
+) -> Loops:
     """Return the loops that the fit begins with."""
     friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
     none = np.zeros(len(usual.scale))
@@ -213,6 +275,7 @@ def _begin(model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual) 
         kp=stated.kp * usual.scale,
         armature=np.maximum(usual.inertia - usual.bodies, _LEAST * usual.inertia),
         delay=plain.loops.delay,
+        limit=usual.largest if finds_limit else stated.limit,
         terms=terms,
         values=np.array(values),
     )
@@ -225,7 +288,7 @@ def _unknowns(
     base: Loops,
     usual: _Usual,
     *,
-    has_speeds: bool,
+    tells_kd: bool,
 ) -> list[Unknown]:
     """Return what is unknown of drives and loops, beginning with what the loops have."""
     members: dict[str, list[int]] = {}
@@ -234,14 +297,16 @@ def _unknowns(
     open_ = {
         "armature": np.full(len(groups), "armature" in model.layout.terms),
         "kp": ~_is_stated(loop.kp, model),
-        "kd": ~_is_stated(loop.kd, model) & has_speeds,
+        "kd": ~_is_stated(loop.kd, model) & tells_kd,
         "limit": np.full(len(groups), loop.limit == "find"),
+        "delay": ~_is_stated(loop.delay, model),
     }
     spread = {
         "armature": usual.inertia,
         "kp": base.kp / _WIDE,
         "kd": usual.torque / usual.speed,
         "limit": usual.torque,
+        "delay": np.full(len(groups), _SLOWEST / _WIDE),
     }
     found = []
     for what, is_open in open_.items():
@@ -254,14 +319,11 @@ def _unknowns(
                 found.append(Unknown(f"{group}.{what}", what, own, begin, wide, lowest))
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
-            own = [j for j in joints if term in base.terms[j]]
+            having = [j for j in joints if term in base.terms[j]]
             # what wears and what leans differ from drive to drive, grease and motor do not
-            for sharing in [own] if isinstance(term, Viscous) else [[j] for j in own]:
+            for sharing in [having] if isinstance(term, Viscous) else [[j] for j in having]:
                 name = group if len(sharing) > 1 else model.joints[sharing[0]]
                 found.append(_term(name, term, sharing, base, usual))
-    if not _is_stated(loop.delay, model).any():
-        begin = float(np.median(base.delay))
-        found.append(Unknown("delay", "delay", tuple(range(len(groups))), begin, _SLOWEST, 0.0))
     return found
 
 

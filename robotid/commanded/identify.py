@@ -5,21 +5,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import pinocchio as pin
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.errors import OpenLoop, run_open_loop
-from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops
+from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_terms
 from robotid.commanded.settings import LoopSettings
+from robotid.commanded.term_choice import Tried
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import JointVerdict, Verdict
 from robotid.logs.data import Log
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import Loops
 
-__all__ = ["Commanded", "identify_commands"]
+__all__ = ["Commanded", "identify_commands", "with_gravity"]
 
 #: Share of its motion that the open loop of a joint misses on logs kept apart: well, not usable.
 GOOD, POOR = 0.05, 0.3
@@ -28,7 +29,6 @@ _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is
 _FROM_PRIOR = 0.9  # ... above this share, what was assumed of it
 _TOGETHER = 0.98  # correlation from which two parameters are told together only
 _NAMED = 8  # parameters that a sentence names
-_STEP = 1e-6  # of an unknown, over which parameters are differentiated
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,21 +56,14 @@ class Commanded:
     @cached_property
     def standard(self) -> Array:
         """Standard parameters of the model, shape (p,)."""
-        return _standard(self.model, self.fitted.loops)
+        return self.fitted.simulator.standard(self.model, self.fitted.estimate.theta)[0]
 
     @cached_property
     def standard_covariance(self) -> Array:
         """Their covariance, shape (p, p); 0 of what was not to be found."""
-        estimate, simulator = self.fitted.estimate, self.fitted.simulator
-        columns = []
-        for k, value in enumerate(estimate.theta):
-            up, down = estimate.theta.copy(), estimate.theta.copy()
-            step = _STEP * max(1.0, abs(value))
-            up[k], down[k] = value + step, value - step
-            ends = [_standard(self.model, simulator.loops(theta)) for theta in (up, down)]
-            columns.append((ends[0] - ends[1]) / (2 * step))
-        S = np.array(columns).T  # (p, c)
-        covariance: Array = S @ estimate.covariance @ S.T
+        estimate = self.fitted.estimate
+        _, slopes = self.fitted.simulator.standard(self.model, estimate.theta)
+        covariance: Array = slopes @ estimate.covariance @ slopes.T
         return covariance
 
     @cached_property
@@ -90,9 +83,9 @@ class Commanded:
         )
 
     @property
-    def told_together(self) -> tuple[tuple[str, str, float], ...]:
-        """Pairs of unknowns of loops that are told together only, and their correlation."""
-        return tuple(_pairs(self.fitted))
+    def told_together(self) -> tuple[tuple[str, ...], ...]:
+        """Unknowns of loops whose errors go together, so that their ratios alone are known."""
+        return _together(self.fitted)
 
     @property
     def has_gains(self) -> bool:
@@ -141,15 +134,18 @@ def identify_commands(
                 "columns qref_ of each joint, or identify from torques with another estimator"
             )
     if loop.gravity_compensation:
-        logs, kept = ([_with_gravity(model, log) for log in part] for part in (logs, kept))
+        logs, kept = ([with_gravity(model, log) for log in part] for part in (logs, kept))
     fitted = fit_loops(model, logs, loop, settings, chooses=chooses, progress=progress)
     report_stage(progress, "testing", STAGES)
     stated = stated_loops(model, loop)
     has_gains = loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns)
     urdf = _urdf(model, stated) if has_gains else None
-    runs = [[run_open_loop(log, fitted, urdf) for log in part] for part in (logs, kept)]
+    sign = fitted.encoders.sign
+    runs = [
+        [run_open_loop(log.turned(sign), fitted, urdf) for log in part] for part in (logs, kept)
+    ]
     found = Commanded(
-        model=_with_terms(model, fitted.loops),
+        model=with_terms(model, fitted.loops),
         loop=loop,
         settings=settings,
         fitted=fitted,
@@ -160,65 +156,35 @@ def identify_commands(
     return replace(found, findings=by_severity(_findings(found)))
 
 
-def _standard(model: RobotModel, loops: Loops) -> Array:
-    """Return the standard parameters of loops, shape (p,)."""
-    drives = []
-    for d, term in model.layout.drive_parameters:
-        j = model.joints.index(model.layout.drives[d].name)
-        drives.append(
-            float(loops.armature[j] if term.is_inertia else loops.values[loops.place(j, term)])
-        )
-    return np.concatenate([loops.bodies.reshape(-1), drives])
-
-
-def _with_terms(model: RobotModel, loops: Loops) -> RobotModel:
-    """Return the model with the terms of loops that it has not yet."""
-    own = {
-        joint: [
-            *model.layout.own.get(joint, ()),
-            *(t for t in terms if t not in _has(model, joint)),
-        ]
-        for joint, terms in zip(model.joints, loops.terms, strict=True)
-    }
-    return RobotModel.from_urdf(
-        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
-    )
-
-
-def _has(model: RobotModel, joint: str) -> list[object]:
-    """Return the terms that the model has of a joint."""
-    layout = model.layout
-    return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
-
-
 def _urdf(model: RobotModel, stated: Loops) -> Loops:
     """Return the URDF with the stated gains: no friction, and a rotor that weighs nothing."""
     n = len(model.joints)
     return replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
 
 
-def _with_gravity(model: RobotModel, log: Log) -> Log:
-    """Return a log whose fed-forward torque has that of gravity by the URDF, as measured."""
-    data = model.pin_model.createData()
-    G = model.velocity_map
-    configurations = model.configurations(log.q)
-    torque = np.array(
-        [pin.computeGeneralizedGravity(model.pin_model, data, q) @ G for q in configurations]
-    )
+def with_gravity(model: RobotModel, log: Log) -> Log:
+    """Return a log whose fed-forward torque has that of gravity by the URDF, as measured.
+
+    Args:
+        model: The robot as its URDF says.
+        log: The log, of its joints in its order, with commands.
+    """
+    torque = predict_instants(model, model.standard_parameters(), log.q)
     fed = torque if log.tau_ref is None else log.tau_ref + torque
     return replace(log, tau_ref=fed)
 
 
-def _pairs(fitted: Fitted) -> Iterator[tuple[str, str, float]]:
-    """Yield pairs of unknowns of loops whose errors go together."""
+def _together(fitted: Fitted) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of unknowns of loops whose errors are correlated."""
     unknowns, errors = fitted.simulator.unknowns, fitted.estimate.std_error
     own = [k for k, u in enumerate(unknowns) if u.what != "body" and errors[k] > 0]
-    covariance = fitted.estimate.covariance
-    for a, k in enumerate(own):
-        for m in own[a + 1 :]:
-            correlation = float(covariance[k, m] / (errors[k] * errors[m]))
-            if abs(correlation) > _TOGETHER:
-                yield unknowns[k].name, unknowns[m].name, correlation
+    covariance = fitted.estimate.covariance[np.ix_(own, own)]
+    correlation = covariance / np.outer(errors[own], errors[own])
+    sets: list[set[int]] = []
+    for a, b in np.argwhere(np.triu(np.abs(correlation) > _TOGETHER, 1)):
+        joined = [s for s in sets if s & {int(a), int(b)}]
+        sets = [s for s in sets if s not in joined] + [set().union({int(a), int(b)}, *joined)]
+    return tuple(tuple(unknowns[own[k]].name for k in sorted(s)) for s in sets)
 
 
 def _findings(found: Commanded) -> Iterator[Finding]:
@@ -254,7 +220,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"{listed(at_zero, _NAMED)} came out as 0, the least that can be: the motion shows "
             "none, or another parameter has taken it",
         )
-    if "delay" in at_zero:
+    if any(name.endswith("delay") for name in at_zero):
         yield Finding(
             "no_delay",
             "warning",
@@ -262,13 +228,13 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             "the delay came out as 0: commands and positions may not be of one clock, or the "
             "motion is too slow to show it; command a faster one",
         )
-    for first, second, correlation in found.told_together:
+    for told_names in found.told_together:
+        told = listed(told_names, _NAMED)
         yield Finding(
             "told_together",
             "note",
-            f"{first}, {second}",
-            f"{first} and {second} are told together only (correlation {correlation:.2f})",
-            {"correlation": correlation},
+            told,
+            f"{told} are told together only: their ratios are known better than they are",
         )
     if found.undetermined:
         names = listed(found.undetermined, _NAMED)
@@ -279,17 +245,38 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"the logs say nothing of {names}: they keep what was assumed; command a motion that "
             "needs them",
         )
-    chosen = [t for t in found.fitted.tried if t.is_chosen]
-    for t in chosen:
-        terms = " and ".join(t.terms)
-        yield Finding(
-            "friction_found",
-            "note",
-            t.joint,
-            f"{t.joint}: {terms} lowers the squared error of windows that it was not fitted to by "
-            f"{100 * t.gain:.0f} %",
-            {"gain_pct": 100 * t.gain},
-        )
+    yield from _encoder_findings(found)
+    yield from map(_friction_found, (t for t in found.fitted.tried if t.is_chosen))
+
+
+def _friction_found(tried: Tried) -> Finding:
+    """Return what is said of terms that other windows confirmed."""
+    return Finding(
+        "friction_found",
+        "note",
+        tried.joint,
+        f"{tried.joint}: {' and '.join(tried.terms)} lowers the squared error of windows that it "
+        f"was not fitted to by {100 * tried.gain:.0f} %",
+        {"gain_pct": 100 * tried.gain},
+    )
+
+
+def _encoder_findings(found: Commanded) -> Iterator[Finding]:
+    """Yield which encoders have another zero or sense than the URDF, and what speaks for it."""
+    encoders = found.fitted.encoders
+    for j, joint in enumerate(found.model.joints):
+        if encoders.gain[j] > 0:
+            sense = "counts the other way, and " if encoders.sign[j] < 0 else ""
+            zero = float(found.fitted.loops.zero[j])
+            yield Finding(
+                "encoder",
+                "warning",
+                joint,
+                f"{joint}: its encoder {sense}reads 0 where the URDF is at {zero:+.3g} rad; by "
+                f"gravity this explains {100 * encoders.gain[j]:.0f} % of what holds the loop off "
+                "its command. Calibrate it, or state the zero in the URDF",
+                {"zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j])},
+            )
 
 
 def _judge(found: Commanded) -> Verdict:

@@ -1,7 +1,7 @@
 """The plain model of a commanded joint: by itself, of second order, with Coulomb friction.
 
-Every joint alone: J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v). It is what
-a fit with bodies begins with, and what it has to beat.
+Every joint alone: J a + d v + Fc sign(v) + c = kp (q_ref(t - delay) - q) + kd (v_ref - v). It is
+what a fit with bodies begins with, and what it has to beat.
 """
 
 from dataclasses import dataclass, replace

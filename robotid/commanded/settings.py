@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from robotid._settings import Range, Settings, setting
+from robotid._settings import Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
@@ -22,22 +22,21 @@ class LoopSettings(Settings):
     kind: str = setting("pd", "how the loop is closed", among=("pd",))
     kp: PerJoint | None = setting(
         None, "gain of the position [N m/rad or N/m], for all joints or by joint; found if not "
-        "stated, with the bodies' gravity and inertia as its measure", **GAIN,
+        "stated, measured by the bodies' gravity and inertia", **GAIN,
     )  # fmt: skip
     kd: PerJoint | None = setting(
-        None, "gain of the speed [N m s/rad or N s/m], likewise; one with the viscous friction, and "
-        "counted as that, if not stated", **LEVEL,
+        None, "gain of the speed [N m s/rad or N s/m], likewise; counted as viscous friction, with "
+        "which it is one, if not stated", **LEVEL,
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
-        None, "largest torque of the drive [N m or N], likewise; none if not stated, and found if "
-        "it is 'find'",
+        None,
+        "largest torque of the drive [N m or N], likewise; none if not stated, found if 'find'",
         reads=(int, float, dict, str),
-        within=Range(
-            "positive numbers, or 'find'", lambda x: x == "find" or GAIN["within"].holds(x)
-        ),
-    )  # fmt: skip
+        within=GAIN["within"],
+        among=("find",),
+    )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found, one for all joints, if not stated",
+        None, "how late the command acts [s], likewise; found, one for each group, if not stated",
         **LEVEL,
     )  # fmt: skip
     gravity_compensation: bool = setting(
@@ -49,7 +48,7 @@ class LoopSettings(Settings):
         reads=(dict,),
     )  # fmt: skip
     zeros: str = setting(
-        "urdf", "urdf: encoders have the URDF's zero and sign; find: both are found, from gravity",
+        "urdf", "zero and sign of the encoders: as the URDF has them, or found, from gravity",
         among=("urdf", "find"),
     )  # fmt: skip
 

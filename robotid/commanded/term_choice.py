@@ -107,7 +107,8 @@ def choose(
     rows = sum(fold.rows for fold in folds)  # of one joint, whose noise level is 1
     spare = {k for places in sets for k in places}
     columns = [k for k in range(len(theta)) if k not in spare]
-    open_sets, chosen, gains = set(range(len(sets))), set(), {}
+    open_sets, chosen = set(range(len(sets))), set[int]()
+    gains: dict[int, float] = {}
     while open_sets:
         found = _gains(folds, columns, {s: sets[s] for s in open_sets})
         gains |= {s: gain / rows for s, gain in found.items()}
@@ -143,7 +144,7 @@ class _Fold:
 
 def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> list[_Fold]:
     """Return the problem cut into folds of windows, the prior shared among them."""
-    c, count = len(theta), min(_FOLDS, len(simulator.windows))
+    count = min(_FOLDS, len(simulator.windows))
     known = 1.0 / simulator.prior_std**2 / count
     H = np.tile(np.diag(known), (count, 1, 1))
     g, rows = np.tile(known * (simulator.prior - theta), (count, 1)), [0] * count
@@ -159,7 +160,7 @@ def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> li
 
 
 def _gains(
-    folds: Sequence[_Fold], columns: Sequence[int], sets: dict[int, Sequence[int]]
+    folds: Sequence[_Fold], columns: list[int], sets: dict[int, list[int]]
 ) -> dict[int, float]:
     """Return by how much each set of further columns lowers the squares of folds left out."""
     gains = dict.fromkeys(sets, 0.0)
@@ -170,7 +171,8 @@ def _gains(
         factor = scipy.linalg.cho_factor(H_f[np.ix_(base, base)])
         move = scipy.linalg.cho_solve(factor, g_f[base])
         slope = fold.H[np.ix_(base, base)] @ move - fold.g[base]
-        for s, further in sets.items():
+        for s, own in sets.items():
+            further = np.array(own)
             B = H_f[np.ix_(base, further)]
             X = scipy.linalg.cho_solve(factor, B)
             y = np.linalg.solve(H_f[np.ix_(further, further)] - B.T @ X, g_f[further] - B.T @ move)

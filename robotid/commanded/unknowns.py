@@ -9,10 +9,11 @@ import numpy as np
 from robotid._typing import Array
 from robotid.estimators.output_error import Residual
 from robotid.robot.drives import DriveTerm
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
 from robotid.simulation.loops import LoopedRobot, Loops, RollOut, Window
 
-__all__ = ["LoopSimulator", "Unknown", "body_unknowns"]
+__all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns"]
 
 _POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
 #: Entries of the triangle that a body changes by: the logarithm of its mass' root, and its centre.
@@ -76,6 +77,21 @@ def body_unknowns(robot: LoopedRobot, spread: float) -> list[Unknown]:
 
 
 @dataclass(frozen=True, eq=False)
+class TorqueRows:
+    """What logs of torques come down to: R [K pi, 1] is their residual, weighted to unit noise.
+
+    Attributes:
+        model: The robot, whose standard parameters pi are.
+        R: Triangular factor, shape (b + 1, b + 1).
+        K: Base parameters of standard ones, shape (b, p).
+    """
+
+    model: RobotModel
+    R: Array
+    K: Array
+
+
+@dataclass(frozen=True, eq=False)
 class LoopSimulator:
     """A looped robot with unknowns, beside windows of logs: what an estimator asks.
 
@@ -84,12 +100,14 @@ class LoopSimulator:
         windows: Windows of its logs.
         base: All that is known; unknowns stand over it.
         unknowns: What is to be found.
+        torque: Rows of measured torques, if there are any.
     """
 
     robot: LoopedRobot
     windows: tuple[Window, ...]
     base: Loops
     unknowns: tuple[Unknown, ...]
+    torque: "TorqueRows | None" = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -137,6 +155,49 @@ class LoopSimulator:
             NotConvergedError: If a step has no solution.
         """
         return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Return what measured torques leave, and what lowers it; see ``Simulator``.
+
+        Args:
+            theta: Values of the unknowns, shape (c,).
+        """
+        if self.torque is None:
+            return np.zeros((0, len(theta))), np.zeros(0)
+        R, K = self.torque.R, self.torque.K
+        pi, slopes = self.standard(self.torque.model, theta)
+        return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
+
+    def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
+        """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c).
+
+        Args:
+            model: The robot, with the terms of the loops; 0 of those that they lack.
+            theta: Values of the unknowns, shape (c,).
+        """
+        layout, loops = model.layout, self.loops(theta)
+        place, pi = {}, np.zeros(len(layout.names))
+        pi[: layout.n_inertial] = loops.bodies.reshape(-1)
+        for i, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
+            j = model.joints.index(layout.drives[d].name)
+            place[j, "armature" if term.is_inertia else term] = i
+            if term.is_inertia:
+                pi[i] = loops.armature[j]
+            elif term in loops.terms[j]:
+                pi[i] = loops.values[loops.place(j, term)]
+        slopes = np.zeros((len(pi), len(theta)))
+        changes = iter(self._bodies(theta)[1])
+        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
+        for k, unknown in enumerate(self.unknowns):
+            if unknown.what == "body":
+                first = 10 * body_of[unknown.joints[0]]
+                slopes[first : first + 10, k] = next(changes)
+                continue
+            for j in unknown.joints:
+                row = place.get((j, unknown.term or unknown.what))
+                if row is not None:
+                    slopes[row, k] = 1.0
+        return pi, slopes
 
     def residuals(self, theta: Array, *, with_slopes: bool) -> list[Residual]:
         """Return what is measured less what comes out, window by window; see ``Simulator``.

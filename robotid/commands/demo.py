@@ -1,7 +1,7 @@
 """The demonstration: simulate a UR5 that its URDF does not describe, and identify it."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -64,6 +64,7 @@ def run_demo(
         validation=(entries[1],),
     )
     plan, beside = WorkPlan(progress=progress), {"replay": "replay.html"}
-    identification, result = run_job(job, target, plan=plan, beside=beside)
+    found, result = run_job(job, target, plan=plan, beside=beside)
+    identification = cast(Identification, found)  # of the default estimator
     replay_identified(identification).write(target / "replay.html")
     return identification, result, identification.mapping.to_base(truth)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid._files import missing_file
-from robotid.commanded.settings import LoopSettings
 from robotid._settings import Entries, Range, Settings, check_keys, setting
+from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.identification.settings import ConsistentSettings, EstimatorSettings

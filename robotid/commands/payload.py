@@ -119,7 +119,8 @@ def _chosen_terms(
         return {}
     (surveyed,) = survey_logs(job, model, entries)
     reference = Recordings(model, structural_mapping(model), surveyed)
-    choice = ConsistentSettings(prior_weight=1.0, draws=0)
+    # which friction there is asks for no shape of bodies, and a quadratic fit always settles
+    choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
     return with_drives(
         reference, choice, wanted_families(job.friction, model.joints)
     ).model.layout.own

@@ -164,10 +164,10 @@ def _print_result(result: dict[str, Any], *, is_verbose: bool) -> None:
 
 def _print_commanded(result: dict[str, Any], *, is_verbose: bool) -> None:
     """Print what was found from commands: open loops beside plainer models, drives, the verdict."""
-    found = result["simulation"]
+    found, fit = result["simulation"], result["simulation"]["fit"]
     say(
-        f"\n{result['robot']}: {len(result['joints'])} joints, {found['fit']['parameters']} unknowns; "
-        f"{found['fit']['message']}"
+        f"\n{result['robot']}: {len(result['joints'])} joints, {fit['parameters']} unknowns; "
+        f"{fit['message']}"
     )
     kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
              "command_rmse": "command"}  # fmt: skip

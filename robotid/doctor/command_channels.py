@@ -21,6 +21,7 @@ _COHERENT = 0.8  # share of a position's spectrum that its command explains, fro
 _EXCITED = 1e-4  # of its strongest frequency, below which a command does not excite
 _SUREST = 0.999  # coherence beyond which no response is known: joints are not linear
 _HALF_POWER = np.sqrt(0.5)  # response, of that at rest, at which a loop's bandwidth ends
+_RIPPLE = 5  # lines over which the size of a response is smoothed
 _DELAYS = np.arange(0.0, 0.2, 0.001)  # [s] that are tried
 _LONGEST = 0.5  # [s] by which a joint is sought to be late, or early
 _AS_ALIKE = 0.9  # share of the largest correlation that is as good
@@ -55,7 +56,8 @@ def check_commands(log: Log) -> Iterator[Finding]:
         log: The log; nothing is yielded of one without commands, but that it has no torque.
 
     Yields:
-        A note "no_torque"; a note "held_command"; a warning "commands_alike" per group of joints
+        A note "no_torque"; a note "loops", of bandwidth and lag of each joint; a note
+        "held_command"; a warning "commands_alike" per group of joints
         that are told the same; an error "late_command" of joints that move before their command;
         warnings "slow_command", "small_command", "saturated", "slow_sampling" and a warning
         "gives_way" of joints that move though they are told to stand.
@@ -66,6 +68,7 @@ def check_commands(log: Log) -> Iterator[Finding]:
         return
     loops = [_Loop(log, j) for j in range(len(log.joints))]
     moved = [loop for loop in loops if loop.is_told]
+    yield from _shown(log, moved)
     yield from _held(log, moved)
     yield from _alike(log, moved)
     early = list(_early(log, moved))
@@ -141,9 +144,12 @@ class _Loop:
     @cached_property
     def bandwidth(self) -> float:
         """Frequency at which it follows half the power [Hz]; nan if it follows all excited."""
-        f, size = self.response[0], np.abs(self.response[1])
+        from scipy.ndimage import median_filter
+
+        f, H, _ = self.response
         if not len(f):
             return np.nan
+        size = median_filter(np.abs(H), size=_RIPPLE, mode="nearest")
         slow = int(np.argmax(size[:3]))  # the very first may be that of a drift
         weak = np.flatnonzero(size[slow:] < _HALF_POWER * size[slow])
         return float(f[slow + weak[0]]) if len(weak) else np.nan
@@ -232,6 +238,25 @@ def _without_torque(log: Log) -> Finding:
         else "it has neither torque nor commands: nothing can be identified from motion alone"
     )
     return log_finding(log.name, "no_torque", "note", message)
+
+
+def _shown(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:
+    """Yield how late the joints follow, and up to which frequency."""
+    late = {loop.name: loop.lag[0] for loop in loops if np.isfinite(loop.lag[0])}
+    if not late:
+        return
+    ends = {loop.name: loop.bandwidth for loop in loops if np.isfinite(loop.bandwidth)}
+    shown = ", ".join(
+        f"{name} {1e3 * lag:.3g} ms" + (f" to {ends[name]:.2g} Hz" if name in ends else "")
+        for name, lag in late.items()
+    )
+    message = (
+        f"joints follow their commands late, up to the bandwidth if the command reaches it: {shown}"
+        "; a delay is at most as long as this lag; nothing needs doing"
+    )
+    evidence = {f"lag_{name}": lag for name, lag in late.items()}
+    evidence |= {f"bandwidth_{name}": width for name, width in ends.items()}
+    yield log_finding(log.name, "loops", "note", message, **evidence)
 
 
 def _held(log: Log, loops: Sequence[_Loop]) -> Iterator[Finding]:

@@ -7,8 +7,8 @@ beside what drifts.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -59,10 +59,14 @@ class Simulator(Protocol):
         lowest: Smallest value that each may have, shape (c,); -inf without.
     """
 
-    names: tuple[str, ...]
-    prior: Array
-    prior_std: Array
-    lowest: Array
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def prior(self) -> Array: ...
+    @property
+    def prior_std(self) -> Array: ...
+    @property
+    def lowest(self) -> Array: ...
 
     def residuals(self, theta: Array, *, with_slopes: bool) -> Sequence[Residual]:
         """Return what is measured less what is simulated, window by window.
@@ -73,6 +77,16 @@ class Simulator(Protocol):
 
         Raises:
             NotConvergedError: If it cannot be simulated with these parameters.
+        """
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Return further residuals of unit weight, as of torques, and what lowers them.
+
+        Args:
+            theta: Parameters, shape (c,).
+
+        Returns:
+            A, shape (m, c), and b, shape (m,): parameters theta + x leave b - A x.
         """
 
 
@@ -102,8 +116,6 @@ class OutputError:
         whitens: Whether the residual's correlation is estimated and taken out.
         most: Largest correlation of one sample with the next that is taken out, shape (n,): beyond
             the loop's own, whitening takes away what the loop shows. 0.95 if None.
-        rows: Further rows [A b] that A theta = b should fit, unit weight, shape (m, c + 1), as
-            those of torques; none if None.
         steps: Most steps in a round.
         rounds: Most rounds.
         progress: Told of the steps.
@@ -115,7 +127,6 @@ class OutputError:
 
     whitens: bool = True
     most: Array | None = None
-    rows: Array | None = None
     steps: int = _STEPS
     rounds: int = _ROUNDS
     progress: ProgressCallback = field(default=ignore_progress)
@@ -173,8 +184,7 @@ class OutputError:
             return np.inf  # a step that leads there is too long
         cost = _squares(weights.whiten(r.e, r.joints) for r in found)
         cost += float(np.sum(((theta - simulator.prior) / simulator.prior_std) ** 2))
-        if self.rows is not None:
-            cost += float(np.sum((self.rows[:, -1] - self.rows[:, :-1] @ theta) ** 2))
+        cost += float(np.sum(simulator.rows(theta)[1] ** 2))
         return cost if np.isfinite(cost) else np.inf
 
     def _normal(self, simulator: Simulator, weights: _Weights, theta: Array) -> tuple[Array, Array]:
@@ -184,11 +194,8 @@ class OutputError:
         for A, b, columns in linearised(simulator, weights, theta):
             H[np.ix_(columns, columns)] += A.T @ A
             g[columns] += A.T @ b
-        if self.rows is not None:
-            A, b = self.rows[:, :-1], self.rows[:, -1] - self.rows[:, :-1] @ theta
-            H += A.T @ A
-            g += A.T @ b
-        return H, g
+        A, b = simulator.rows(theta)
+        return H + A.T @ A, g + A.T @ b
 
     def _descend(
         self, simulator: Simulator, weights: _Weights, theta: Array, close: float
@@ -238,8 +245,8 @@ class OutputError:
         if len(stretches) >= FEWEST_STRETCHES:
             found = scatter(stretches, np.zeros(len(theta)), np.ones(1), bread)
             meat, inflation, freedom = found.meat, found.inflation, found.freedom()
-        if self.rows is not None:
-            meat = meat + self.rows[:, :-1].T @ self.rows[:, :-1]
+            further = simulator.rows(theta)[0]
+            meat = meat + further.T @ further
         covariance = bread @ (meat + np.diag(known)) @ bread
         # never better known than independent rows would make it
         spread = np.sqrt(np.maximum(np.diag(covariance), np.diag(bread)))

@@ -313,7 +313,7 @@ class Clearance:
             Schwarzer, Saha, Latombe (2005), Adaptive dynamic collision checking for robots.
         """
         seen, kept = _APART, self.kept[:, None]  # seen: the least margin so far
-        lowest: Contact | None = None
+        lowest, nearest = seen, None
         h = duration / max(2, round(duration / _FIRST)) / 2
         middles = np.arange(h, duration, 2 * h)
         a = motion.evaluate(np.linspace(0.0, duration, 40 * len(middles)))[2]
@@ -324,18 +324,20 @@ class Clearance:
             moved = self._levers @ way.T  # (pairs, N)
             near = self.near(self.poses(q), kept + seen + moved, self.everything)
             exact = near.distance[near.pairs, near.samples] - self.kept[near.pairs]
-            seen = min(seen, exact.min(initial=np.inf))
+            if exact.min(initial=np.inf) < seen:
+                k = int(np.argmin(exact))
+                seen = float(exact[k])
+                nearest = int(near.pairs[k]), float(middles[near.samples[k]])
             bound = near.distance - kept - moved
             is_open = (bound < seen - _SURE).any(axis=0) & (2 * h > _SHORTEST)
-            closed = np.where(is_open, np.inf, bound)
-            pair, sample = np.unravel_index(np.argmin(closed), closed.shape)
-            found = float(closed[pair, sample])
-            if found < (seen if lowest is None else lowest.margin):
-                own = float(self.kept[pair])
-                lowest = Contact(*self.named[pair], found + own, float(middles[sample]), own)
+            lowest = min(lowest, float(bound[:, ~is_open].min(initial=np.inf)))
             h /= 2
             middles = np.sort(np.r_[middles[is_open] - h, middles[is_open] + h])
-        return lowest
+        if nearest is None:
+            return None
+        pair, time = nearest
+        own = float(self.kept[pair])
+        return Contact(*self.named[pair], min(lowest, seen) + own, time, own)
 
     @cached_property
     def _levers(self) -> Array:

@@ -131,13 +131,14 @@ class Course:
 
     @cached_property
     def nearest(self) -> Contact | None:
-        """Where things that the motion moves come nearest to each other; None if there are none."""
+        """Where what the motion moves has the least margin of distance; None if there is none."""
         if self.clearance is None:
             return None
-        few = self.thinned
-        distance, pairs = few.nearness(few.changes(self.clearance))
-        k = int(np.argmin(distance))
-        if np.isinf(distance[k]):
-            return None
-        names = self.clearance.named[int(pairs[k])]
-        return Contact(*names, float(distance[k]), float(few.t[k]))
+        few, kept = self.thinned, self.clearance.kept
+        changes, found = few.changes(self.clearance), []
+        for own in np.unique(kept[changes]).tolist():
+            distance, pairs = few.nearness(changes & (kept == own))
+            k = int(np.argmin(distance))
+            names = self.clearance.named[int(pairs[k])]
+            found.append(Contact(*names, float(distance[k]), float(few.t[k]), own))
+        return min(found, key=lambda contact: contact.margin, default=None)

@@ -318,7 +318,8 @@ class Designer:
             C = _scaled(C, 0.99)
         raise NotConvergedError(
             f"between the instants that were looked at {contact}, nearer than "
-            f"{1e3 * self.clearance.least:.0f} mm; raise the clearance or try another seed",
+            f"{1e3 * (contact.kept if contact else 0.0):.0f} mm; raise the clearance or try "
+            "another seed",
             "max_iterations",
         )
 

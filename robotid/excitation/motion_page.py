@@ -150,7 +150,8 @@ def _collisions(content: Mapping[str, Any], course: Course) -> str:
     elif contact is not None:
         said = (
             f"Nearest to a collision: {contact.first} and {contact.second}, "
-            f"{1e3 * contact.distance:.0f} mm apart at {contact.time:.2f} s."
+            f"{1e3 * contact.distance:.0f} mm apart at {contact.time:.2f} s; "
+            f"{1e3 * contact.kept:.0f} mm are kept."
         )
     if entry["unread"]:
         said += f" Not looked at, since no shape can be read: {listed(entry['unread'])}."
@@ -213,7 +214,13 @@ def _distance_chart(model: RobotModel, course: Course, clearance: Clearance) -> 
     own = np.array([b in model.tree.links and a in model.tree.links for a, b in clearance.named])
     series = [Series("clearance", np.full(len(course.t), 1e3 * clearance.least), "text")]
     changes = course.changes(clearance)
-    for label, chosen, tone in (("links", own, "tone-1"), ("floor and boxes", ~own, "tone-2")):
+    near = np.isfinite(clearance.room)
+    groups = (
+        ("links", own & ~near, "tone-1"),
+        ("floor and boxes", ~own, "tone-2"),
+        ("links built near each other", near, "tone-3"),
+    )
+    for label, chosen, tone in groups:
         if (chosen & changes).any():
             series.append(Series(label, 1e3 * course.nearness(chosen & changes)[0], tone))
     low, high = (float(f([f(x.y) for x in series])) for f in (np.min, np.max))

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from robotid._files import file_sha256, read_json
 from robotid._settings import Range
 from robotid._typing import Array
-from robotid.exceptions import DataError, ModelError
 from robotid.commanded.errors import OpenLoop
 from robotid.commanded.identify import Commanded
+from robotid.exceptions import DataError, ModelError
 from robotid.export.commanded import CommandedDrive, commanded_drives, follow_commands
 from robotid.export.ranges import parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
@@ -32,7 +32,7 @@ from robotid.identification.verdict import Doubt
 from robotid.identification.witness import Witness
 from robotid.logs.data import Log, suggestion
 from robotid.logs.transmission import Transmission
-from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drives import TERMS
@@ -176,28 +176,7 @@ def build_commanded(
         outputs: Files written beside it, by kind.
     """
     model, layout, estimate = found.model, found.model.layout, found.fitted.estimate
-    mapping = structural_mapping(model)
-    variances = np.diag(found.standard_covariance)
-    errors = np.sqrt(np.maximum(variances, 0.0))
-    prior = model.standard_parameters()
-    standard = [
-        {
-            "name": name,
-            "value": float(found.standard[i]),
-            "std_error": float(errors[i]) if errors[i] > 0 else None,
-            "unit": layout.units[i],
-            "prior": float(prior[i]),
-            "source": _source_of(found, name, errors[i]),
-        }
-        for i, name in enumerate(layout.names)
-    ]
-    spread = mapping.K @ found.standard_covariance @ mapping.K.T
-    base = zip(
-        mapping.base_names, mapping.expressions, mapping.to_base(found.standard),
-        np.sqrt(np.maximum(np.diag(spread), 0.0)), mapping.independent, strict=True,
-    )  # fmt: skip
-    bodies = pseudo_inertia(found.standard[: layout.n_inertial])
-    smallest = np.linalg.eigvalsh(bodies)[:, 0]
+    mapping, standard = structural_mapping(model), _commanded_standard(found)
     return {
         "schema_version": SCHEMA_VERSION,
         "robotid": __version__,
@@ -218,18 +197,9 @@ def build_commanded(
             "rank": estimate.rank,
             "condition": _finite(estimate.condition),
             "undetermined": list(found.undetermined),
-            "not_told_apart": [{"names": [a, b]} for a, b, _ in found.told_together],
+            "not_told_apart": [{"names": list(names)} for names in found.told_together],
         },
-        "base_parameters": [
-            {
-                "name": name,
-                "expression": expression,
-                "value": float(value),
-                "std_error": _finite(error),
-                "unit": layout.units[i],
-            }
-            for name, expression, value, error, i in base
-        ],
+        "base_parameters": _commanded_base(found, mapping),
         "uncertainty": {
             "method": "scatter of the scores of stretches of the whitened residual",
             "inflation": estimate.details["inflation"],
@@ -237,32 +207,15 @@ def build_commanded(
         "standard_parameters": standard[: layout.n_inertial],
         "drive_parameters": [*standard[layout.n_inertial :], *_loop_parameters(found)],
         "own_terms": model.options["own_terms"],
-        "consistency": {
-            "is_consistent": bool((smallest >= 0).all()),
-            "links": [
-                {"name": body, "mass": float(J[3, 3]), "min_eigenvalue": float(low)}
-                for body, J, low in zip(layout.bodies, bodies, smallest, strict=True)
-            ],
-            "total_mass": float(bodies[:, 3, 3].sum()),
-        },
-        "identification": {
-            "per_joint": {
-                joint: _commanded_joint(found, found.errors, j)
-                for j, joint in enumerate(model.joints)
-            }
-        },
+        "consistency": _commanded_bodies(found),
+        "identification": {"per_joint": _commanded_joints(found, found.errors)},
         "validation": [
-            {
-                "log": run.log.path,
-                "per_joint": {
-                    joint: _commanded_joint(found, (run,), j)
-                    for j, joint in enumerate(model.joints)
-                },
-            }
+            {"log": run.log.path, "per_joint": _commanded_joints(found, (run,))}
             for run in found.kept
         ],
         "simulation": {
             "controller": {"kind": found.loop.kind, "effort_limit": _stated_limits(found)},
+            "signs": dict(zip(model.joints, found.fitted.encoders.sign.tolist(), strict=True)),
             "fit": {
                 "message": estimate.message,
                 "converged": estimate.converged,
@@ -279,6 +232,61 @@ def build_commanded(
         ],
         "verdict": found.verdict.to_dict(),
     }
+
+
+def _commanded_standard(found: Commanded) -> list[dict[str, Any]]:
+    """Return the entries of all standard parameters, drives last."""
+    layout, prior = found.model.layout, found.model.standard_parameters()
+    errors = np.sqrt(np.maximum(np.diag(found.standard_covariance), 0.0))
+    return [
+        {
+            "name": name,
+            "value": float(found.standard[i]),
+            "std_error": float(errors[i]) if errors[i] > 0 else None,
+            "unit": layout.units[i],
+            "prior": float(prior[i]),
+            "source": _source_of(found, name, errors[i]),
+        }
+        for i, name in enumerate(layout.names)
+    ]
+
+
+def _commanded_base(found: Commanded, mapping: BaseMapping) -> list[dict[str, Any]]:
+    spread = np.diag(mapping.K @ found.standard_covariance @ mapping.K.T)
+    base = zip(
+        mapping.base_names, mapping.expressions, mapping.to_base(found.standard),
+        np.sqrt(np.maximum(spread, 0.0)), mapping.independent, strict=True,
+    )  # fmt: skip
+    return [
+        {
+            "name": name,
+            "expression": expression,
+            "value": float(value),
+            "std_error": _finite(error),
+            "unit": found.model.layout.units[i],
+        }
+        for name, expression, value, error, i in base
+    ]
+
+
+def _commanded_bodies(found: Commanded) -> dict[str, Any]:
+    """Return whether the bodies can be, and their masses."""
+    layout = found.model.layout
+    bodies = pseudo_inertia(found.standard[: layout.n_inertial])
+    smallest = np.linalg.eigvalsh(bodies)[:, 0]
+    return {
+        "is_consistent": bool((smallest >= 0).all()),
+        "links": [
+            {"name": body, "mass": float(J[3, 3]), "min_eigenvalue": float(low)}
+            for body, J, low in zip(layout.bodies, bodies, smallest, strict=True)
+        ],
+        "total_mass": float(bodies[:, 3, 3].sum()),
+    }
+
+
+def _commanded_joints(found: Commanded, runs: Sequence[OpenLoop]) -> dict[str, Any]:
+    joints = enumerate(found.model.joints)
+    return {joint: _commanded_joint(found, runs, j) for j, joint in joints}
 
 
 def _source_of(found: Commanded, name: str, error: float) -> str:
@@ -488,7 +496,9 @@ class Result:
             raise DataError(f"{self.path.name} has no gains of drives: it cannot follow commands")
         if log.q_ref is None:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
-        return follow_commands(*self.identified, self.commanded, log)
+        signs = self.content["simulation"].get("signs", {})
+        sign = np.array([signs.get(joint, 1.0) for joint in log.joints])
+        return sign * follow_commands(*self.identified, self.commanded, log.turned(sign))
 
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None

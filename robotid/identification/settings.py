@@ -345,7 +345,8 @@ class SimulationSettings(EstimatorSettings):
 
     name: str = _called(
         "simulation",
-        "closed loops rolled out on the commands of logs and fitted to the positions; needs [controller]",
+        "closed loops rolled out on the commands of logs and fitted to their positions; "
+        "[controller] says what is known of the loops",
     )
     window: float = setting(2.5, "length of the windows that are rolled out [s]", within=_FINITE)
     lead: float = setting(

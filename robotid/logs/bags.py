@@ -127,13 +127,15 @@ def _with_commands(
     if len(told) > 1:
         note += f", {1e3 * float(np.median(np.diff(told))):.3g} ms later in the median"
     if early := int(np.sum(measured < told[0])):
-        note += f"; {early} messages before the first one are left out"
+        note += f"; messages before the first one, left out: {early}"
     if late := int(np.sum(measured > told[-1])):
-        note += f"; {late} messages come after the last one"
+        note += f"; messages after the last one: {late}"
+    told_names = commands.names[1:]  # those of a controller's own state give way to them
+    own_names = [name for name in states.names if name not in told_names]
 
     def read(wanted: Sequence[str]) -> dict[str, Array]:
-        mine = [name for name in wanted if name in states.names and name != "time"]
-        theirs = [name for name in wanted if name in commands.names and name != "time"]
+        mine = [name for name in wanted if name in own_names and name != "time"]
+        theirs = [name for name in wanted if name in told_names]
         rows = states.read(["time", *mine])
         rows = {name: values[rows["time"] >= told[0]] for name, values in rows.items()}
         for name in theirs:  # each by itself: joints may be commanded by messages of their own
@@ -143,8 +145,7 @@ def _with_commands(
             rows[name] = np.where(last >= 0, held[name][order][np.maximum(last, 0)], np.nan)
         return {name: rows[name] for name in wanted}
 
-    names = [*states.names, *commands.names[1:]]
-    return Table(names, read, (*states.notes, note))
+    return Table([*own_names, *told_names], read, (*states.notes, note))
 
 
 @contextmanager

@@ -124,6 +124,14 @@ class Log:
         cut = {name: x[:, kept] for name, x in self._arrays().items()}
         return replace(self, joints=tuple(joints), **cut)
 
+    def turned(self, sign: Array) -> "Log":
+        """Return the log with the signs of some joints turned.
+
+        Args:
+            sign: 1 or -1 of each joint, shape (n,).
+        """
+        return replace(self, **{name: sign * x for name, x in self._arrays().items()})
+
     def _arrays(self) -> dict[str, Any]:
         """Return the arrays with a column per joint, those that there are."""
         arrays = {name: getattr(self, name) for name in COLUMNS.values()}

@@ -51,7 +51,11 @@ def state_size(bodies: int, depth: int) -> int:
 
 
 def compiled(function: Any) -> Any:
-    """Compile without the interpreter's lock; contract: a b + c may be rounded once."""
+    """Compile without the interpreter's lock; contract: a b + c may be rounded once.
+
+    Args:
+        function: The function.
+    """
     return njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")(function)
 
 
@@ -80,21 +84,25 @@ def _put3(x, at, k, lane, u):
 
 @compiled
 def cross(u, v):
+    """Return u x v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 @compiled
 def add(u, v):
+    """Return u + v."""
     return u[0] + v[0], u[1] + v[1], u[2] + v[2]
 
 
 @compiled
 def scale(s, u):
+    """Return s u."""
     return s * u[0], s * u[1], s * u[2]
 
 
 @compiled
 def dot(u, v):
+    """Return u . v."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 

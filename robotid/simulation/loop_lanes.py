@@ -92,19 +92,19 @@ def _into_parent(X, Y, Z, u):
 
 
 @compiled
-def _turn(I, u):
-    """Return I u of a symmetric matrix xx xy yy xz yz zz."""
+def _turn(J, u):
+    """Return J u of a symmetric matrix xx xy yy xz yz zz."""
     return (
-        I[0] * u[0] + I[1] * u[1] + I[3] * u[2],
-        I[1] * u[0] + I[2] * u[1] + I[4] * u[2],
-        I[3] * u[0] + I[4] * u[1] + I[5] * u[2],
+        J[0] * u[0] + J[1] * u[1] + J[3] * u[2],
+        J[1] * u[0] + J[2] * u[1] + J[4] * u[2],
+        J[3] * u[0] + J[4] * u[1] + J[5] * u[2],
     )
 
 
 @compiled
-def _momentum(m, c, I, w, v):
-    """Return m v + w x mc and mc x v + I w: a body's momentum, or its force of an acceleration."""
-    return add(scale(m, v), cross(w, c)), add(cross(c, v), _turn(I, w))
+def _momentum(m, c, J, w, v):
+    """Return m v + w x mc and mc x v + J w: a body's momentum, or its force of an acceleration."""
+    return add(scale(m, v), cross(w, c)), add(cross(c, v), _turn(J, w))
 
 
 @compiled
@@ -147,13 +147,13 @@ def _move(work, own, up, joint, v, a):
 
 @compiled
 def _force(work, own, body):
-    """Write the force I A + V x* I V on a body; body has its ten parameters."""
-    m, c, I = body[0], (body[1], body[2], body[3]), body[4:10]
+    """Write the force J A + V x* J V on a body; body has its ten parameters."""
+    m, c, J = body[0], (body[1], body[2], body[3]), body[4:10]
     for lane in range(LANES):
         w, v = _get3(work, own + _W, lane), _get3(work, own + _V, lane)
         dw, a = _get3(work, own + _DW, lane), _get3(work, own + _A, lane)
-        f, n = _momentum(m, c, I, dw, a)
-        lin, ang = _momentum(m, c, I, w, v)
+        f, n = _momentum(m, c, J, dw, a)
+        lin, ang = _momentum(m, c, J, w, v)
         _put3(work, own + _F, lane, add(f, cross(w, lin)))
         _put3(work, own + _F + 3, lane, add(n, add(cross(w, ang), cross(v, lin))))
 
@@ -205,12 +205,12 @@ def _mass_matrix(work, parents, joints, bodies, M):
         turn = (joints[i, 36], joints[i, 37], joints[i, 38])
         for lane in range(LANES):
             m, c = _get(work, own + _C, lane), _get3(work, own + _C + 1, lane)
-            I = (
+            J = (
                 _get(work, own + _C + 4, lane), _get(work, own + _C + 5, lane),
                 _get(work, own + _C + 6, lane), _get(work, own + _C + 7, lane),
                 _get(work, own + _C + 8, lane), _get(work, own + _C + 9, lane),
             )  # fmt: skip
-            f, t = _momentum(m, c, I, turn, slide)
+            f, t = _momentum(m, c, J, turn, slide)
             _put3(work, own + _TF, lane, f)
             _put3(work, own + _TF + 3, lane, t)
             _put(work, M + i * n + i, lane, dot(slide, f) + dot(turn, t))
@@ -243,7 +243,7 @@ def _join_bodies(work, own, up):
         c = _into_parent(X, Y, Z, _get3(work, own + _C + 1, lane))
         I0, I1, I2 = _get3(work, own + _C + 4, lane)
         I3, I4, I5 = _get3(work, own + _C + 7, lane)
-        # R I: its columns are R applied to the columns of I
+        # R J: its columns are R applied to the columns of J
         U = _into_parent(X, Y, Z, (I0, I1, I3))
         V = _into_parent(X, Y, Z, (I1, I2, I4))
         W = _into_parent(X, Y, Z, (I3, I4, I5))
@@ -311,13 +311,13 @@ def _carry(work, own, up, joint, v):
 @compiled
 def _force_change(work, own, body):
     """Write how the force on a body changes, from the changes of velocity and acceleration."""
-    m, c, I = body[0], (body[1], body[2], body[3]), body[4:10]
+    m, c, J = body[0], (body[1], body[2], body[3]), body[4:10]
     for lane in range(LANES):
         w, v = _get3(work, own + _W, lane), _get3(work, own + _V, lane)
         tw, tv = _get3(work, own + _TV, lane), _get3(work, own + _TV + 3, lane)
-        f, n = _momentum(m, c, I, _get3(work, own + _TA, lane), _get3(work, own + _TA + 3, lane))
-        lin, ang = _momentum(m, c, I, w, v)
-        tlin, tang = _momentum(m, c, I, tw, tv)
+        f, n = _momentum(m, c, J, _get3(work, own + _TA, lane), _get3(work, own + _TA + 3, lane))
+        lin, ang = _momentum(m, c, J, w, v)
+        tlin, tang = _momentum(m, c, J, tw, tv)
         _put3(work, own + _TF, lane, add(f, add(cross(tw, lin), cross(w, tlin))))
         n = add(n, add(cross(tw, ang), cross(w, tang)))
         _put3(work, own + _TF + 3, lane, add(n, add(cross(tv, lin), cross(v, tlin))))
@@ -559,13 +559,13 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
 def _inertial_column(work, parents, joints, works, body, index, own):
     """Write the torques of a change of a body's ten parameters."""
     direction = works[index]
-    m, c, I = direction[0], (direction[1], direction[2], direction[3]), direction[4:10]
+    m, c, J = direction[0], (direction[1], direction[2], direction[3]), direction[4:10]
     at = (body + 1) * _BODY
     for lane in range(LANES):
         w, v = _get3(work, at + _W, lane), _get3(work, at + _V, lane)
         dw, a = _get3(work, at + _DW, lane), _get3(work, at + _A, lane)
-        f, n = _momentum(m, c, I, dw, a)
-        lin, ang = _momentum(m, c, I, w, v)
+        f, n = _momentum(m, c, J, dw, a)
+        lin, ang = _momentum(m, c, J, w, v)
         _put3(work, at + _TF, lane, add(f, cross(w, lin)))
         _put3(work, at + _TF + 3, lane, add(n, add(cross(w, ang), cross(v, lin))))
     i = body

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from os import cpu_count
 from types import ModuleType
 from typing import TypeAlias
@@ -135,7 +136,7 @@ def cut_windows(log: Log, length: float, lead: float) -> tuple[Window, ...]:
     edges = [0, *(np.flatnonzero(steps > _GAP * dt) + 1), len(log.t)]
     ahead = round(lead / dt)
     windows = []
-    for start, stop in zip(edges, edges[1:], strict=False):
+    for start, stop in pairwise(edges):
         size = stop - start if math.isinf(length) else max(2, round(length / dt))
         firsts = list(range(start, stop, size))
         if len(firsts) > 1 and stop - firsts[-1] < _SHORT * size:
@@ -254,9 +255,9 @@ class LoopedRobot:
         along = np.zeros((0, 10)) if directions is None else np.array(directions, order="C")
         lanes = _lanes()
         blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
-        work = [(part, block) for block in blocks for part in self._parts]
-        with ThreadPoolExecutor(max_workers=min(len(work), cpu_count() or 1) or 1) as pool:
-            done = list(pool.map(lambda w: self._block(*w, loops, wanted, along), work))
+        pieces = [(part, block) for block in blocks for part in self._parts]
+        with ThreadPoolExecutor(max_workers=min(len(pieces), cpu_count() or 1) or 1) as pool:
+            done = list(pool.map(lambda p: self._block(p[0], p[1], loops, wanted, along), pieces))
         n, each = len(self.model.joints), len(self._parts)
         found = []
         for b, block in enumerate(blocks):
@@ -353,7 +354,9 @@ def _times(window: Window, samples: int, every: int) -> Array:
     beyond = samples - len(t)
     dt = float(np.median(np.diff(window.log.t)))
     stamps = np.concatenate([t, t[-1] + dt * np.arange(1, beyond + 1)])
-    return np.interp(np.arange((samples - 1) * every + 1) / every, np.arange(samples), stamps)
+    steps = np.arange((samples - 1) * every + 1) / every
+    times: Array = np.interp(steps, np.arange(samples), stamps)
+    return times
 
 
 def _parts(tree: Tree) -> list[_Part]:

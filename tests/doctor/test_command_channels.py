@@ -33,8 +33,8 @@ def log():
 
 
 def found(log):
-    """The findings but the note that every log without torque gets, by code."""
-    return {f.code: f for f in check_commands(log) if f.code != "no_torque"}
+    """The findings but the notes that every such log gets, by code."""
+    return {f.code: f for f in check_commands(log) if f.code not in ("no_torque", "loops")}
 
 
 def waves(amplitudes, speeds):
@@ -44,10 +44,17 @@ def waves(amplitudes, speeds):
 # --- nothing where nothing is ---------------------------------------------------------------------
 
 
-def test_a_good_chirp_gives_a_note_alone(log):
-    (note,) = check_commands(log)
+def test_a_good_chirp_gives_notes_alone(log):
+    note, loops = check_commands(log)
     assert (note.code, note.severity, note.where) == ("no_torque", "note", "log")
     assert "as ratios to the gains of its controller" in note.message
+    assert (loops.code, loops.severity, loops.where) == ("loops", "note", "log")
+    for servo, joint in zip(GOOD, log.joints, strict=True):
+        # of exp(-s T) k / (s^2 + d s + k): phase T + d / k at rest, 0.707 at sqrt(k) for d = 1.4
+        late = servo.delay + servo.damping / servo.stiffness
+        assert loops.evidence[f"lag_{joint}"] == pytest.approx(late, rel=0.15)
+        ends = np.sqrt(servo.stiffness) / (2 * np.pi)
+        assert loops.evidence[f"bandwidth_{joint}"] == pytest.approx(ends, abs=0.3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -164,7 +171,7 @@ def test_joints_that_are_told_the_same_are_named_in_groups():
             [one, -0.5 * one, other, 1 + 0.2 * other, 0.1 * told(20.0 - t)[:, 0]]
         )
 
-    codes = [f for f in check_commands(record(commands, [Servo()] * 5)) if f.code != "no_torque"]
+    codes = [f for f in check_commands(record(commands, [Servo()] * 5)) if f.severity != "note"]
     assert [(f.code, f.severity, f.where) for f in codes] == [
         ("commands_alike", "warning", "log: joint_0, joint_1"),
         ("commands_alike", "warning", "log: joint_2, joint_3"),

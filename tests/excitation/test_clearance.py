@@ -79,8 +79,11 @@ def test_the_nearest_place_is_a_lower_bound_within_a_millimetre(panda, seed):
     motion = random_fourier(panda, np.random.default_rng(seed))
     contact = clearance.nearest(motion, 3.0)
     q = motion.evaluate(np.linspace(0.0, 3.0, 3001))[0]
-    dense = clearance.near(clearance.poses(q), 0.07, clearance.everything).distance.min()
-    assert dense - 2e-3 < contact.distance <= dense
+    dense = clearance.near(clearance.poses(q), 0.07, clearance.everything).distance.min(axis=1)
+    margins = dense - clearance.kept
+    assert margins.min() - 2e-3 < contact.margin <= margins.min()
+    pair = clearance.named.index((contact.first, contact.second))
+    assert margins[pair] < margins.min() + 1e-4  # it is that pair, not one that has a lower bound
 
 
 def test_bad_surroundings_are_refused(slider, tmp_path):
@@ -140,6 +143,19 @@ def test_links_that_are_built_near_each_other_are_watched_and_those_that_touch_a
     assert {far.first, far.second} == {"base", "plate"}
     assert far.margin < 0.0 < less.margin
     assert far.kept == clearance.kept[0]
+
+
+def test_links_that_touch_in_almost_every_pose_but_not_at_zero_are_watched(tmp_path):
+    # a plate that is driven into the base, from 4 mm above it
+    driven = TILTED.replace('name="tilt" type="revolute"', 'name="tilt" type="prismatic"')
+    driven = driven.replace('<axis xyz="1 0 0"/><limit lower="-0.35" upper="0.35"',
+                            '<axis xyz="0 0 -1"/><limit lower="0" upper="0.1"')  # fmt: skip
+    driven = driven.replace('<origin xyz="0 0 0.065"/>', '<origin xyz="0 0 0.054"/>')
+    (tmp_path / "driven.urdf").write_text(driven)
+    clearance = Clearance(RobotModel.from_urdf(tmp_path / "driven.urdf"))
+    assert len(clearance.made_to) == 1  # the pin
+    assert clearance.named == [("base", "plate")]
+    assert 0.0005 < clearance.kept[0] < 0.002  # half of what lies between 1 and 4 mm
 
 
 def test_links_that_stay_at_their_distance_are_kept_at_half_of_it():

@@ -64,9 +64,9 @@ def test_the_distance_of_a_course_is_that_of_all_pairs(course):
     distance, pairs = found.nearness(around.everything)
     np.testing.assert_allclose(distance, exact.min(axis=0), atol=1e-9)
     np.testing.assert_array_equal(exact[pairs, np.arange(len(distance))], exact.min(axis=0))
-    k = int(np.argmin(distance))
-    assert found.nearest.distance == pytest.approx(exact.min())
-    assert found.nearest.time == found.t[k]
+    margins = (exact - around.kept[:, None])[found.changes(around)]
+    assert found.nearest.margin == pytest.approx(margins.min())
+    assert found.nearest.time == found.t[np.unravel_index(margins.argmin(), margins.shape)[1]]
     floor = np.array(["the floor" in pair for pair in around.named])
     assert exact[floor].min() > 0.2  # farther than what is looked at first
     np.testing.assert_allclose(found.nearness(floor)[0], exact[floor].min(axis=0), atol=1e-9)

@@ -367,11 +367,21 @@ def test_two_topics_of_joint_states_are_joined_by_holding_the_last_command(tmp_p
     assert (back.v_ref, back.has_torque) == (None, False)
     assert back.notes == (
         "commands of topic '/joint_commands' are held until the next one, 20 ms later in the "
-        "median; 5 messages before the first one are left out; 1 messages come after the last one",
+        "median; messages before the first one, left out: 5; messages after the last one: 1",
     )
     only = LogSource(command="/joint_commands")
     assert_same(read_log(path, JOINTS, needs="commands", source=only), back)
     assert len(read_log(path, JOINTS, needs="motion", source=COMMANDS).t) == 55
+
+
+def test_commands_of_a_topic_go_before_those_of_a_controllers_own_state(tmp_path):
+    log = driven()
+    told = replace(log, q=log.q_ref + 1)
+    path = write_controller(tmp_path / "run", log, "new", states=list(messages_of(told)))
+    source = LogSource(topic="/arm_controller/state", command="/joint_states")
+    back = read_log(path, JOINTS, needs="commands", source=source)
+    np.testing.assert_array_equal(back.q_ref, log.q_ref + 1)
+    np.testing.assert_array_equal(back.q, log.q)
 
 
 def test_topics_of_commands_that_cannot_be_are_refused(tmp_path):
