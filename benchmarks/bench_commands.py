@@ -1,0 +1,449 @@
+"""Drives from commands and positions: errors of open loops, intervals, and time.
+
+    ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
+        [--go2] [--so101] [--rollouts] [--coverage RUNS] [--torque]
+
+Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
+chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
+rest from the same position and speed. --so101: fitted to three motions of six servos, beside the
+plain baseline of the recording's description. --coverage: MuJoCo rolls out a robot with known
+drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
+with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. Times are of the processor,
+all threads together, where they do not say otherwise: other loads of the machine add little.
+"""
+
+import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+import mujoco
+from helpers import mujoco_plant
+from mujoco import rollout
+
+from robotid.commanded.identify import identify_commands
+from robotid.commanded.settings import LoopSettings
+from robotid.commands.job import read_job
+from robotid.export.commanded import CommandedDrive, loops_of
+from robotid.identification.settings import SimulationSettings
+from robotid.logs.data import Log
+from robotid.robot.drives import AUTO
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, Window
+
+FINE = 5e-5  # [s] step of the plant
+STEP = 5e-4  # [s] of our roll-outs beside it
+STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)  # impedance of its friction
+RATE, DURATION, NOISE = 500.0, 10.0, 3e-4  # [Hz], [s], [rad]
+REACH = 1.96
+KHZ = 1e-3  # [s] step and period of the roll-outs that are timed
+
+GO2_GAINS = (20.0, 1.5)  # [N m/rad], [N m s/rad]
+GO2_SYSID = (3.5, 3.3, 9.0, 5.6, 2.8, 10.6, 3.8, 2.6, 17.2, 6.9, 3.9, 10.9)  # [mrad], published
+GO2_PUBLISHED = "mujoco.sysid, published: 49 parameters, 104 s of two cores"
+GO2_SPLIT = 14.09  # [s]
+SYSID_STEP, LONGEST = 2.5e-3, 0.03  # [s] of MuJoCo, of a delay
+#: Of each joint: key, begin, lowest, highest.
+SYSID_PARAMETERS = (
+    ("armature", 0.01, 1e-4, 0.3), ("damping", 0.1, 0.0, 5.0), ("frictionloss", 0.1, 0.0, 5.0),
+    ("bias", 0.0, -0.3, 0.3),
+)  # fmt: skip
+
+SO101_FITTED = ("chirp_sweep", "multisine", "large_amplitude")
+SO101_PLAIN = {  # [mrad], of the recording's description
+    "friction_gravity": (4.4, 8.6, 13.0, 3.9, 3.4, 1.6),
+    "step_response": (6.6, 25.5, 38.4, 12.4, 12.7, 2.7),
+    "prbs_excitation": (24.0, 49.0, 52.0, 18.0, 14.0, 31.0),
+    "workspace_sweep": (11.0, 28.0, 53.0, 15.0, 6.5, 2.8),
+}
+SO101_JOINTS = {
+    "shoulder_pan": "Rotation", "shoulder_lift": "Pitch", "elbow_flex": "Elbow",
+    "wrist_flex": "Wrist_Pitch", "wrist_roll": "Wrist_Roll", "gripper": "Jaw",
+}  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
+    parser.add_argument("--go2", action="store_true", help="a quadruped, beside mujoco.sysid")
+    parser.add_argument("--so101", action="store_true", help="an arm of six servos")
+    parser.add_argument("--rollouts", action="store_true", help="speed, beside MuJoCo")
+    parser.add_argument(
+        "--coverage", type=int, metavar="RUNS", help="intervals beside a known truth"
+    )
+    parser.add_argument(
+        "--robots", nargs="+", default=["planar", "leg", "arm"], help="of --coverage"
+    )
+    parser.add_argument("--sysid-steps", type=int, default=30, help="most steps; 0: as published")
+    parser.add_argument("--out", type=Path, help="folder that bench_commands.json is written to")
+    options = parser.parse_args()
+    parts = {
+        "go2": options.go2 and (lambda: go2(options.sysid_steps)),
+        "so101": options.so101 and so101,
+        "rollouts": options.rollouts and (lambda: rollouts(0.3 if options.quick else 3.0)),
+        "coverage": options.coverage and (lambda: coverage(options.robots, options.coverage)),
+    }
+    if not any(parts.values()):
+        runs = (["planar"], 2, 4.0) if options.quick else (options.robots, 20)
+        parts["rollouts"] = lambda: rollouts(0.3 if options.quick else 3.0)
+        parts["coverage"] = lambda: coverage(*runs)
+    results = {name: part() for name, part in parts.items() if part}
+    print(f"{setting.machine()}, mujoco {mujoco.__version__}")
+    if options.out:
+        options.out.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({**results, "machine": setting.machine()}, indent=1)
+        (options.out / "bench_commands.json").write_text(text + "\n")
+
+
+def clocks():
+    """Return the time of the wall and of the processor [s]."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def by_job(text):
+    """Return what a job finds, and the times that it took."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "job.toml"
+        path.write_text(text)
+        job = read_job(path)
+        begun = clocks()
+        model = job.model()
+        logs, kept = (
+            [job.read(entry, model, needs="commands") for entry in entries]
+            for entries in (job.identification, job.validation)
+        )
+        found = identify_commands(
+            model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms
+        )
+        return found, clocks() - begun
+
+
+def geometric_mean(ratios):
+    return float(np.exp(np.mean(np.log(ratios))))
+
+
+def recordings(name):
+    if "ROBOTID_DATA" not in os.environ:
+        raise SystemExit("set ROBOTID_DATA to the folder of the recordings")
+    return Path(os.environ["ROBOTID_DATA"]) / "commands" / name
+
+
+def go2(sysid_steps):
+    """Print the open-loop error of twelve joints, beside mujoco.sysid; return the figures."""
+    log = recordings("go2") / "chirp.parquet"
+    begin, kp, kd = np.nextafter(GO2_SPLIT, np.inf), *GO2_GAINS
+    found, took = by_job(
+        f'urdf = "{example_urdf("go2.urdf")}"\n[estimator]\nname = "simulation"\n'
+        f"[controller]\nkp = {kp}\nkd = {kd}\n"
+        f'[[identification]]\nlog = "{log}"\nend = {GO2_SPLIT}\n'
+        f'[[validation]]\nlog = "{log}"\nstart = {begin}\n'
+    )
+    ours = 1e3 * found.kept[0].rmse
+    beside = [(GO2_PUBLISHED, np.array(GO2_SYSID))]
+    if sysid_steps:
+        theirs, count, steps, their_time = sysid_fit(found, sysid_steps)
+        beside.insert(0, (f"mujoco.sysid, {count} parameters, {steps} steps here", theirs))
+    joints = found.model.joints
+    print(f"| open loop on the rest of the chirp, error in mrad | {' | '.join(joints)} | ratio |")
+    print("|---" * (len(joints) + 2) + "|")
+    count_of_ours = len(found.fitted.estimate.theta)
+    table = [(f"robotid, {count_of_ours} parameters", ours), *beside]
+    for who, errors in table:
+        ratio = "" if errors is ours else f"{geometric_mean(ours / errors):.3f}"
+        print(f"| {who} | {' | '.join(f'{e:.1f}' for e in errors)} | {ratio} |")
+    times = {"robotid": took} | ({"mujoco.sysid": their_time} if sysid_steps else {})
+    said = [
+        f"{who} {t[0]:.0f} s of the wall, {t[1]:.0f} s of processor" for who, t in times.items()
+    ]
+    print(f"\nRatio: geometric mean of robotid's error over theirs. {'; '.join(said)}.")
+    print(f"{found.fitted.estimate.message}.\n", flush=True)
+    return {
+        "errors_mrad": {who: list(errors) for who, errors in table},
+        "ratios": {who: geometric_mean(ours / errors) for who, errors in beside},
+        "seconds": {who: list(t) for who, t in times.items()},
+    }
+
+
+def sysid_fit(found, most):
+    """Return the errors of mujoco.sysid on the kept log, parameters, steps and times."""
+    from mujoco import sysid
+
+    log, kept = found.errors[0].log, found.kept[0].log
+    model, begun = found.model, clocks()
+    spec = sysid_spec(model)
+    params = sysid.ParameterDict()
+    for joint in model.joints:
+        for key, value, low, high in SYSID_PARAMETERS:
+            modifier = sysid_modifier(key, joint)
+            params.add(sysid.Parameter(f"{joint}.{key}", value, low, high, modifier=modifier))
+    params.add(sysid.Parameter("delay", 0.005, 0.0, 0.9 * LONGEST, modifier=sysid_delay))
+    robot, names = spec.compile(), [f"q_{joint}" for joint in model.joints]
+    t, q_ref = held(log)
+    sequences = sysid.ModelSequences(
+        "go2", spec, "chirp", beginning(robot, log),
+        sysid.TimeSeries.from_control_names(t, q_ref, robot),
+        sysid.TimeSeries.from_names(log.t - log.t[0], log.q, robot, names),
+        allow_missing_sensors=True,
+    )  # fmt: skip
+    residual = sysid.build_residual_fn(models_sequences=[sequences])
+    best, result = sysid.optimize(params, residual, verbose=False, max_iters=most)
+    took = clocks() - begun
+    fitted = sysid.apply_param_modifiers(best, spec)
+    t, q_ref = held(kept)
+    data = mujoco.MjData(fitted)
+    states, _ = rollout.rollout(fitted, data, beginning(fitted, kept)[None], q_ref[None])
+    at = [fitted.joint(joint).qposadr[0] for joint in model.joints]
+    q = states[0][:, 1:][:, at]  # at t + one step
+    q = np.column_stack(
+        [np.interp(kept.t - kept.t[0], t + SYSID_STEP, own, left=np.nan) for own in q.T]
+    )
+    rmse = 1e3 * np.sqrt(np.nanmean((q - kept.q) ** 2, axis=0))
+    return rmse, params.size, len(result.extras.get("objective", ())), took
+
+
+def sysid_spec(model):
+    """Return MuJoCo's description of the robot of the URDF, each joint with a drive."""
+    drives = [
+        CommandedDrive(joint, *GO2_GAINS, LONGEST, 0.0, 0.01, 0.05, 0.1, 0.0, np.inf)
+        for joint in model.joints
+    ]
+    bare = RobotModel.from_urdf(model.tree)
+    none = np.zeros(len(drives))
+    plant = mujoco_plant.Plant(bare, tuple(drives), none, none)
+    robot = mujoco_plant.loaded(plant, 1 / SYSID_STEP, SYSID_STEP)
+    with TemporaryDirectory() as folder:
+        path = str(Path(folder) / "robot.xml")
+        mujoco.mj_saveLastXML(path, robot)
+        spec = mujoco.MjSpec.from_file(path)
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    for joint in model.joints:
+        spec.add_sensor(
+            name=f"q_{joint}", type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint,
+        )  # fmt: skip
+    return spec
+
+
+def sysid_modifier(key, joint):
+    """Return what writes a parameter of a joint into MuJoCo's description."""
+
+    def write(spec, parameter):
+        value = float(parameter.value[0])
+        if key == "bias":
+            spec.actuator(joint).biasprm[0] = GO2_GAINS[0] * value
+        elif key == "damping":
+            spec.joint(joint).damping[0] = value
+        else:
+            setattr(spec.joint(joint), key, value)
+
+    return write
+
+
+def sysid_delay(spec, parameter):
+    for actuator in spec.actuators:
+        actuator.delay = float(parameter.value[0])
+
+
+def held(log):
+    """Return times from 0 at MuJoCo's step, and the command that is held at each."""
+    t = np.arange(int((log.t[-1] - log.t[0]) / SYSID_STEP) + 1) * SYSID_STEP
+    at = np.searchsorted(log.t - log.t[0], t + 1e-6, side="right") - 1
+    return t, np.array(log.q_ref[at])
+
+
+def beginning(robot, log):
+    """Return MuJoCo's state where a log begins."""
+    q, v = Window(log, 0, 0, len(log.t)).start
+    data = mujoco.MjData(robot)
+    for j, joint in enumerate(log.joints):
+        data.qpos[robot.joint(joint).qposadr[0]] = q[j]
+        data.qvel[robot.joint(joint).dofadr[0]] = v[j]
+    for k in range(robot.nu):
+        if robot.actuator_history[k, 0]:
+            size = robot.actuator_history[k, 0]
+            mujoco.mj_initCtrlHistory(robot, data, k, None, [log.q_ref[0, k]] * size)
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.empty(mujoco.mj_stateSize(robot, kind))
+    mujoco.mj_getState(robot, data, state, kind)
+    return state
+
+
+def so101():
+    """Print the open-loop error of six servos on four motions; return the figures."""
+    folder = recordings("so101")
+    columns = "".join(
+        f'{kind}_{joint} = "{kind}_{name}"\n'
+        for joint, name in SO101_JOINTS.items()
+        for kind in ("q", "qref")
+    )
+    groups = ", ".join(f'"{joint}"' for joint in SO101_JOINTS)
+    entries = [("identification", name) for name in SO101_FITTED]
+    entries += [("validation", name) for name in SO101_PLAIN]
+    found, took = by_job(
+        f'urdf = "{example_urdf("so101.urdf")}"\n[estimator]\nname = "simulation"\n'
+        f"[controller.groups]\nservo = [{groups}]\n[columns]\n{columns}"
+        + "".join(f'[[{what}]]\nlog = "{folder / name}.parquet"\n' for what, name in entries)
+    )
+    print(f"| kept motion, error in mrad | {' | '.join(found.model.joints)} | ratio |")
+    print("|---" * (len(found.model.joints) + 2) + "|")
+    ratios, rows = [], {}
+    for (name, plain), run in zip(SO101_PLAIN.items(), found.kept, strict=True):
+        errors = 1e3 * run.rmse
+        ratios.append(errors / np.array(plain))
+        rows[name] = list(errors)
+        print(f"| {name} | {' | '.join(f'{e:.1f}' for e in errors)} | "
+              f"{geometric_mean(ratios[-1]):.2f} |")  # fmt: skip
+        print(f"| - plain baseline | {' | '.join(f'{e:.1f}' for e in plain)} | |")
+    by_joint = [geometric_mean(own) for own in np.array(ratios).T]
+    whole = geometric_mean(ratios)
+    print(f"| ratio | {' | '.join(f'{x:.2f}' for x in by_joint)} | {whole:.3f} |")
+    print(f"\n{took[0]:.0f} s of the wall, {took[1]:.0f} s of processor; "
+          f"{found.fitted.estimate.message}.\n", flush=True)  # fmt: skip
+    return {"errors_mrad": rows, "ratio": whole, "by_joint": by_joint, "seconds": list(took)}
+
+
+def rollouts(seconds):
+    """Print how many roll-outs of a second are done in a second; return the figures."""
+    print("| robot, 1 kHz | roll-outs per second: robotid, 1 thread | 2 threads | MuJoCo, 1 thread |"
+          " 2 threads | robotid over MuJoCo | gradient, roll-outs | by parameters |")  # fmt: skip
+    print("|---" * 8 + "|")
+    rows = []
+    for name in ("arm", "quadruped"):
+        plant = mujoco_plant.plant(name, np.random.default_rng(0))
+        row = rollout_row(name, plant, seconds)
+        rows.append(row)
+        print(f"| {name}, {row['joints']} joints | {row['ours'][0]:.0f} | {row['ours'][1]:.0f} | "
+              f"{row['mujoco'][0]:.0f} | {row['mujoco'][1]:.0f} | "
+              f"{row['ours'][0] / row['mujoco'][0]:.1f} | {row['gradient']:.1f} | "
+              f"{row['parameters']} |", flush=True)  # fmt: skip
+    print(
+        "\nA roll-out is of one second of the robot, a step of 1 ms; of one thread by its "
+        "processor time, of two by the wall. The gradient is by all parameters at once.\n"
+    )
+    return rows
+
+
+def rollout_row(name, plant, seconds):
+    """Return roll-outs per second of a plant, ours and MuJoCo's, and the gradient's cost."""
+    n, many = len(plant.drives), 64
+    t = np.arange(1001) * KHZ
+    q_ref = mujoco_plant.multisine(t, plant.middle, plant.reach, np.random.default_rng(1))
+    log = Log(t, q_ref, 0 * q_ref, plant.model.joints, q_ref=q_ref, has_torque=False)
+    robot, loops = (
+        LoopedRobot(plant.model, step=KHZ),
+        loops_of(plant.model, drive_pi(plant), plant.drives),
+    )
+    windows = [Window(log, 0, 0, len(t))] * many
+    kinds = robot.kinds
+    columns = [(kinds[what], j, 0) for what in ("armature", "kp", "kd", "delay") for j in range(n)]
+    columns += [(kinds["term"], j, k + sum(map(len, loops.terms[:j])))
+                for j in range(n) for k in range(len(loops.terms[j]))]  # fmt: skip
+    mj = mujoco_plant.loaded(plant, 1 / KHZ, KHZ)
+    state = np.repeat(beginning(mj, log)[None], many, axis=0)
+    control = np.repeat(q_ref[None, :-1], many, axis=0)
+    datas = [mujoco.MjData(mj) for _ in range(2)]
+    ways = {
+        "ours": lambda: robot.roll_out(loops, windows),
+        "gradient": lambda: robot.roll_out(loops, windows, columns),
+        "mujoco 1": lambda: rollout.rollout(mj, datas[:1], state, control),
+        "mujoco 2": lambda: rollout.rollout(mj, datas, state, control),
+    }
+    best = {way: np.full(2, np.inf) for way in ways}
+    for way in ways.values():
+        way()  # what is compiled is ready then
+    begun = time.perf_counter()
+    while time.perf_counter() - begun < seconds or not np.isfinite(best["mujoco 2"]).all():
+        for key, way in ways.items():  # in turn, so that all meet the same load
+            start = clocks()
+            way()
+            best[key] = np.minimum(best[key], clocks() - start)
+    per_second = {key: many / own for key, own in best.items()}
+    return {
+        "robot": name,
+        "joints": n,
+        "parameters": len(columns),
+        "ours": [per_second["ours"][1], per_second["ours"][0]],
+        "mujoco": [per_second["mujoco 1"][1], per_second["mujoco 2"][0]],
+        "gradient": best["gradient"][1] / best["ours"][1],
+    }
+
+
+def drive_pi(plant):
+    """Return the standard parameters of a plant."""
+    pi, names = plant.model.standard_parameters(), plant.model.layout.names
+    for drive in plant.drives:
+        for term in ("armature", "viscous", "coulomb", "offset"):
+            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
+    return pi
+
+
+def coverage(robots, runs, seconds=DURATION):
+    """Print how well intervals hold the truth, by robot and kind of parameter; return the rows."""
+    print(f"| robot, {runs} runs | parameter | values | mean error over scatter | "
+          "error said over scatter | 95 % intervals hold |")  # fmt: skip
+    print("|---" * 6 + "|")
+    rows = []
+    for name in robots:
+        found, begun = {}, time.process_time()
+        for seed in range(runs):
+            for kind, error, said in one_run(name, np.random.default_rng([17, seed]), seconds):
+                found.setdefault(kind, []).append((error, said))
+        for kind, pairs in found.items():
+            error, said = np.array(pairs).T
+            row = {
+                "robot": name,
+                "parameter": kind,
+                "values": len(error),
+                "bias": float(np.mean(error / said)),
+                "said": float(1.0 / np.std(error / said)),
+                "held": float(np.mean(np.abs(error) <= REACH * said)),
+            }
+            rows.append(row)
+            print(f"| {name} | {kind} | {len(error)} | {row['bias']:+.2f} | {row['said']:.2f} | "
+                  f"{100 * row['held']:.1f} % |", flush=True)  # fmt: skip
+        took = (time.process_time() - begun) / runs
+        print(f"| {name} | {took:.1f} s of processor a run | | | | |", flush=True)
+    print()
+    return rows
+
+
+def one_run(name, rng, seconds):
+    """Yield kind, error and standard error of each parameter of a run."""
+    delay = 2e-4 * rng.integers(20, 41)
+    plant = mujoco_plant.plant(name, rng, delay=delay)
+    log = plant_log(plant, rng, seconds)
+    gains = {key: {d.joint: getattr(d, key) for d in plant.drives} for key in ("kp", "kd")}
+    first = plant.model.joints[0]
+    loop = LoopSettings(**gains, groups={first: [first]})  # every joint has a drive of its own
+    settings = SimulationSettings(bodies=0.0, step=STEP)
+    found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
+    estimate, truth = found.fitted.estimate, {**plant.truth, "delay": delay}
+    for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
+        yield key.rpartition(".")[2], theta - truth[key], said
+
+
+def plant_log(plant, rng, seconds, noise=NOISE):
+    """Return the log of a plant on a multi-sine, at a fine step and with stiff friction."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    q_ref = mujoco_plant.multisine(t, plant.middle, plant.reach, rng)
+    robot = mujoco_plant.loaded(plant, RATE, FINE)
+    robot.dof_solref[:] = 2 * FINE, 1.0
+    robot.dof_solimp[:] = STIFF
+    q, _ = mujoco_plant.rolled_out(robot, q_ref, RATE)
+    q = q + noise * rng.standard_normal(q.shape)
+    return Log(t, q, 0 * q, plant.model.joints, q_ref=q_ref, has_torque=False)
+
+
+if __name__ == "__main__":
+    main()
