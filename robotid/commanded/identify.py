@@ -14,7 +14,7 @@ from robotid.commanded.term_choice import Tried
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
-from robotid.identification.verdict import JointVerdict, Verdict
+from robotid.identification.verdict import JointVerdict, Verdict, alarming
 from robotid.logs.data import Log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -43,6 +43,7 @@ class Commanded:
         errors: Open loops on the fitted logs.
         kept: Open loops on logs kept apart.
         findings: What the user should know.
+        alarms: Faults of the logs that make the result wrong, as the doctor found them.
     """
 
     model: RobotModel
@@ -52,6 +53,7 @@ class Commanded:
     errors: tuple[OpenLoop, ...]
     kept: tuple[OpenLoop, ...]
     findings: tuple[Finding, ...]
+    alarms: tuple[str, ...] = ()
 
     @cached_property
     def standard(self) -> Array:
@@ -106,6 +108,8 @@ def identify_commands(
     settings: SimulationSettings,
     *,
     chooses: bool = True,
+    examined: Sequence[Finding] = (),
+    ignore: Sequence[str] = (),
     progress: ProgressCallback = ignore_progress,
 ) -> Commanded:
     """Identify drives, loops and bodies from logs of commands and positions.
@@ -117,6 +121,8 @@ def identify_commands(
         loop: What is known of the loops.
         settings: The estimator's.
         chooses: Whether further friction is tried.
+        examined: What the doctor found in the logs.
+        ignore: Codes of its errors that you know better.
         progress: Told of the stages.
 
     Raises:
@@ -151,9 +157,10 @@ def identify_commands(
         fitted=fitted,
         errors=tuple(runs[0]),
         kept=tuple(runs[1]),
-        findings=(),
+        findings=tuple(examined),
+        alarms=tuple(finding.message for finding in alarming(examined, ignore)),
     )
-    return replace(found, findings=by_severity(_findings(found)))
+    return replace(found, findings=by_severity([*examined, *_findings(found)]))
 
 
 def _urdf(model: RobotModel, stated: Loops) -> Loops:
@@ -305,7 +312,9 @@ def _judge(found: Commanded) -> Verdict:
             f"open loops miss at most {100 * worst:.2g} % of the motion of any joint on logs kept "
             "apart, and less than the plainer models"
         ]
-    return Verdict(status, tuple(reasons), by_joint)
+    if found.alarms:
+        status, reasons = "poor", [*found.alarms, *(reasons if status != "good" else [])]
+    return Verdict(status, tuple(reasons), by_joint, alarms=found.alarms)
 
 
 def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) -> JointVerdict:
