@@ -82,8 +82,12 @@ def test_open_loops_beat_plainer_models(leg, found):
     np.testing.assert_allclose(run.command, np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0)))
     np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0)))
     assert list(run.horizons) == [0.1, 0.5, 2.0]
-    for error in run.horizons.values():
+    robot, loops = found.fitted.simulator.robot, found.fitted.loops
+    for horizon, error in run.horizons.items():
         assert (error < 3 * NOISE).all()
+        outs = robot.roll_out(loops, cut_windows(run.log, horizon, 0.0))
+        missed = np.concatenate([out.window.log.q[out.window.counted] - out.q for out in outs])
+        np.testing.assert_allclose(error, np.sqrt(np.mean(missed**2, axis=0)))
 
 
 def test_a_short_log_has_short_horizons_only(leg, found):
