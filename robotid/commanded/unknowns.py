@@ -8,6 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators.output_error import Residual
+from robotid.exceptions import NotConvergedError
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
@@ -17,6 +18,7 @@ __all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns"]
 
 _STARTS = 2  # steps towards better starts of windows ...
 _SHARES = (1.0, 0.3, 0.1)  # ... of which these are tried
+_TOLD = 1e-6  # what moves a window less, relative, is no direction of its start
 _POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
 #: Entries of the triangle that a body changes by: the logarithm of its mass' root, and its centre.
 _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
@@ -173,15 +175,20 @@ class LoopSimulator:
         windows = [replace(window, first=window.begin) for window in self.windows]
         for _ in range(_STARTS):
             outs = self.robot.roll_out(loops, windows, columns)
-            sigma = np.sqrt(np.mean(np.concatenate([_error(out) for out in outs]) ** 2, axis=0))
+            errors = np.concatenate([_error(out) for out in outs])
+            sigma = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)
             best = [float(np.sum((_error(out) / sigma) ** 2)) for out in outs]
             changes = [_better_start(out, sigma) for out in outs]
-            starts = [[w.start + share * x for share in _SHARES] for w, x in zip(windows, changes)]
-            resting = [np.stack([w.around, np.zeros(n)]) for w in windows]
-            tables = ((*own, rest) for own, rest in zip(starts, resting, strict=True))
-            for tries in zip(*tables, strict=True):
-                tried = [replace(w, given=x) for w, x in zip(windows, tries, strict=True)]
-                for k, out in enumerate(self.robot.roll_out(loops, tried)):
+            begun = list(zip(windows, changes, strict=True))
+            tries = [[w.start + share * x for w, x in begun] for share in _SHARES]
+            tries.append([np.stack([w.around, np.zeros(n)]) for w in windows])  # at rest
+            for starts in tries:
+                tried = [replace(w, given=x) for w, x in zip(windows, starts, strict=True)]
+                try:
+                    outs = self.robot.roll_out(loops, tried)
+                except NotConvergedError:
+                    continue  # these starts cannot be rolled out; others can
+                for k, out in enumerate(outs):
                     cost = float(np.sum((_error(out) / sigma) ** 2))
                     if cost < best[k]:
                         best[k], windows[k] = cost, tried[k]
@@ -322,7 +329,7 @@ def _better_start(out: RollOut, sigma: Array) -> Array:
     for joints, places, slopes in out.slopes:
         A = slopes / sigma[joints, None]
         b = _error(out)[:, joints] / sigma[joints]
-        change[places] = np.linalg.lstsq(A.reshape(b.size, -1), b.reshape(-1), rcond=None)[0]
+        change[places] = np.linalg.lstsq(A.reshape(b.size, -1), b.reshape(-1), rcond=_TOLD)[0]
     return change.reshape(2, -1)
 
 
