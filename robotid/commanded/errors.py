@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotid._typing import Array
-from robotid.commanded.fit import Fitted
 from robotid.exceptions import NotConvergedError
 from robotid.logs.data import Log
 from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
@@ -43,20 +42,28 @@ class OpenLoop:
     spread: Array
 
 
-def run_open_loop(log: Log, fitted: Fitted, urdf: Loops | None) -> OpenLoop:
+def run_open_loop(
+    robot: LoopedRobot,
+    loops: Loops,
+    log: Log,
+    *,
+    urdf: Loops | None = None,
+    plain: Loops | None = None,
+) -> OpenLoop:
     """Return how far open loops run from a log.
 
     Args:
-        log: The log, with commands, in the coordinates of the fit.
-        fitted: What the fit found.
+        robot: The robot.
+        loops: Its loops as they were identified.
+        log: The log, with commands, in the URDF's sense of the joints.
         urdf: The URDF with the stated gains, if they are known.
+        plain: The plain model, if there is one.
 
     Raises:
         NotConvergedError: If the identified robot cannot be rolled out.
     """
-    robot = fitted.simulator.robot
     q = np.full_like(log.q, np.nan)
-    for out in robot.roll_out(fitted.loops, cut_windows(log, np.inf, 0.0)):
+    for out in robot.roll_out(loops, cut_windows(log, np.inf, 0.0)):
         q[out.window.counted] = out.q
     told = log.q_ref - log.q
     return OpenLoop(
@@ -65,12 +72,11 @@ def run_open_loop(log: Log, fitted: Fitted, urdf: Loops | None) -> OpenLoop:
         rmse=np.sqrt(np.nanmean((log.q - q) ** 2, axis=0)),
         command=np.sqrt(np.mean(told**2, axis=0)),
         urdf=None if urdf is None else _error(robot, urdf, log, np.inf),
-        second_order=_error(robot, fitted.plain.loops, log, np.inf),
+        second_order=None if plain is None else _error(robot, plain, log, np.inf),
         horizons={
             h: error
             for h in HORIZONS
-            if h < log.t[-1] - log.t[0]
-            and (error := _error(robot, fitted.loops, log, h)) is not None
+            if h < log.t[-1] - log.t[0] and (error := _error(robot, loops, log, h)) is not None
         },
         spread=np.std(log.q, axis=0),
     )

@@ -105,8 +105,9 @@ def fit_loops(
     has_gain = _is_stated(loop.kp, model)
     usual = _usual(robot, plain, windows, has_gain)
     base = _begin(model, stated, plain, usual, finds_limit=loop.limit == "find")
+    weighs = settings.torques and all(log.has_torque for log in logs)
     # positions alone tell the sum of kd and viscous friction
-    tells_kd = all(log.v_ref is not None or log.has_torque for log in logs)
+    tells_kd = weighs or all(log.v_ref is not None for log in logs)
     unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=tells_kd)
     unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
@@ -116,7 +117,8 @@ def fit_loops(
     )
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
-    simulator = replace(simulator, torque=_torque_rows(model, base, logs))
+    if weighs:
+        simulator = replace(simulator, torque=_torque_rows(model, base, logs))
     few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
     begun = replace(estimator, rounds=1).fit(few, simulator.prior)
     theta = begun.theta
@@ -139,7 +141,8 @@ def fit_loops(
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, estimate.theta, taken)
-        simulator = replace(simulator, torque=_torque_rows(model, simulator.base, logs))
+        if weighs:
+            simulator = replace(simulator, torque=_torque_rows(model, simulator.base, logs))
         estimate = estimator.fit(simulator, theta)
     return Fitted(simulator, estimate, plain, encoders, tuple(tried), tuple(groups))
 
@@ -170,13 +173,11 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
     )
 
 
-def _torque_rows(model: RobotModel, base: Loops, logs: Sequence[Log]) -> TorqueRows | None:
-    """Return what the torques of logs come down to, if all have them, for the terms of loops.
+def _torque_rows(model: RobotModel, base: Loops, logs: Sequence[Log]) -> TorqueRows:
+    """Return what the torques of logs come down to, for the terms of loops.
 
     Their weight is that of rows as independent as the scatter of stretches shows them to be.
     """
-    if not all(log.has_torque for log in logs):
-        return None
     own = with_terms(model, base)
     found = identify(own, logs, friction="none", doctor=False)
     weight = found.wls.sigma * np.sqrt(max(found.errors.inflation, 1.0))

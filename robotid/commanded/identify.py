@@ -9,12 +9,13 @@ import numpy as np
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.errors import OpenLoop, run_open_loop
 from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_terms
+from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.term_choice import Tried
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
-from robotid.identification.verdict import JointVerdict, Verdict
+from robotid.identification.verdict import Verdict, alarming
 from robotid.logs.data import Log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -22,9 +23,6 @@ from robotid.simulation.loops import Loops
 
 __all__ = ["Commanded", "identify_commands", "with_gravity"]
 
-#: Share of its motion that the open loop of a joint misses on logs kept apart: well, not usable.
-GOOD, POOR = 0.05, 0.3
-_BEATEN = 1.05  # a plainer model that misses this many times less is better
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _FROM_PRIOR = 0.9  # ... above this share, what was assumed of it
 _TOGETHER = 0.98  # correlation from which two parameters are told together only
@@ -43,6 +41,7 @@ class Commanded:
         errors: Open loops on the fitted logs.
         kept: Open loops on logs kept apart.
         findings: What the user should know.
+        alarms: Faults of the logs that make the result wrong, as the doctor found them.
     """
 
     model: RobotModel
@@ -52,6 +51,7 @@ class Commanded:
     errors: tuple[OpenLoop, ...]
     kept: tuple[OpenLoop, ...]
     findings: tuple[Finding, ...]
+    alarms: tuple[str, ...] = ()
 
     @cached_property
     def standard(self) -> Array:
@@ -95,7 +95,13 @@ class Commanded:
     @cached_property
     def verdict(self) -> Verdict:
         """How far to trust it."""
-        return _judge(self)
+        return judge_open_loops(
+            self.model.joints,
+            self.kept or self.errors,
+            is_kept=bool(self.kept),
+            is_settled=self.fitted.estimate.converged,
+            alarms=self.alarms,
+        )
 
 
 def identify_commands(
@@ -106,6 +112,8 @@ def identify_commands(
     settings: SimulationSettings,
     *,
     chooses: bool = True,
+    examined: Sequence[Finding] = (),
+    ignore: Sequence[str] = (),
     progress: ProgressCallback = ignore_progress,
 ) -> Commanded:
     """Identify drives, loops and bodies from logs of commands and positions.
@@ -117,6 +125,8 @@ def identify_commands(
         loop: What is known of the loops.
         settings: The estimator's.
         chooses: Whether further friction is tried.
+        examined: What the doctor found in the logs.
+        ignore: Codes of its errors that you know better.
         progress: Told of the stages.
 
     Raises:
@@ -142,8 +152,15 @@ def identify_commands(
     urdf = _urdf(model, stated) if has_gains else None
     sign = fitted.encoders.sign
     runs = [
-        [run_open_loop(log.turned(sign), fitted, urdf) for log in part] for part in (logs, kept)
-    ]
+        [
+            run_open_loop(
+                fitted.simulator.robot, fitted.loops, log.turned(sign),
+                urdf=urdf, plain=fitted.plain.loops,
+            )
+            for log in part
+        ]
+        for part in (logs, kept)
+    ]  # fmt: skip
     found = Commanded(
         model=with_terms(model, fitted.loops),
         loop=loop,
@@ -151,9 +168,10 @@ def identify_commands(
         fitted=fitted,
         errors=tuple(runs[0]),
         kept=tuple(runs[1]),
-        findings=(),
+        findings=tuple(examined),
+        alarms=tuple(finding.message for finding in alarming(examined, ignore)),
     )
-    return replace(found, findings=by_severity(_findings(found)))
+    return replace(found, findings=by_severity([*examined, *_findings(found)]))
 
 
 def _urdf(model: RobotModel, stated: Loops) -> Loops:
@@ -277,68 +295,3 @@ def _encoder_findings(found: Commanded) -> Iterator[Finding]:
                 "its command. Calibrate it, or state the zero in the URDF",
                 {"zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j])},
             )
-
-
-def _judge(found: Commanded) -> Verdict:
-    """Return the verdict: by the open loop on kept logs, and by plainer models on the same."""
-    joints = found.model.joints
-    shown = found.kept or found.errors
-    by_joint = {
-        joint: _judge_joint(joint, j, shown, bool(found.kept)) for j, joint in enumerate(joints)
-    }
-    rank = {"poor": 0, "not evaluated": 1, "usable": 2, "good": 3}
-    status = min((v.status for v in by_joint.values()), key=rank.__getitem__)
-    reasons = [
-        reason
-        for verdict in sorted(by_joint.values(), key=lambda v: rank[v.status])
-        if verdict.status != "good"
-        for reason in verdict.reasons
-    ]
-    if not found.fitted.estimate.converged:
-        reasons.insert(0, "the fit has not settled")
-        status = min(status, "usable", key=rank.__getitem__)
-    if not found.kept:
-        reasons.insert(0, "no log was kept apart: nothing tests the open loop; add [[validation]]")
-    if status == "good":
-        worst = max(_share(shown, j) for j in range(len(joints)))
-        reasons = [
-            f"open loops miss at most {100 * worst:.2g} % of the motion of any joint on logs kept "
-            "apart, and less than the plainer models"
-        ]
-    return Verdict(status, tuple(reasons), by_joint)
-
-
-def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) -> JointVerdict:
-    """Return the verdict on one joint, by all logs together."""
-    share = _share(runs, j)
-    said = f"{joint}: the open loop misses {100 * share:.2g} % of its motion"
-    beaten = [
-        name
-        for name, others in (
-            ("the command itself", [run.command for run in runs]),
-            ("the plain model of second order", [run.second_order for run in runs]),
-            ("the URDF with the stated gains", [run.urdf for run in runs]),
-        )
-        if all(other is not None for other in others)
-        and _mean(run.rmse[j] for run in runs)
-        > _BEATEN * _mean(other[j] for other in others if other is not None)
-    ]
-    if beaten:
-        said += f"; {listed(beaten)} misses less"
-    if not is_kept:
-        return JointVerdict("not evaluated", (said,))
-    if share > POOR or "the command itself" in beaten:
-        return JointVerdict("poor", (said,))
-    if share > GOOD or beaten:
-        return JointVerdict("usable", (said,))
-    return JointVerdict("good", (said,))
-
-
-def _share(runs: Sequence[OpenLoop], j: int) -> float:
-    """Return the share of a joint's motion that open loops miss, all logs together."""
-    return _mean(run.rmse[j] for run in runs) / max(_mean(run.spread[j] for run in runs), 1e-12)
-
-
-def _mean(values: Iterator[float]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(list(values)))))

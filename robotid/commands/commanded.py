@@ -8,11 +8,13 @@ from robotid._typing import ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.fit import STAGES
 from robotid.commanded.identify import Commanded, identify_commands, with_gravity
 from robotid.commands.job import Job, LogEntry
+from robotid.doctor.diagnosis import diagnose
 from robotid.exceptions import SettingsError
 from robotid.export.result import Result, build_commanded
 from robotid.export.urdf import write_urdf
 from robotid.identification.advice import Origin
 from robotid.identification.settings import SimulationSettings
+from robotid.identification.verdict import check_ignored
 from robotid.logs.data import Log
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.robot.drives import AUTO
@@ -51,9 +53,11 @@ def run_commanded(
         [job.read(entry, model, needs="commands") for entry in entries]
         for entries in (job.identification, job.validation)
     )
+    check_ignored(job.ignore)
     found = identify_commands(
-        model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms, progress=told
-    )
+        model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms,
+        examined=diagnose(model, logs, kept, job.signals), ignore=job.ignore, progress=told,
+    )  # fmt: skip
     report_stage(told, "writing", STAGES)
     outputs = {"urdf": name, "sidecar": sidecar} | ({"report": "report.html"} if job.report else {})
     content = build_commanded(found, job.to_dict(), outputs)

@@ -169,17 +169,9 @@ def _print_commanded(result: dict[str, Any], *, is_verbose: bool) -> None:
         f"\n{result['robot']}: {len(result['joints'])} joints, {fit['parameters']} unknowns; "
         f"{fit['message']}"
     )
-    kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
-             "command_rmse": "command"}  # fmt: skip
     for role, words in (("identification", "fitted"), ("validation", "not fitted")):
         for run in found[role]:
-            say(f"\n{words}: {_window(Path(run['log']).name or 'log', run)}, position missed", "  ")
-            rows = []
-            for joint, own in run["per_joint"].items():
-                sizes = (own[key] for key in kinds)
-                shown = ("-" if x is None else f"{1e3 * x:.2f}" for x in sizes)
-                rows.append((joint, *shown, f"m{own['unit']}"))
-            print("\n".join(columns(("joint", *kinds.values(), ""), rows)))
+            _print_open_loop(run, f"{words}: ")
     rows = []
     for entry in result["drive_parameters"]:
         error = entry["std_error"]
@@ -189,6 +181,20 @@ def _print_commanded(result: dict[str, Any], *, is_verbose: bool) -> None:
     print("\n" + "\n".join(columns(heads, rows)) + "\n")
     _print_causes(result["warnings"], result["joints"], is_verbose=is_verbose)
     _print_verdict(result["verdict"])
+
+
+def _print_open_loop(run: Mapping[str, Any], before: str = "") -> None:
+    """Print how far open loops run from a log, beside plainer models."""
+    kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
+             "command_rmse": "command"}  # fmt: skip
+    joints = run["per_joint"]
+    kinds = {k: v for k, v in kinds.items() if any(own[k] is not None for own in joints.values())}
+    say(f"\n{before}{_window(Path(run['log']).name or 'log', run)}, position missed", "  ")
+    rows = []
+    for joint, own in joints.items():
+        shown = ("-" if own[key] is None else f"{1e3 * own[key]:.2f}" for key in kinds)
+        rows.append((joint, *shown, f"m{own['unit']}"))
+    print("\n".join(columns(("joint", *kinds.values(), ""), rows)))
 
 
 def _recordings(inputs: Sequence[Mapping[str, Any]], role: str) -> list[str]:
@@ -234,6 +240,9 @@ def _print_validation(found: dict[str, Any]) -> None:
 
     say(f"predicted with {found['predicted_with']}")
     for recording in found["validation"]:
+        if "horizons" in recording:
+            _print_open_loop(recording)
+            continue
         say(f"\n{recording['name']}", "  ")
         print("\n".join(error_lines(recording, width=terminal_width())))
     _print_verdict(found["verdict"])

@@ -5,12 +5,20 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from robotid._files import file_sha256
+from robotid.commanded.errors import run_open_loop
+from robotid.commanded.open_loop_verdict import judge_open_loops
+from robotid.commands.commanded import log_of_commands
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import diagnose
+from robotid.export.commanded import loops_of
 from robotid.export.result import (
+    Result,
     load_result,
+    open_loop_entry,
     recording_metrics,
     stated_model,
     stated_parameters,
@@ -29,6 +37,7 @@ from robotid.identification.survey import SurveyedLog
 from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot
 
 __all__ = ["validate_result"]
 
@@ -55,6 +64,8 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
     result = loaded.content
     settings = {key: value for key, value in result["settings"].items() if value != {}}
     job = job_from_settings(settings, Path(path).name, Path())
+    if "simulation" in result:
+        return _validate_commands(loaded, job, [LogEntry(Path(log)) for log in logs])
     source = stated_model(result, job.model())
     if loaded.has_urdf:
         model, pi = loaded.identified
@@ -70,6 +81,29 @@ def validate_result(path: str | Path, logs: Sequence[str | Path]) -> dict[str, A
         "result": str(path),
         "predicted_with": result["outputs"].get("urdf", "base parameters of result.json"),
         "validation": [recording_metrics(e, "estimate") for e in evaluations],
+        "verdict": verdict.to_dict(),
+    }
+
+
+def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) -> dict[str, Any]:
+    """Measure how far the open loops of a result run from other logs of commands."""
+    model, pi = loaded.identified
+    drives, signs = loaded.commanded, loaded.content["simulation"]["signs"]
+    sign = np.array([signs[joint] for joint in model.joints])
+    robot, runs, logs = LoopedRobot(model), [], []
+    for entry in entries:
+        logs.append(log_of_commands(job, entry, loaded))
+        runs.append(run_open_loop(robot, loops_of(model, pi, drives), logs[-1].turned(sign)))
+    hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
+    is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
+    alarms = alarming(diagnose(model, (), logs, job.signals), job.ignore)
+    verdict = judge_open_loops(
+        model.joints, runs, is_kept=is_kept, alarms=[finding.message for finding in alarms]
+    )
+    return {
+        "result": str(loaded.path),
+        "predicted_with": loaded.content["outputs"]["urdf"],
+        "validation": [open_loop_entry(model, run) for run in runs],
         "verdict": verdict.to_dict(),
     }
 

@@ -46,6 +46,7 @@ __all__ = [
     "build_preview",
     "build_result",
     "load_result",
+    "open_loop_entry",
     "read_result",
     "recording_metrics",
     "stated_model",
@@ -223,8 +224,8 @@ def build_commanded(
                 "correlation": [float(rho) for rho in estimate.details["correlation"]],
             },
             "friction_tried": [dataclasses.asdict(tried) for tried in found.fitted.tried],
-            "identification": [_open_loop(found, run) for run in found.errors],
-            "validation": [_open_loop(found, run) for run in found.kept],
+            "identification": [open_loop_entry(found.model, run) for run in found.errors],
+            "validation": [open_loop_entry(found.model, run) for run in found.kept],
         },
         "warnings": [
             {"code": f.code, "severity": f.severity, "message": f.message, "where": f.where}
@@ -353,26 +354,30 @@ def _commanded_joint(found: Commanded, runs: Sequence[OpenLoop], j: int) -> dict
     return {"relative_error_pct": share, "rmse": rmse, "unit": _unit_of(found, j)}
 
 
-def _open_loop(found: Commanded, run: OpenLoop) -> dict[str, Any]:
-    """Return the errors of open loops on one log, joint by joint and by horizon."""
+def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
+    """Return the errors of open loops on one log, joint by joint and by horizon.
+
+    Args:
+        model: The robot.
+        run: The open loops beside the log.
+    """
     others = {
         "command_rmse": run.command, "urdf_rmse": run.urdf, "second_order_rmse": run.second_order
     }  # fmt: skip
-    joints = found.model.joints
     return {
         "log": run.log.path,
         "start": float(run.log.t[0]),
         "end": float(run.log.t[-1]),
         "per_joint": {
-            joint: {
+            joint.name: {
                 "rmse": float(run.rmse[j]),
-                "unit": _unit_of(found, j),
+                "unit": "m" if joint.type == "prismatic" else "rad",
                 **{key: None if x is None else float(x[j]) for key, x in others.items()},
             }
-            for j, joint in enumerate(joints)
+            for j, joint in enumerate(model.limits)
         },
         "horizons": {
-            f"{h:g}": dict(zip(joints, map(float, errors), strict=True))
+            f"{h:g}": dict(zip(model.joints, map(float, errors), strict=True))
             for h, errors in run.horizons.items()
         },
     }

@@ -358,6 +358,9 @@ class SimulationSettings(EstimatorSettings):
         "plausible relative error of the URDF's bodies, by which they may change; 0: they stay",
         within=_NOT_NEGATIVE,
     )
+    torques: bool = setting(
+        True, "whether torques weigh beside the positions, where all logs have them"
+    )
     whiten: bool = setting(
         True, "whether the correlation of the residuals is estimated and taken out"
     )

@@ -1,0 +1,93 @@
+"""The verdict on drives found from commands: how far open loops run, beside plainer models."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from robotid.commanded.errors import OpenLoop
+from robotid.findings import listed
+from robotid.identification.verdict import JointVerdict, Verdict
+
+__all__ = ["GOOD", "POOR", "judge_open_loops"]
+
+#: Share of its motion that the open loop of a joint misses on logs kept apart: well, not usable.
+GOOD, POOR = 0.05, 0.3
+_BEATEN = 1.05  # a plainer model that misses this many times less is better
+
+
+def judge_open_loops(
+    joints: Sequence[str],
+    runs: Sequence[OpenLoop],
+    *,
+    is_kept: bool,
+    is_settled: bool = True,
+    alarms: Sequence[str] = (),
+) -> Verdict:
+    """Return the verdict: by open loops on logs kept apart, and by plainer models on the same.
+
+    Args:
+        joints: Names of the n joints.
+        runs: Open loops beside logs.
+        is_kept: Whether the logs were kept apart from the fit.
+        is_settled: Whether the fit has settled.
+        alarms: Faults of the logs that make the result wrong.
+    """
+    by_joint = {joint: _judge_joint(joint, j, runs, is_kept) for j, joint in enumerate(joints)}
+    rank = {"poor": 0, "not evaluated": 1, "usable": 2, "good": 3}
+    status = min((v.status for v in by_joint.values()), key=rank.__getitem__)
+    reasons = [
+        reason
+        for verdict in sorted(by_joint.values(), key=lambda v: rank[v.status])
+        if verdict.status != "good"
+        for reason in verdict.reasons
+    ]
+    if not is_settled:
+        reasons.insert(0, "the fit has not settled")
+        status = min(status, "usable", key=rank.__getitem__)
+    if not is_kept:
+        reasons.insert(0, "no log was kept apart: nothing tests the open loop; add [[validation]]")
+    if status == "good":
+        worst = max(_share(runs, j) for j in range(len(joints)))
+        reasons = [
+            f"open loops miss at most {100 * worst:.2g} % of the motion of any joint on logs kept "
+            "apart, and less than plainer models"
+        ]
+    if alarms:
+        status, reasons = "poor", [*alarms, *(reasons if status != "good" else [])]
+    return Verdict(status, tuple(reasons), by_joint, alarms=tuple(alarms))
+
+
+def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) -> JointVerdict:
+    """Return the verdict on one joint, by all logs together."""
+    share = _share(runs, j)
+    said = f"{joint}: the open loop misses {100 * share:.2g} % of its motion"
+    beaten = [
+        name
+        for name, others in (
+            ("the command itself", [run.command for run in runs]),
+            ("the plain model of second order", [run.second_order for run in runs]),
+            ("the URDF with the stated gains", [run.urdf for run in runs]),
+        )
+        if all(other is not None for other in others)
+        and _mean(run.rmse[j] for run in runs)
+        > _BEATEN * _mean(other[j] for other in others if other is not None)
+    ]
+    if beaten:
+        said += f"; {listed(beaten)} misses less"
+    if not is_kept:
+        return JointVerdict("not evaluated", (said,))
+    if share > POOR or "the command itself" in beaten:
+        return JointVerdict("poor", (said,))
+    if share > GOOD or beaten:
+        return JointVerdict("usable", (said,))
+    return JointVerdict("good", (said,))
+
+
+def _share(runs: Sequence[OpenLoop], j: int) -> float:
+    """Return the share of a joint's motion that open loops miss, all logs together."""
+    return _mean(run.rmse[j] for run in runs) / max(_mean(run.spread[j] for run in runs), 1e-12)
+
+
+def _mean(values: Iterable[float]) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(list(values)))))
