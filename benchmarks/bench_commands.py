@@ -315,8 +315,9 @@ def so101():
 
 def rollouts(seconds):
     """Print how many roll-outs of a second are done in a second; return the figures."""
-    print("| robot, 1 kHz | roll-outs per second: robotid, 1 thread | 2 threads | MuJoCo, 1 thread |"
-          " 2 threads | robotid over MuJoCo | gradient, roll-outs | by parameters |")  # fmt: skip
+    print("| robot, 1 kHz | roll-outs in a second: robotid, 1 thread | 2 threads "
+          "| MuJoCo, 1 thread | 2 threads "
+          "| robotid over MuJoCo | gradient, roll-outs | by parameters |")  # fmt: skip
     print("|---" * 8 + "|")
     rows = []
     for name in ("arm", "quadruped"):

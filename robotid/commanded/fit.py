@@ -40,6 +40,7 @@ _LEAST = 0.05  # of a usual size, that an inertia begins with, or a gain keeps
 _LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins with
 _WHITE = 2.0  # whitening ends at so many times the rate at which a loop follows
 _FEW = 12  # windows that are fitted first, of many
+_STARTS = 3  # fits with better starts of the windows
 _PASSES = 2  # of choosing terms and fitting again
 
 
@@ -120,7 +121,11 @@ def fit_loops(
         simulator = replace(simulator, torque=_torque_rows(model, base, logs))
     few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
     begun = replace(estimator, rounds=1).fit(few, simulator.prior)
-    estimate = estimator.fit(simulator, begun.theta)
+    theta = begun.theta
+    for _ in range(_STARTS):
+        simulator = simulator.begun_better(theta)
+        estimate = estimator.fit(simulator, theta)
+        theta = estimator.joint_step(simulator, estimate.theta)
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
         report_stage(progress, "trying friction", STAGES)

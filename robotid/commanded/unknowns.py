@@ -8,6 +8,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.estimators.output_error import Residual
+from robotid.exceptions import NotConvergedError
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
@@ -15,6 +16,9 @@ from robotid.simulation.loops import LoopedRobot, Loops, RollOut, Window
 
 __all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns"]
 
+_STARTS = 2  # steps towards better starts of windows ...
+_SHARES = (1.0, 0.3, 0.1)  # ... of which these are tried
+_TOLD = 1e-6  # what moves a window less, relative, is no direction of its start
 _POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
 #: Entries of the triangle that a body changes by: the logarithm of its mass' root, and its centre.
 _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
@@ -156,6 +160,41 @@ class LoopSimulator:
         """
         return self.robot.roll_out(self.loops(theta), self.windows if windows is None else windows)
 
+    def begun_better(self, theta: Array) -> "LoopSimulator":
+        """Return the same with windows whose starts fit best: measured ones have noise.
+
+        Friction may hold for long what is wrong at the start, so that a lead is not enough.
+
+        Args:
+            theta: Values of the unknowns, shape (c,).
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        n, loops, columns = len(self.base.kp), self.loops(theta), self._starts()
+        windows = [replace(window, first=window.begin) for window in self.windows]
+        for _ in range(_STARTS):
+            outs = self.robot.roll_out(loops, windows, columns)
+            errors = np.concatenate([_error(out) for out in outs])
+            sigma = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)
+            best = [float(np.sum((_error(out) / sigma) ** 2)) for out in outs]
+            changes = [_better_start(out, sigma) for out in outs]
+            begun = list(zip(windows, changes, strict=True))
+            tries = [[w.start + share * x for w, x in begun] for share in _SHARES]
+            tries.append([np.stack([w.around, np.zeros(n)]) for w in windows])  # at rest
+            for starts in tries:
+                tried = [replace(w, given=x) for w, x in zip(windows, starts, strict=True)]
+                try:
+                    outs = self.robot.roll_out(loops, tried)
+                except NotConvergedError:
+                    continue  # these starts cannot be rolled out; others can
+                for k, out in enumerate(outs):
+                    cost = float(np.sum((_error(out) / sigma) ** 2))
+                    if cost < best[k]:
+                        best[k], windows[k] = cost, tried[k]
+        kept = zip(self.windows, windows, strict=True)
+        return replace(self, windows=tuple(replace(w, given=new.start) for w, new in kept))
+
     def rows(self, theta: Array) -> tuple[Array, Array]:
         """Return what measured torques leave, and what lowers it; see ``Simulator``.
 
@@ -215,10 +254,14 @@ class LoopSimulator:
             return [Residual(_error(out), None, everything, none) for out in self.roll_out(theta)]
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns, owners = self._columns(loops)
+        count = len(columns)
+        columns += self._starts()
         found = []
         for out in self.robot.roll_out(loops, self.windows, columns, directions):
             error = _error(out)
             for joints, places, slopes in out.slopes:
+                by_start = slopes[:, :, places >= count]
+                slopes, places = slopes[:, :, places < count], places[places < count]
                 own = np.unique(owners[places])
                 if len(own) < len(places):  # a column of each joint that shares it
                     shared = np.zeros((len(places), len(own)))
@@ -226,8 +269,13 @@ class LoopSimulator:
                     slopes = slopes @ shared
                 else:
                     slopes = slopes[:, :, np.argsort(owners[places])]
-                found.append(Residual(error[:, joints], slopes, joints, own))
+                found.append(Residual(error[:, joints], slopes, joints, own, by_start))
         return found
+
+    def _starts(self) -> list[tuple[int, int, int]]:
+        """Return the columns of positions and speeds where windows begin."""
+        kinds, n = self.robot.kinds, len(self.base.kp)
+        return [(kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
 
     def _columns(self, loops: Loops) -> tuple[list[tuple[int, int, int]], Array]:
         """Return what to differentiate by, and the unknown that each column is of."""
@@ -273,6 +321,16 @@ class LoopSimulator:
                 half = U @ change @ T.T @ U.T
                 directions.append(inertial_from_pseudo_inertia(half + half.T))
         return bodies, np.array(directions).reshape(-1, 10)
+
+
+def _better_start(out: RollOut, sigma: Array) -> Array:
+    """Return by how much position and speed at the start are off, to first order, shape (2, n)."""
+    change = np.zeros(2 * len(sigma))
+    for joints, places, slopes in out.slopes:
+        A = slopes / sigma[joints, None]
+        b = _error(out)[:, joints] / sigma[joints]
+        change[places] = np.linalg.lstsq(A.reshape(b.size, -1), b.reshape(-1), rcond=_TOLD)[0]
+    return change.reshape(2, -1)
 
 
 def _error(out: RollOut) -> Array:

@@ -27,6 +27,7 @@ _SETTLED = 2e-2  # ... until they change by less than that
 _ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends a round, and the last one
 _TOO_STIFF = 1e10  # damping at which no step lowers the cost any more
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
+_NO_TRACE = 1e-3  # noise levels that a start moves a window by, below which it is no matter
 _STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
 _LOST = 1e-6  # share of its prior's variance, below which a direction's gain in knowledge is none
 
@@ -40,12 +41,15 @@ class Residual:
         slopes: Derivatives of the simulated output, shape (N, k, c'); None if not asked for.
         joints: Which joints, shape (k,).
         columns: Which parameters, shape (c',).
+        by_start: Derivatives by where the window's own simulation starts, shape (N, k, s); None if
+            that is known.
     """
 
     e: Array
     slopes: Array | None
     joints: Array
     columns: Array
+    by_start: Array | None = None
 
 
 class Simulator(Protocol):
@@ -187,11 +191,23 @@ class OutputError:
         cost += float(np.sum(simulator.rows(theta)[1] ** 2))
         return cost if np.isfinite(cost) else np.inf
 
-    def _normal(self, simulator: Simulator, weights: _Weights, theta: Array) -> tuple[Array, Array]:
+    def joint_step(self, simulator: Simulator, theta: Array) -> Array:
+        """Return the parameters after a step that moves them and the starts of windows together.
+
+        Args:
+            simulator: What rolls out.
+            theta: Parameters that fit best with the starts as they are, shape (c,).
+        """
+        H, g = self._normal(simulator, self.weights(simulator, theta), theta, frees=True)
+        return _bounded_step(H, g, theta, simulator.lowest, 0.0)
+
+    def _normal(
+        self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
+    ) -> tuple[Array, Array]:
         """Return H = A'A and A'b of the linearised problem, prior included."""
         tau = 1.0 / simulator.prior_std**2
         H, g = np.diag(tau), tau * (simulator.prior - theta)
-        for A, b, columns in linearised(simulator, weights, theta):
+        for A, b, columns in linearised(simulator, weights, theta, frees=frees):
             H[np.ix_(columns, columns)] += A.T @ A
             g[columns] += A.T @ b
         A, b = simulator.rows(theta)
@@ -235,7 +251,7 @@ class OutputError:
         rounds: int,
     ) -> Estimate:
         """Return the estimate, its errors from how much the scores of stretches scatter."""
-        H, _ = self._normal(simulator, weights, theta)
+        H, _ = self._normal(simulator, weights, theta, frees=True)
         known = 1.0 / simulator.prior_std**2
         scale = 1.0 / np.sqrt(np.diag(H))
         values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
@@ -296,7 +312,7 @@ def _rho_change(before: _Weights, after: _Weights) -> float:
 
 
 def linearised(
-    simulator: Simulator, weights: _Weights, theta: Array
+    simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
 ) -> Iterable[tuple[Array, Array, Array]]:
     """Yield rows A, b and their columns, whitened, window by window and part by part.
 
@@ -304,11 +320,18 @@ def linearised(
         simulator: What rolls out.
         weights: As of ``OutputError.weights``.
         theta: Parameters, shape (c,).
+        frees: Whether what the start of a window could do is taken out of its rows.
     """
     for r in simulator.residuals(theta, with_slopes=True):
         b = weights.whiten(r.e, r.joints)
-        A = weights.whiten(_given(r), r.joints)
-        yield A.reshape(b.size, -1), b.reshape(-1), r.columns
+        A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
+        b = b.reshape(-1)
+        if frees and r.by_start is not None:
+            G = weights.whiten(r.by_start, r.joints).reshape(b.size, -1)
+            U, sizes, _ = np.linalg.svd(G, full_matrices=False)
+            U = U[:, sizes > _NO_TRACE]
+            A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
+        yield A, b, r.columns
 
 
 def _given(r: Residual) -> Array:
@@ -336,7 +359,7 @@ def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: floa
 
 def _stretches(simulator: Simulator, weights: _Weights, theta: Array) -> list[Factors]:
     """Return the factors of the whitened rows, stretch by stretch."""
-    found = list(linearised(simulator, weights, theta))
+    found = list(linearised(simulator, weights, theta, frees=True))
     c, total = len(theta), sum(len(b) for _, b, _ in found)
     stretches: list[Factors] = []
     for A, b, columns in found:

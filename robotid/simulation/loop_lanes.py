@@ -29,6 +29,8 @@ __all__ = [
     "LATE",
     "LIMIT",
     "LOAD",
+    "SPEED",
+    "START",
     "TERM",
     "ZERO",
     "average_command",
@@ -43,7 +45,7 @@ _NEWTON = 60  # steps, of which three or four are usual
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
 # kinds of sensitivities
-ARMATURE, KP, KD, LIMIT, TERM, LATE, ZERO, INERTIAL = range(8)
+ARMATURE, KP, KD, LIMIT, TERM, LATE, ZERO, INERTIAL, START, SPEED = range(10)
 LOAD = 9  # code of the term that multiplies the load of the gear
 
 _R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
@@ -678,6 +680,12 @@ def roll_out(
             _put(work, q + i, lane, start[0, i, lane])
             _put(work, v + i, lane, start[1, i, lane])
             _put(work, u + i, lane, start[1, i, lane])
+        for p in range(P):
+            if columns[p, 0] == START or columns[p, 0] == SPEED:
+                row = columns[p, 1] + (n if columns[p, 0] == SPEED else 0)
+                _put(work, S + row * P + p, lane, 1.0)
+                if columns[p, 0] == START:
+                    out_S[0, columns[p, 1], p, lane] = 1.0
     for k in range(len(steps)):
         step = steps[k]
         for i in range(n):

@@ -99,25 +99,40 @@ class Window:
         begin: Sample at which the roll-out begins.
         first: First sample that counts; those before let what is wrong at the start die away.
         stop: Sample after the last one.
+        given: Position and speed where it begins, shape (2, n); those measured if None.
     """
 
     log: Log
     begin: int
     first: int
     stop: int
+    given: Array | None = None
 
     @property
     def counted(self) -> slice:
         """The samples that count."""
         return slice(self.first, self.stop)
 
+    @property
+    def around(self) -> Array:
+        """Mean position about where it begins, shape (n,): that of a joint at rest."""
+        mean: Array = self.log.q[self._near].mean(axis=0)
+        return mean
+
+    @property
+    def _near(self) -> slice:
+        """The samples about where it begins."""
+        dt = float(np.median(np.diff(self.log.t)))
+        wide = max(_FEWEST, round(_AROUND / dt))
+        return slice(max(self.begin - wide, 0), min(self.begin + wide + 1, len(self.log.t)))
+
     @cached_property
     def start(self) -> Array:
         """Position and speed where it begins, shape (2, n)."""
+        if self.given is not None:
+            return self.given
         t, q, k = self.log.t, self.log.q, self.begin
-        dt = float(np.median(np.diff(t)))
-        wide = max(_FEWEST, round(_AROUND / dt))
-        near = slice(max(k - wide, 0), min(k + wide + 1, len(t)))
+        near = self._near
         along, order = t[near] - t[k], min(2, len(t[near]) - 1)
         fit = np.polynomial.polynomial.polyfit(along, q[near], order)
         return np.stack([q[k], fit[1]])
@@ -221,6 +236,8 @@ class LoopedRobot:
             "delay": lanes.LATE,
             "zero": lanes.ZERO,
             "body": lanes.INERTIAL,
+            "start": lanes.START,
+            "speed": lanes.SPEED,
         }
 
     @property

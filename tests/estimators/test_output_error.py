@@ -1,4 +1,5 @@
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -171,6 +172,23 @@ def test_fewer_samples_than_parameters_are_refused(rng):
     short = replace(lag, told=lag.told[:, :2], measured=lag.measured[:, :2])
     with pytest.raises(DataError, match=r"2 samples of position for 3 parameters"):
         OutputError(whitens=False).fit(short, START)
+
+
+def test_what_a_start_could_do_is_taken_out_of_rows(rng):
+    lag = lagging(rng)
+    [first, *others] = lag.residuals(TRUTH, with_slopes=True)
+    fades = 0.9 ** np.arange(len(first.e))
+    by_start = np.tile(fades[:, None, None], (1, first.e.shape[1], 1))
+    weights = OutputError().weights(lag, TRUTH)
+    freed = SimpleNamespace(residuals=lambda *_, **__: [replace(first, by_start=by_start), *others])
+    A, b, _ = next(iter(linearised(freed, weights, TRUTH, frees=True)))
+    G = weights.whiten(by_start, first.joints).reshape(-1)
+    size = np.linalg.norm(G)
+    assert np.abs(G @ A).max() < 1e-9 * size * np.linalg.norm(A)
+    plain, e, _ = next(iter(linearised(lag, weights, TRUTH)))
+    u = G / size
+    np.testing.assert_allclose(A, plain - np.outer(u, u @ plain), atol=1e-9 * np.abs(plain).max())
+    np.testing.assert_allclose(b, e - u * (u @ e), atol=1e-9 * np.abs(e).max())
 
 
 def test_what_is_linearised_is_whitened(rng):

@@ -265,6 +265,23 @@ def test_a_window_begins_with_the_slope_of_what_was_measured(planar):
     np.testing.assert_allclose(v, [0.5 - 0.6 * 0.1, -5 * np.sin(0.5)], rtol=1e-2)
 
 
+def test_sensitivities_by_the_start_are_those_of_differences(legs):
+    robot, loops, n = LoopedRobot(legs), loops_of(legs, TERMS), len(legs.joints)
+    [window] = cut_windows(commanded(legs, 0.2), np.inf, 0.0)
+    columns = [(robot.kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
+    [out] = robot.roll_out(loops, [window], columns)
+    h = 1e-7
+    for joints, places, slopes in out.slopes:
+        for c, p in enumerate(places):
+            step = np.zeros(2 * n)
+            step[p] = h
+            ends = [replace(window, given=window.start + s * step.reshape(2, n)) for s in (1, -1)]
+            up, down = robot.roll_out(loops, ends)
+            exact = (up.q - down.q)[:, joints] / (2 * h)
+            np.testing.assert_allclose(slopes[:, :, c], exact, atol=1e-5)
+            assert np.abs(exact).max() > 1e-3
+
+
 def test_lanes_know_nothing_of_each_other(legs):
     log = commanded(legs, 0.5)
     robot, windows = LoopedRobot(legs), cut_windows(log, 0.042, 0.01)

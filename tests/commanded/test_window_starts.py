@@ -1,0 +1,42 @@
+from dataclasses import replace
+
+import numpy as np
+from helpers.mujoco_plant import multisine, plant
+
+from robotid.commanded.unknowns import LoopSimulator, Unknown
+from robotid.export.commanded import loops_of
+from robotid.logs.data import Log
+from robotid.simulation.loops import LoopedRobot, cut_windows
+
+NOISE = 3e-4  # [rad]
+
+
+def simulator(rng):
+    """Return windows of a roll-out with noise, without a lead, and where they began in truth."""
+    arm = plant("planar", rng, delay=0.006)
+    pi, names = arm.model.standard_parameters(), arm.model.layout.names
+    for drive in arm.drives:
+        for term in ("armature", "viscous", "coulomb"):
+            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
+    t = np.arange(750) / 250.0
+    q_ref = multisine(t, arm.middle, arm.reach, rng)
+    log = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
+    robot, loops = LoopedRobot(arm.model, step=4e-3), loops_of(arm.model, pi, arm.drives)
+    [out] = robot.roll_out(loops, cut_windows(log, np.inf, 0.0))
+    noisy = replace(log, q=out.q + NOISE * rng.standard_normal(out.q.shape))
+    unknown = Unknown("delay", "delay", (0, 1), 0.006, 0.1)
+    windows = cut_windows(noisy, 1.0, 0.0)
+    truth = np.array([[out.q[w.begin], out.v[w.begin]] for w in windows])
+    return LoopSimulator(robot, windows, loops, (unknown,)), truth
+
+
+def test_starts_that_fit_are_nearer_to_the_truth_than_those_measured(rng):
+    measured, truth = simulator(rng)
+    better = measured.begun_better(measured.prior)
+    before, after = (np.array([w.start for w in one.windows]) - truth for one in (measured, better))
+    assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
+    left = np.concatenate([r.e for r in better.residuals(measured.prior, with_slopes=False)])
+    assert np.sqrt(np.mean(left**2)) < 1.2 * NOISE
+    assert [(w.begin, w.first, w.stop) for w in better.windows] == [
+        (w.begin, w.first, w.stop) for w in measured.windows
+    ]
