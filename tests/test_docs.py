@@ -61,6 +61,18 @@ def test_the_page_of_the_job_file_is_what_the_settings_say(tmp_path):
     assert job.identification == (LogEntry(tmp_path / "first.csv", 0.5, 30.0),)
 
 
+def test_the_job_of_commands_and_positions_is_accepted(tmp_path):
+    page = (DOCS / "commands_and_positions.md").read_text()
+    text = re.search(r"<!-- example -->\n```toml\n(.*?)```", page, re.DOTALL).group(1)
+    job = job_from_settings(tomllib.loads(text), "job.toml", tmp_path)
+    assert job.estimator.name == "simulation"
+    assert (job.controller.kp, job.controller.kd) == (20.0, 1.5)
+    for key in re.findall(
+        r"`(\w+)(?: = \"find\")?`", page.partition("What is not stated")[2][:500]
+    ):
+        assert f"controller.{key}" in Job.paths(), key
+
+
 def test_the_page_on_simulation_says_what_the_settings_say_and_runs(tmp_path, monkeypatch, ur5):
     page = (DOCS / "simulating.md").read_text()
     written = runpy.run_path(str(DOCS / "make_job_file.py"))["simulating"]()

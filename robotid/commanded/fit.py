@@ -135,8 +135,9 @@ def fit_loops(
             if set_[0].name not in simulator.names
         ]
         wide, theta = _with(simulator, estimate.theta, offered)
-        tried = choose(wide, theta, offered, estimator)
-        taken = [set_ for set_, t in zip(offered, tried, strict=True) if t.is_chosen]
+        found = choose(wide, theta, offered, estimator)
+        tried = [*(t for t in tried if t.is_chosen), *found]
+        taken = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
         if not taken:
             break
         report_stage(progress, "fitting loops", STAGES)

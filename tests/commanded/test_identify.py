@@ -1,0 +1,182 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import multisine, plant, recorded
+
+from robotid.commanded.fit import stated_loops
+from robotid.commanded.identify import identify_commands
+from robotid.commanded.settings import LoopSettings
+from robotid.exceptions import DataError
+from robotid.identification.settings import SimulationSettings
+from robotid.logs.data import Log
+from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Viscous
+from robotid.simulation.loops import LoopedRobot, cut_windows
+
+NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
+SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=1e-3)
+
+
+def stated(robot, **changes):
+    drives = robot.drives
+    gains = {"kp": {d.joint: d.kp for d in drives}, "kd": {d.joint: d.kd for d in drives}}
+    return LoopSettings(**(gains | changes))
+
+
+@pytest.fixture(scope="module")
+def leg():
+    """A leg of a Go2 in MuJoCo, a log to fit and one kept apart."""
+    rng = np.random.default_rng(4)
+    robot = plant("leg", rng)
+    return robot, *(recorded(robot, rng, duration=d, noise=NOISE)[0] for d in (8.0, 4.0))
+
+
+@pytest.fixture(scope="module")
+def found(leg):
+    robot, log, kept = leg
+    return identify_commands(robot.model, [log], [kept], stated(robot), SETTINGS, chooses=False)
+
+
+def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
+    truth, estimate = leg[0].truth, found.fitted.estimate
+    assert estimate.converged
+    assert {name.rpartition(".")[2] for name in estimate.names} == {
+        "armature", "viscous", "coulomb", "offset", "delay",
+    }  # fmt: skip
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        assert abs(value - truth[name]) < 3.3 * error, name
+        if not name.endswith("offset"):  # which is 0
+            assert error < 0.15 * truth[name], name
+
+
+def test_the_drives_of_an_arm_are_recovered():
+    rng = np.random.default_rng(1)
+    robot = plant("planar", rng)
+    log, truth = recorded(robot, rng, duration=8.0)
+    found = identify_commands(robot.model, [log], [], stated(robot), SETTINGS, chooses=False)
+    values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    for name, value in values.items():
+        wide = {"delay": 3e-4, "offset": 0.05}.get(name.rpartition(".")[2], 0.04 * truth[name])
+        assert abs(value - truth[name]) < wide, name
+
+
+def test_the_standard_parameters_are_what_was_found(leg, found):
+    names = found.model.layout.names
+    values = dict(zip(names, found.standard, strict=True))
+    estimate = found.fitted.estimate
+    errors = dict(zip(names, np.sqrt(np.diag(found.standard_covariance)), strict=True))
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        if name in values:
+            assert values[name] == value
+            assert errors[name] == pytest.approx(error, rel=1e-6)
+    urdf = leg[0].model.standard_parameters()
+    np.testing.assert_array_equal(found.standard[:30], urdf[:30])  # bodies stay: bodies=0
+
+
+def test_open_loops_beat_plainer_models(leg, found):
+    [run] = found.kept
+    assert found.verdict.status == "good"
+    assert (run.rmse < 1.2 * NOISE).all()
+    for other in (run.command, run.urdf, run.second_order):
+        assert (run.rmse < 0.9 * other).all()
+    np.testing.assert_allclose(run.command, np.sqrt(np.mean((run.log.q_ref - run.log.q) ** 2, 0)))
+    np.testing.assert_allclose(run.rmse, np.sqrt(np.mean((run.log.q - run.q) ** 2, axis=0)))
+    assert list(run.horizons) == [0.1, 0.5, 2.0]
+    for error in run.horizons.values():
+        assert (error < 3 * NOISE).all()
+
+
+def test_a_short_log_has_short_horizons_only(leg, found):
+    robot, log, _ = leg
+    n = 400  # 0.8 s
+    short = Log(
+        log.t[:n], log.q[:n], log.tau[:n], log.joints, q_ref=log.q_ref[:n], has_torque=False
+    )
+    again = identify_commands(robot.model, [log], [short], stated(robot), SETTINGS, chooses=False)
+    assert list(again.kept[0].horizons) == [0.1, 0.5]
+    np.testing.assert_allclose(again.fitted.estimate.theta, found.fitted.estimate.theta)
+
+
+def test_without_a_kept_log_nothing_is_judged(leg):
+    robot, log, _ = leg
+    found = identify_commands(robot.model, [log], [], stated(robot), SETTINGS, chooses=False)
+    assert found.verdict.status == "not evaluated"
+    assert found.verdict.reasons[0].startswith("no log was kept apart")
+
+
+def test_a_robot_that_moves_otherwise_in_the_kept_log_is_poor(leg):
+    robot, log, kept = leg
+    other = replace(kept, q=kept.q[::-1].copy())
+    found = identify_commands(robot.model, [log], [other], stated(robot), SETTINGS, chooses=False)
+    assert found.verdict.status == "poor"
+    assert "the open loop misses" in found.verdict.reasons[0]
+
+
+def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(leg):
+    robot, log, kept = leg
+    found = identify_commands(robot.model, [log], [kept], LoopSettings(), SETTINGS, chooses=False)
+    assert not found.has_gains
+    [scale] = [f for f in found.findings if f.code == "scale"]
+    assert scale.severity == "warning"
+    assert "state kp in [controller]" in scale.message
+    assert found.kept[0].urdf is None, "without gains, the URDF has no open loop"
+
+
+def test_joints_of_a_group_share_their_drive(leg):
+    robot, log, kept = leg
+    hip, thigh, calf = robot.model.joints
+    loop = stated(robot, groups={"upper": [hip, thigh]})
+    found = identify_commands(robot.model, [log], [kept], loop, SETTINGS, chooses=False)
+    names = found.fitted.estimate.names
+    assert "upper.armature" in names
+    assert "upper.viscous" in names
+    assert f"{hip}.coulomb" in names, "what wears is each drive's own"
+    assert f"{calf}.armature" in names
+    loops = found.fitted.loops
+    assert loops.armature[0] == loops.armature[1] != loops.armature[2]
+
+
+def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
+    robot, rng = leg[0], np.random.default_rng(3)
+    model, n = robot.model, 3
+    t = np.arange(4000) / 500.0
+    q_ref = multisine(t, robot.middle, robot.reach, rng)
+    centre = float(robot.middle[2])
+    plain = (Viscous(), Coulomb(), Offset())
+    bent = (
+        *plain,
+        PositionCoulomb(order=1, centre=centre),
+        PositionCoulomb(order=2, centre=centre),
+    )
+    loops = replace(
+        stated_loops(model, stated(robot)), armature=np.full(n, 0.02), delay=np.full(n, 0.006),
+        terms=(plain, plain, bent),
+        values=np.array([0.1, 0.2, 0.0, 0.1, 0.2, 0.0, 0.1, 0.25, 0.0, 0.5, 1.0]),
+    )  # fmt: skip
+    told = Log(t, q_ref, np.zeros_like(q_ref), model.joints, q_ref=q_ref, has_torque=False)
+    [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
+    log = replace(told, q=out.q + 3e-4 * rng.standard_normal(out.q.shape))
+    found = identify_commands(model, [log], [], stated(robot), SETTINGS)
+    chosen = {(t.joint, t.terms) for t in found.fitted.tried if t.is_chosen}
+    assert {joint for joint, _ in chosen} == {model.joints[2]}
+    values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    [name] = [f.where for f in found.findings if f.code == "friction_found"]
+    assert name == model.joints[2]
+    terms = [t for t in found.fitted.loops.terms[2] if isinstance(t, PositionCoulomb)]
+    parts = zip((1, 2), terms, strict=True)
+    q = np.linspace(centre - 0.2, centre + 0.2, 9)
+    size = values[f"{name}.coulomb"] + sum(
+        values[f"{name}.{term.name}"] * (q - term.centre) ** k for k, term in parts
+    )
+    exact = 0.25 + 0.5 * (q - centre) + (q - centre) ** 2
+    np.testing.assert_allclose(size, exact, rtol=0.05)
+    assert f"{name}.{terms[0].name}" in found.model.layout.names
+
+
+def test_a_log_without_commands_is_refused(leg):
+    robot, log, _ = leg
+    bare = replace(log, q_ref=None)
+    with pytest.raises(DataError, match=r"has no commands, which the estimator 'simulation'"):
+        identify_commands(robot.model, [bare], [], stated(robot), SETTINGS)
+    with pytest.raises(DataError, match="no log was given"):
+        identify_commands(robot.model, [], [], stated(robot), SETTINGS)

@@ -1,0 +1,33 @@
+import pytest
+
+from robotid.commanded.settings import LoopSettings, groups_of
+from robotid.exceptions import SettingsError
+
+JOINTS = ("FL_hip_joint", "FL_calf_joint", "FR_hip_joint", "FR_calf_joint", "tail")
+
+
+def test_joints_that_are_alike_share_a_group_named_by_their_words():
+    found = groups_of(LoopSettings(), JOINTS, ["a", "b", "a", "b", "c"])
+    assert found == ["hip", "calf", "hip", "calf", "tail"]
+
+
+def test_alike_joints_without_a_word_in_common_have_the_first_ones_name():
+    assert groups_of(LoopSettings(), ("left", "right"), [1, 1]) == ["left", "left"]
+
+
+def test_stated_groups_stand_over_what_looks_alike():
+    loop = LoopSettings(groups={"front": ["FL_hip_joint", "FL_calf_joint"]})
+    found = groups_of(loop, JOINTS, [1] * 5)
+    assert found == ["front", "front", *JOINTS[2:]]
+
+
+def test_groups_of_joints_that_are_not_there_are_refused():
+    loop = LoopSettings(groups={"front": ["FL_hip_jiont"]})
+    with pytest.raises(SettingsError, match=r"groups.front has 'FL_hip_jiont'.*FL_hip_joint"):
+        groups_of(loop, JOINTS, [1] * 5)
+
+
+def test_a_joint_of_two_groups_is_refused():
+    loop = LoopSettings(groups={"front": ["tail"], "back": ["tail"]})
+    with pytest.raises(SettingsError, match=r"joint 'tail' is in the groups front and back"):
+        groups_of(loop, JOINTS, [1] * 5)

@@ -1,0 +1,129 @@
+import json
+
+import pytest
+
+from robotid.cli import main
+from robotid.robot.examples import example_urdf
+from robotid.robot.tree import read_tree
+
+LEG = ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint")
+
+
+@pytest.fixture(scope="module")
+def job(recordings, tmp_path_factory):
+    """A job of one leg and some seconds of a chirp that a Go2 was told."""
+    path = tmp_path_factory.mktemp("commanded") / "job.toml"
+    log = recordings / "commands" / "go2" / "chirp.parquet"
+    path.write_text(
+        f"""urdf = "{example_urdf("go2.urdf")}"
+joints = {list(LEG)}
+
+[estimator]
+name = "simulation"
+window = 1.0
+lead = 0.3
+
+[controller]
+kp = 20.0
+kd = 1.5
+
+[[identification]]
+log = "{log}"
+start = 6.0
+end = 10.0
+
+[[validation]]
+log = "{log}"
+start = 10.001
+end = 12.0
+"""
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(job, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("found") / "out"
+    assert main(["identify", str(job), "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    return json.loads((folder / "result.json").read_text())
+
+
+def test_a_job_of_commands_writes_what_other_jobs_write(folder, result):
+    named = {*result["outputs"].values(), "result.json"}
+    assert {path.name for path in folder.iterdir()} == named
+    assert {"report.html", "go2.identified.urdf", "go2.identified.drive.json"} <= named
+    assert result["joints"] == list(LEG)
+    assert {"kind": "pd", "kp": 20.0, "kd": 1.5}.items() <= result["settings"]["controller"].items()
+    assert [entry["role"] for entry in result["inputs"]] == ["urdf", "identification", "validation"]
+
+
+def test_drives_of_a_real_leg_are_as_large_as_they_can_be(result):
+    values = {entry["name"]: entry for entry in result["drive_parameters"]}
+    for joint in LEG:
+        assert 0.002 < values[f"{joint}.armature"]["value"] < 0.2
+        assert 0.0 <= values[f"{joint}.coulomb"]["value"] < 2.0
+        assert values[f"{joint}.kp"] == {
+            "name": f"{joint}.kp", "value": 20.0, "std_error": None, "unit": "N m/rad",
+            "source": "stated",
+        }  # fmt: skip
+        assert values[f"{joint}.kd"]["std_error"] is None
+        assert 0.0 < values[f"{joint}.delay"]["value"] < 0.03
+        assert values[f"{joint}.delay"]["std_error"] < 0.01
+
+
+def test_the_kept_window_is_followed_better_than_by_the_command(result):
+    [run] = result["simulation"]["validation"]
+    for own in run["per_joint"].values():
+        assert own["rmse"] < 0.015  # [rad]
+        assert own["rmse"] < 0.3 * own["command_rmse"]
+    assert result["verdict"]["status"] in ("good", "usable")
+    assert set(result["verdict"]["per_joint"]) == set(LEG)
+
+
+def test_the_written_urdf_has_the_bodies_that_were_found(folder, result):
+    tree = read_tree(folder / "go2.identified.urdf")
+    masses = {link["name"]: link["mass"] for link in result["consistency"]["links"]}
+    assert result["consistency"]["is_consistent"]
+    for name, mass in masses.items():
+        assert mass > 0
+        assert name in tree.links
+
+
+def test_what_was_found_is_printed_with_its_values(folder, result, job, capsys, tmp_path):
+    assert main(["report", str(folder), "--out", str(tmp_path / "again.html")]) == 0
+    capsys.readouterr()
+    assert main(["identify", str(job), "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    for role, words in (("identification", "fitted"), ("validation", "not fitted")):
+        assert f"{words}: chirp.parquet" in printed
+        own = result["simulation"][role][0]["per_joint"][LEG[2]]
+        row = [line for line in printed.splitlines() if line.split()[:1] == [LEG[2]]]
+        wanted = [f"{1e3 * own[key]:.2f}" for key in ("rmse", "second_order_rmse", "command_rmse")]
+        assert any(all(word in line.split() for word in wanted) for line in row)
+    [armature] = [e for e in result["drive_parameters"] if e["name"] == f"{LEG[0]}.armature"]
+    assert f"{armature['value']:.4g}" in printed
+    assert result["verdict"]["status"] in printed
+
+
+def test_json_is_the_result(job, result, capsys, tmp_path):
+    assert main(["identify", str(job), "--out", str(tmp_path / "out"), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["drive_parameters"] == result["drive_parameters"]
+
+
+def test_a_log_without_commands_ends_with_one_sentence(tmp_path, job, capsys, ur5):
+    (tmp_path / "log.csv").write_text(
+        "t," + ",".join(f"q_{j}" for j in LEG) + "\n"
+        + "".join(f"{k / 500},{0.1 * k},0,0\n" for k in range(20))
+    )  # fmt: skip
+    text = job.read_text().split("[[identification]]")[0]
+    bad = tmp_path / "job.toml"
+    bad.write_text(text + '[[identification]]\nlog = "log.csv"\n')
+    assert main(["identify", str(bad), "--out", str(tmp_path / "out")]) != 0
+    assert "qref_FL_hip_joint" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "result.json").exists()
