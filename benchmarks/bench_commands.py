@@ -1,7 +1,7 @@
 """Drives from commands and positions: errors of open loops, intervals, and time.
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
-        [--go2] [--so101] [--rollouts] [--coverage RUNS] [--torque]
+        [--go2] [--so101] [--rollouts] [--coverage RUNS]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the

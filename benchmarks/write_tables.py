@@ -38,6 +38,7 @@ PAGES = {
     "excitation": "excitation.md",
     "designs": "excitation.md",
     "motions": "excitation.md",
+    "commands": "commands_and_positions.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

@@ -18,7 +18,7 @@ __all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns"]
 
 _STARTS = 2  # steps towards better starts of windows ...
 _SHARES = (1.0, 0.3, 0.1)  # ... of which these are tried
-_TOLD = 1e-6  # what moves a window less, relative, is no direction of its start
+_NEAR = 3.0  # errors of position, that a start may be from where it was measured
 _POSSIBLE = 1e-9  # smallest eigenvalue of a pseudo-inertia, relative, from which a body can change
 #: Entries of the triangle that a body changes by: the logarithm of its mass' root, and its centre.
 _ENTRIES = ((3, 3), (0, 3), (1, 3), (2, 3))
@@ -324,12 +324,19 @@ class LoopSimulator:
 
 
 def _better_start(out: RollOut, sigma: Array) -> Array:
-    """Return by how much position and speed at the start are off, to first order, shape (2, n)."""
+    """Return by how much position and speed at the start are off, to first order, shape (2, n).
+
+    They are near what was measured: within some errors of position, and the usual speed.
+    """
+    log = out.window.log
+    speed = np.sqrt(np.mean((np.diff(log.q, axis=0) / np.diff(log.t)[:, None]) ** 2, axis=0))
+    usual = np.maximum(np.concatenate([_NEAR * sigma, speed]), 1e-9)
     change = np.zeros(2 * len(sigma))
     for joints, places, slopes in out.slopes:
-        A = slopes / sigma[joints, None]
-        b = _error(out)[:, joints] / sigma[joints]
-        change[places] = np.linalg.lstsq(A.reshape(b.size, -1), b.reshape(-1), rcond=_TOLD)[0]
+        b = (_error(out)[:, joints] / sigma[joints]).reshape(-1)
+        A = (slopes / sigma[joints, None]).reshape(b.size, -1) * usual[places]
+        A, b = np.vstack([A, np.eye(len(places))]), np.concatenate([b, np.zeros(len(places))])
+        change[places] = usual[places] * np.linalg.lstsq(A, b, rcond=None)[0]
     return change.reshape(2, -1)
 
 
