@@ -294,10 +294,12 @@ class LoopSimulator:
 
     @cached_property
     def _roots(self) -> Array:
-        """A root U of each body's pseudo-inertia, shape (n, 4, 4)."""
+        """A root U of each body's pseudo-inertia that is unknown, an upper triangle, (n, 4, 4)."""
+        roots = np.zeros((len(self.base.bodies), 4, 4))
         J = pseudo_inertia(self.base.bodies.reshape(-1))
-        values, axes = np.linalg.eigh(J)
-        roots: Array = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :] @ axes.transpose(0, 2, 1)
+        body_of = {joint: body for body, joint in enumerate(self.robot.joint_of_body)}
+        for body in {body_of[u.joints[0]] for u in self.unknowns if u.what == "body"}:
+            roots[body] = np.linalg.cholesky(J[body, ::-1, ::-1])[::-1, ::-1]
         return roots
 
     def _bodies(self, theta: Array) -> tuple[Array, Array]:

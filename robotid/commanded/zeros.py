@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.signal
 
 from robotid._typing import Array
 from robotid.logs.data import Log
@@ -85,6 +84,8 @@ def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
 
 def _smooth(log: Log, count: int) -> tuple[Array, Array, Array, Array]:
     """Return position, speed, acceleration and error of the loop at some samples of a log."""
+    import scipy.signal  # takes most of a second
+
     dt = float(np.median(np.diff(log.t)))
     sos = scipy.signal.butter(2, min(_CUTOFF, 0.2 / dt), fs=1.0 / dt, output="sos")
     q = scipy.signal.sosfiltfilt(sos, log.q, axis=0)

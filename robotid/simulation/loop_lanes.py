@@ -62,7 +62,7 @@ def work_size(joints: int, columns: int) -> int:
         columns: Number of sensitivities.
     """
     n = joints
-    return LANES * ((n + 1) * _BODY + 4 * n * n + 14 * n + 2 * n * columns)
+    return LANES * ((n + 1) * _BODY + 4 * n * n + 13 * n + 2 * n * columns)
 
 
 @compiled
@@ -442,7 +442,7 @@ def _balance(work, n, at, drives, terms, step, command):
     Row i is divided by e = 1 + mu s(u) sign(tau), by which a gear that loses a share mu of its
     load multiplies the bodies' torque tau: so H stays symmetric.
     """
-    q, v, u, middle, h, M, G, H, by_q, by_u, gains, load, loss = at
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss = at
     codes, shapes, values, first = terms
     for i in range(n):
         for lane in range(LANES):
@@ -514,7 +514,7 @@ def _newton(work, n, at, drives, terms, step, command):
 @compiled
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
-    q, v, u, middle, h, M, G, H, by_q, by_u, gains, load, loss = at
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss = at
     T_q, T_v, S, own, change = sweeps
     codes, shapes, values, first = terms
     P = len(columns)
@@ -591,7 +591,7 @@ def _combine(work, n, at, sweeps, drives, step):
 
     H du = T_v dv - T_q dq - own, each row divided by its e.
     """
-    M, by_q, gains, loss = at[5], at[8], at[10], at[12]
+    M, by_q, gains, loss = at[5], at[8], at[9], at[11]
     T_q, T_v = sweeps[0], sweeps[1]
     for i in range(n):
         for j in range(n):
@@ -667,10 +667,10 @@ def roll_out(
     n, P = len(parents), len(columns)
     q = (n + 1) * _BODY
     v, u, middle, h, a = q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n
-    G, by_q, by_u, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n, a + 6 * n
+    G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
     load, loss, M = change + n, change + 2 * n, change + 3 * n
     H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
-    at = (q, v, u, middle, h, M, G, H, by_q, by_u, gains, load, loss)
+    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss)
     sweeps, terms = (T_q, T_v, S, own, change), (codes, shapes, values, first)
     work[:] = 0.0
     for lane in range(LANES):

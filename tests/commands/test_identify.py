@@ -66,7 +66,9 @@ def test_each_log_is_hashed_once_and_opened_once(ur5, rng, tmp_path, monkeypatch
     hashed, opened = [], []
     digest, lay_out = hashlib.file_digest, Job.lay_out
     monkeypatch.setattr(hashlib, "file_digest", lambda f, a: hashed.append(f.name) or digest(f, a))
-    monkeypatch.setattr(Job, "lay_out", lambda j, e, m: opened.append(e.path) or lay_out(j, e, m))
+    monkeypatch.setattr(
+        Job, "lay_out", lambda j, e, m, **k: opened.append(e.path) or lay_out(j, e, m, **k)
+    )
     run_job(job, tmp_path / "out")
     logs = [str(tmp_path / name) for name in ("keep.csv", "run.csv")]
     assert sorted(str(name) for name in hashed if str(name).endswith(".csv")) == logs

@@ -84,7 +84,7 @@ def test_every_key_of_a_job_arrives(tmp_path):
     assert job.terms == ("armature", "viscous")
     assert job.gains == {"a": 14.87}
     assert job.units.time == "ms"
-    assert job.source == LogSource("/arm", {"a": "M1"}, "current", "log")
+    assert job.source == LogSource("/arm", joints={"a": "M1"}, effort="current", stamp="log")
     assert job.couplings == (Coupling("motor", (("a", 1.0), ("b", -1.0))),)
     (gear,) = job.transmissions
     assert (gear.motors, gear.efficiency) == (("m", "n"), (0.9, 1.0))
