@@ -216,7 +216,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"the fit has not settled after {estimate.n_iter} steps: its parameters may still "
             "move; state what you know of the loop in [controller], or use shorter windows",
         )
-    if not found.has_gains:
+    if not found.has_gains and found.fitted.simulator.torque is None:
         yield Finding(
             "scale",
             "warning",

@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import plant, recorded
+
+from robotid.commanded.identify import identify_commands
+from robotid.commanded.settings import LoopSettings
+from robotid.commanded.zeros import find_encoders
+from robotid.identification.settings import SimulationSettings
+
+AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
+SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
+
+
+@pytest.fixture(scope="module")
+def leg():
+    rng = np.random.default_rng(1)
+    robot = plant("leg", rng, coulomb=0.01, viscous=0.01)
+    return robot, recorded(robot, rng, duration=8.0, rate=250.0)[0]
+
+
+@pytest.fixture(scope="module")
+def moved(leg):
+    """The log of a leg whose thigh reads 0 where the URDF is at 0.5 rad."""
+    robot, log = leg
+    away = np.array([0.0, AWAY, 0.0])
+    return robot, replace(log, q=log.q - away, q_ref=log.q_ref - away)
+
+
+def test_encoders_with_the_zeros_of_the_urdf_keep_them(leg):
+    found = find_encoders(leg[0].model, [leg[1]])
+    np.testing.assert_array_equal(found.zero, 0.0)
+    np.testing.assert_array_equal(found.sign, 1.0)
+    np.testing.assert_array_equal(found.gain, 0.0)
+
+
+def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
+    robot, log = moved
+    first = find_encoders(robot.model, [log])
+    np.testing.assert_array_equal(first.sign, 1.0)
+    assert first.zero[1] == pytest.approx(AWAY, abs=np.deg2rad(15.0))
+    assert (first.zero[[0, 2]] == 0.0).all()
+    drives = robot.drives
+    loop = LoopSettings(
+        kp={d.joint: d.kp for d in drives}, kd={d.joint: d.kd for d in drives}, zeros="find"
+    )
+    found = identify_commands(robot.model, [log], [], loop, SETTINGS, chooses=False)
+    zero = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    assert zero["FL_thigh_joint.zero"] == pytest.approx(AWAY, abs=0.03)
+    [said] = [f for f in found.findings if f.code == "encoder"]
+    assert said.where == "FL_thigh_joint"
+    assert said.evidence["zero"] == pytest.approx(AWAY, abs=0.03)
+
+
+def test_an_encoder_that_counts_the_other_way_is_turned(leg):
+    robot, log = leg
+    turned = log.turned(np.array([1.0, -1.0, 1.0]))
+    np.testing.assert_array_equal(turned.q[:, 1], -log.q[:, 1])
+    np.testing.assert_array_equal(turned.q_ref[:, [0, 2]], log.q_ref[:, [0, 2]])
+    sign = find_encoders(robot.model, [turned]).sign
+    # a chain with parallel axes is its mirror image: thigh or calf
+    assert sorted(sign[1:].tolist()) == [-1.0, 1.0]
+    assert sign[0] == 1.0
+
+
+def test_torques_tell_the_gains_that_positions_leave_open():
+    rng = np.random.default_rng(3)
+    robot = plant("planar", rng)
+    log, truth = recorded(robot, rng, duration=6.0, rate=250.0, torque=0.5)
+    settings = replace(SETTINGS, bodies=0.1)
+    open_, told = (
+        identify_commands(robot.model, [each], [], LoopSettings(), settings, chooses=False)
+        for each in (replace(log, tau=0 * log.tau, has_torque=False), log)
+    )
+    for joint in robot.model.joints:
+        name = f"{joint}.kp"
+        k, m = (list(f.fitted.estimate.names).index(name) for f in (open_, told))
+        assert told.fitted.estimate.theta[m] == pytest.approx(truth[name], rel=0.01)
+        error, before = told.fitted.estimate.std_error[m], open_.fitted.estimate.std_error[k]
+        assert error < 0.1 * before
+    assert f"{robot.model.joints[0]}.kd" in told.fitted.estimate.names
+    assert "scale" in {f.code for f in open_.findings}
+    assert "scale" not in {f.code for f in told.findings}
