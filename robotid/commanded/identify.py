@@ -20,7 +20,7 @@ from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import Loops
 
-__all__ = ["Commanded", "identify_commands"]
+__all__ = ["Commanded", "identify_commands", "with_gravity"]
 
 #: Share of its motion that the open loop of a joint misses on logs kept apart: well, not usable.
 GOOD, POOR = 0.05, 0.3
@@ -134,7 +134,7 @@ def identify_commands(
                 "columns qref_ of each joint, or identify from torques with another estimator"
             )
     if loop.gravity_compensation:
-        logs, kept = ([_with_gravity(model, log) for log in part] for part in (logs, kept))
+        logs, kept = ([with_gravity(model, log) for log in part] for part in (logs, kept))
     fitted = fit_loops(model, logs, loop, settings, chooses=chooses, progress=progress)
     report_stage(progress, "testing", STAGES)
     stated = stated_loops(model, loop)
@@ -162,8 +162,13 @@ def _urdf(model: RobotModel, stated: Loops) -> Loops:
     return replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
 
 
-def _with_gravity(model: RobotModel, log: Log) -> Log:
-    """Return a log whose fed-forward torque has that of gravity by the URDF, as measured."""
+def with_gravity(model: RobotModel, log: Log) -> Log:
+    """Return a log whose fed-forward torque has that of gravity by the URDF, as measured.
+
+    Args:
+        model: The robot as its URDF says.
+        log: The log, of its joints in its order, with commands.
+    """
     torque = predict_instants(model, model.standard_parameters(), log.q)
     fed = torque if log.tau_ref is None else log.tau_ref + torque
     return replace(log, tau_ref=fed)

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 import scipy.signal
 
 from robotid._typing import Array
 from robotid.logs.data import Log
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
 __all__ = ["Encoders", "find_encoders", "same_encoders"]
@@ -103,14 +103,8 @@ def _cost(
 
     A joint whose loop would give way to the load does not count the load.
     """
-    data, G = model.pin_model.createData(), model.velocity_map
     at, rate, change = (sign * x for x in (q, v, a))
-    torque = np.array(
-        [
-            pin.rnea(model.pin_model, data, c, G @ w, G @ dw) @ G
-            for c, w, dw in zip(model.configurations(at + zero), rate, change, strict=True)
-        ]
-    )
+    torque = predict_instants(model, model.standard_parameters(), at + zero, rate, change)
     total = 0.0
     for j in range(q.shape[1]):
         e = sign[j] * error[:, j]

@@ -6,16 +6,18 @@ from typing import Any
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._typing import ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.fit import STAGES
-from robotid.commanded.identify import Commanded, identify_commands
-from robotid.commands.job import Job
+from robotid.commanded.identify import Commanded, identify_commands, with_gravity
+from robotid.commands.job import Job, LogEntry
 from robotid.exceptions import SettingsError
-from robotid.export.result import build_commanded
+from robotid.export.result import Result, build_commanded
 from robotid.export.urdf import write_urdf
+from robotid.identification.advice import Origin
 from robotid.identification.settings import SimulationSettings
+from robotid.logs.data import Log
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.robot.drives import AUTO
 
-__all__ = ["run_commanded"]
+__all__ = ["log_of_commands", "run_commanded"]
 
 
 def run_commanded(
@@ -60,9 +62,30 @@ def run_commanded(
         write_urdf(found.model, found.standard, partial / name, dynamics=job.dynamics)
         if job.report:
             files = {"result": "result.json", "urdf": name, "sidecar": sidecar}
-            write_commanded_report(content, followed(found), partial / "report.html", files=files)
+            write_commanded_report(
+                content,
+                followed(found),
+                partial / "report.html",
+                files=files,
+                origin=Origin((), str(target)),
+            )
         write_json(content, partial / "result.json")
     return found, content
+
+
+def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
+    """Return a log of commands as its robot hears them, the controller's own torque included.
+
+    Args:
+        job: The job of the result.
+        entry: Which log.
+        result: What the job has found.
+
+    Raises:
+        DataError: If the file cannot be used, or has no commands.
+    """
+    log = job.read(entry, result.robot, needs="commands")
+    return with_gravity(job.model(), log) if job.controller.gravity_compensation else log
 
 
 def followed(found: Commanded) -> list[Followed]:

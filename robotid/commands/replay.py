@@ -9,6 +9,7 @@ import numpy as np
 
 from robotid._files import read_json
 from robotid._typing import Array
+from robotid.commands.commanded import log_of_commands
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.exceptions import DataError, SettingsError
 from robotid.excitation.clearance import Clearance
@@ -199,7 +200,7 @@ def _replay_commanded(job: Job, results: Mapping[str, Result], ghost: str | Path
     (entry,) = job.identification
     first = next(iter(results.values()))
     model, zero = first.robot, np.array([drive.zero for drive in first.commanded])
-    log = job.read(entry, model, needs="commands")
+    log = log_of_commands(job, entry, first)
     q_ref = np.asarray(log.q_ref)
     simulated = {label: result.follow_commands(log) for label, result in results.items()}
     names = ["simulated"] if len(simulated) == 1 else [f"simulated: {x}" for x in simulated]

@@ -9,6 +9,7 @@ import numpy as np
 
 from robotid._files import check_file, file_sha256
 from robotid._typing import ProgressCallback, report_stage
+from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
 from robotid.exceptions import DataError, SettingsError
@@ -93,10 +94,10 @@ def followed_logs(result: Result, job: Job) -> list[Followed]:
         DataError: If a log cannot be read, or has no commands.
         MissingDependencyError: If Numba is not installed.
     """
-    model, found = result.robot, []
+    found = []
     for is_kept, entries in ((True, job.validation), (False, job.identification)):
         for entry in entries:
-            log = job.read(entry, model, needs="commands")
+            log = log_of_commands(job, entry, result)
             name = f"{entry.path.name}, {log.t[0]:.4g} to {log.t[-1]:.4g} s"
             q_ref, q_sim = np.asarray(log.q_ref), result.follow_commands(log)
             found.append(Followed(name, is_kept, log.t, q_ref, log.q, q_sim))

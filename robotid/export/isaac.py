@@ -22,7 +22,6 @@ __all__ = ["isaac_actuators", "write_isaac"]
 
 _STATED = ("armature", "viscous", "coulomb", "offset")  # the offset by a sentence of its own
 _STEP = 0.005  # [s]
-_EXACT = 1e-6  # of a step: a delay that is so close to whole steps has that many
 _HEAD = """\
 Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
 robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of joints that slide.
@@ -32,8 +31,9 @@ robotid {version}. N m, N m s/rad, kg m^2, rad/s; N, N s/m, kg, m/s of joints th
   groups = yaml.safe_load(open("{file}"))["actuators"]
   actuators = {{name: DelayedPDActuatorCfg(**group) for name, group in groups.items()}}
 
-Delays are steps of physics_dt, which sim.dt must be: the whole steps below and above the delay, of
-which Isaac Lab draws one for each robot at each reset. Friction is Coulomb's, at rest and moving.
+Delays are the nearest steps of physics_dt, which sim.dt must be; where min_delay is less than
+max_delay, Isaac Lab draws one for each robot at each reset. Friction is Coulomb's, at rest and
+moving.
 """
 
 
@@ -117,7 +117,7 @@ def write_isaac(
 
 def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str, Any]:
     """Return the fields of one joint's actuator but for its name."""
-    steps = drive.delay / physics_dt
+    steps = round(drive.delay / physics_dt)
     return {
         "effort_limit": _limit(limit_of(drive, joint)),
         "velocity_limit": _limit(joint.velocity),
@@ -127,8 +127,8 @@ def _fields(drive: CommandedDrive, joint: Joint, physics_dt: float) -> dict[str,
         "friction": drive.coulomb,
         "dynamic_friction": drive.coulomb,
         "viscous_friction": drive.viscous,
-        "min_delay": math.floor(steps + _EXACT),
-        "max_delay": math.ceil(steps - _EXACT),
+        "min_delay": steps,
+        "max_delay": steps,
     }
 
 

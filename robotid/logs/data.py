@@ -125,7 +125,7 @@ class Log:
         return replace(self, joints=tuple(joints), **cut)
 
     def turned(self, sign: Array) -> "Log":
-        """Return the log with the signs of some joints turned, as encoders of another sense have it.
+        """Return the log with the signs of some joints turned.
 
         Args:
             sign: 1 or -1 of each joint, shape (n,).

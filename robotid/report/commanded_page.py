@@ -34,6 +34,8 @@ _OPEN = 3  # joints whose charts are open at first
 _NAMED = 7  # joints whose errors over the horizon are drawn
 _FIRST = 3  # reasons of the verdict that are seen at once
 _SMALL = 1e-3  # of rad and m, which errors are shown in
+#: Parameters of a drive that stand before all others.
+_FIRST_TERMS = ("kp", "kd", "delay", "limit", "zero")
 _ROLES = {"validation": "kept apart", "identification": "fitted"}
 
 
@@ -177,7 +179,8 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     facts["Drive parameters"] = f"{found} found, {stated} stated or held"
     if files:
         facts["Files"] = ", ".join(
-            f'<a href="{escape(path)}">{escape(kind)}</a>' for kind, path in files.items()
+            f'<a href="{escape(path)}">{escape("URDF" if kind == "urdf" else kind)}</a>'
+            for kind, path in files.items()
         )
     cells = "".join(f"<div><dt>{name}</dt><dd>{html}</dd></div>" for name, html in facts.items())
     return f'<dl class="facts">{cells}</dl>\n'
@@ -398,9 +401,13 @@ def _error(entry: Mapping[str, Any]) -> float:
 
 
 def _terms(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the parameters that drives have, but for those that are 0 and held of all of them."""
+    """Return the parameters that drives have, but for those that are 0 and held of all of them.
+
+    Those of the controller come first.
+    """
     said = [entry for entry in entries if entry["value"] or entry.get("std_error") is not None]
-    return list(dict.fromkeys(entry["name"].rpartition(".")[2] for entry in said))
+    found = dict.fromkeys(entry["name"].rpartition(".")[2] for entry in said)
+    return sorted(found, key=lambda term: (*_FIRST_TERMS, term).index(term))
 
 
 def _short(entry: Mapping[str, Any] | None) -> Cell:

@@ -314,7 +314,7 @@ def _torque_data(model: RobotModel, torques: Torques, t: Array) -> dict[str, Any
         raise DataError(f"noise has shape {noise.shape}, wanted {wanted[1:]}")
     full, unit = (0.5, "the torque's rms") if torques.noise is None else (6.0, "the noise")
     if torques.quantity == "position":
-        full, unit = 0.5, "the command's error"
+        full, unit = 0.25, "the command's error"
     scale = {"of": np.where(noise > 0, noise, 1.0).tolist(), "full": full, "unit": unit}
     strip = None
     if len(series) > 1:

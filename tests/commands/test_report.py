@@ -13,9 +13,13 @@ from helpers.synthetic import exact_log, truth
 
 from robotid._files import file_sha256
 from robotid.cli import main
+from robotid.commanded.settings import LoopSettings
+from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
+from robotid.export.result import load_result
 from robotid.logs.read import write_log
+from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
 URDF = ROOT / "urdf" / "planar_2r.urdf"
@@ -135,3 +139,17 @@ def test_the_report_of_drives_that_follow_commands_rolls_the_result_out(tmp_path
     assert "log.csv, 0 to 2.995 s, fitted: RMSE" in page
     (tmp_path / "log.csv").write_text("time\n")
     assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 1
+
+
+def test_a_controller_that_carries_the_weight_does_so_in_the_report_too(tmp_path):
+    arm = plant("planar", np.random.default_rng(0))
+    log, _ = recorded(arm, np.random.default_rng(1), duration=0.5, rate=200.0)
+    write_log(log, tmp_path / "log.csv")
+    entry, result = LogEntry(tmp_path / "log.csv"), load_result(written_result(arm, tmp_path / "a"))
+    job = Job(Path(arm.model.tree.path), controller=LoopSettings(gravity_compensation=True))
+    heard = log_of_commands(job, entry, result)
+    pi, still = arm.model.standard_parameters(), np.zeros_like(log.q)
+    weight = predict_instants(arm.model, pi, log.q, still, still)
+    np.testing.assert_allclose(heard.tau_ref, weight, atol=1e-4)
+    plain = log_of_commands(Job(job.urdf), entry, result)
+    assert plain.tau_ref is None

@@ -85,12 +85,12 @@ def test_mujoco_follows_a_chirp_as_the_closed_loop_does(changes, commands):
     """Within 1 mrad of 0.6 to 1.3 rad at 5 rad/s; half of it are the steps of 1 ms."""
     leg = plant("leg", np.random.default_rng(1), **changes)
     wanted = reference(leg.drives, commands)
-    found = followed(loaded(leg, RATE), commands, RATE, settles=0.3)
+    found = followed(loaded(leg, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
     assert np.abs(found - wanted).max() < 1e-3
     assert np.abs(wanted - commands).max() > 0.05  # the drives matter
     for key in ("delay", "coulomb", "armature", "viscous", "kd"):  # and each of their figures
         other = replace(leg, drives=tuple(replace(d, **{key: 0.0}) for d in leg.drives))
-        missed = followed(loaded(other, RATE), commands, RATE, settles=0.3)
+        missed = followed(loaded(other, RATE, 1e-3, as_exported=True), commands, RATE, settles=0.3)
         assert np.abs(missed - wanted).max() > 2e-3, key
 
 
@@ -150,14 +150,14 @@ def test_the_plant_logs_the_torques_of_its_drives():
     kp, kd = (np.array([getattr(drive, key) for drive in leg.drives]) for key in ("kp", "kd"))
     late = 3  # rows
     by_hand = kp * (log.q_ref[:-late] - log.q[late:]) - kd * v[late:]
-    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.035)
+    np.testing.assert_allclose(log.tau[late:-1], by_hand[:-1], atol=0.05)
     assert np.ptp(by_hand, axis=0).min() > 0.8
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     leg = plant("leg", np.random.default_rng(0), coulomb=0.2, offset=0.1, zero=0.02, delay=0.0063)
-    drives = (*leg.drives[:2], replace(leg.drives[2], kp=33.0, coulomb=0.4, delay=0.005))
+    drives = (*leg.drives[:2], replace(leg.drives[2], kp=33.0, coulomb=0.4, delay=0.0048))
     same = replace(drives[0], joint=LEG[1])
     leg = replace(leg, drives=(drives[0], same, drives[2]))
     friction = {LEG[2]: by_position(0.05, 0.3, -2.5, -1.0)}
@@ -206,7 +206,7 @@ def test_mujoco_rolls_out_what_our_own_roll_out_does():
             pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
     robot = LoopedRobot(leg.model, step=1e-3)
     (found,) = robot.roll_out(loops_of(leg.model, pi, leg.drives), cut_windows(log, np.inf, 0.0))
-    assert np.abs(found.q - log.q).max() < 1e-3
+    assert np.abs(found.q - log.q).max() < 3e-4
     assert np.abs(log.q - log.q_ref).max() > 0.05
 
 
@@ -307,8 +307,8 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "friction": drive.coulomb,
             "dynamic_friction": drive.coulomb,
             "viscous_friction": pytest.approx(drive.viscous, rel=1e-5),
-            "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.5 steps
-            "max_delay": 4 if joint != LEG[2] else 3,
+            "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.4 steps
+            "max_delay": 3 if joint != LEG[2] else 2,
         }
 
 
@@ -323,12 +323,10 @@ def test_isaac_groups_are_of_equal_drives_with_whole_delays():
     assert groups["calf_joint"]["joint_names_expr"] == [
         f"{leg}_calf_joint" for leg in ("FL", "FR", "RL", "RR")
     ]
-    for late, step, least, most in (
-        (0.0063, 0.0063, 1, 1), (0.3, 0.1, 3, 3), (0.035, 0.005, 7, 7), (0.0125, 0.005, 2, 3),
-    ):  # fmt: skip
+    for late, step, whole in ((0.0063, 0.0063, 1), (0.3, 0.1, 3), (0.00497, 0.005, 1)):
         own = [replace(drive, delay=late) for drive in drives]
         group = isaac_actuators(quadruped, own, step)["actuators"]["calf_joint"]
-        assert (group["min_delay"], group["max_delay"]) == (least, most)
+        assert (group["min_delay"], group["max_delay"]) == (whole, whole)
     dotted = plant("planar", np.random.default_rng(0))
     named = [replace(drive, joint=f"{drive.joint}.x") for drive in dotted.drives]
     for group in isaac_actuators(dotted.model, named, 0.005)["actuators"].values():

@@ -108,7 +108,8 @@ def test_charts_show_commanded_measured_and_simulated_and_the_worst_joint_first(
 
 def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content):
     drives = tables(page)["Drives, joint by joint"]
-    assert "coulomb_q2 [N m]" in drives.headers
+    assert drives.headers[1:4] == ["kp [N m/rad]", "kd [N m s/rad]", "delay [ms]"]
+    assert drives.headers[-1] == "coulomb_q2 [N m]"
     rows = drives.by_name()
     assert rows[LEG[0]]["coulomb [N m]"] == "0.250 ± 0.025"
     assert rows[LEG[0]]["coulomb_q1 [N m]"] == "–"
