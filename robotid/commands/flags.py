@@ -45,6 +45,8 @@ def _cutoff(word: str, flag: str) -> float | bool:
 #: Key of the job file that each flag states, and what argparse is told of it.
 _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--estimator": ("estimator.name", {"metavar": "NAME"}),
+    "--kp": ("controller.kp", {"metavar": "N_M_PER_RAD", "type": float}),
+    "--kd": ("controller.kd", {"metavar": "N_M_S_PER_RAD", "type": float}),
     "--joints": ("joints", {"metavar": "A,B,..."}),
     "--lock": ("locked", {"metavar": "JOINT=POSITION", "action": "append"}),
     "--snap-angles": ("snap_angles", {"action": "store_const", "const": True}),
@@ -78,7 +80,8 @@ _READ: Mapping[str, Callable[[Any, str], Any]] = {
     "--gain": _pairs,
     "--cutoff": _cutoff,
 }
-_LOG = tuple(flag for flag in _FLAGS if flag != "--estimator")
+_FIT = ("--estimator", "--kp", "--kd")
+_LOG = tuple(flag for flag in _FLAGS if flag not in _FIT)
 #: Flags that a tracked or replayed log has a use for.
 _ONLINE = tuple(
     flag
@@ -408,7 +411,7 @@ def _add_job(parser: argparse.ArgumentParser, json_: str = "one JSON object") ->
     flags.add_argument("--validate", nargs="+", metavar="LOG", help="logs kept apart")
     names = f"which estimator: consistent (default), {', '.join(ESTIMATORS)}"
     flags.add_argument("--estimator", **_FLAGS["--estimator"][1], help=names)
-    _add_settings(flags, _LOG)
+    _add_settings(flags, (*_FIT[1:], *_LOG))
     _add_verbose(parser)
 
 

@@ -12,7 +12,11 @@ from robotid._settings import Entries, Range, Settings, check_keys, setting
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
-from robotid.identification.settings import ConsistentSettings, EstimatorSettings
+from robotid.identification.settings import (
+    ConsistentSettings,
+    EstimatorSettings,
+    SimulationSettings,
+)
 from robotid.logs.data import Log
 from robotid.logs.read import LogLayout, Needs, lay_out, read_log
 from robotid.logs.settings import LogSource, LogUnits, SignalSettings
@@ -216,6 +220,12 @@ class Job(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_transmissions(self.transmissions, self.joints)
+        is_looped = isinstance(self.estimator, SimulationSettings)
+        if self.controller != LoopSettings() and not is_looped:
+            raise SettingsError(
+                f"[controller] is stated, which the estimator {self.estimator.name!r} does not "
+                "read; set [estimator] name = 'simulation', or leave it out"
+            )
         if self.free_flyer:
             raise SettingsError(
                 "free_flyer is true, but no log format that robotid reads has the pose and motion "

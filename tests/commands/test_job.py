@@ -191,3 +191,11 @@ def test_gravity_and_drive_terms_default_to_those_of_the_model():
     job = Job(urdf=Path("robot.urdf"))
     assert job.gravity == GRAVITY
     assert job.terms == (*DRIVE_TERMS, AUTO)
+
+
+def test_a_controller_that_the_estimator_does_not_read_is_refused(tmp_path):
+    table = {"urdf": "arm.urdf", "controller": {"kp": 20.0}, "estimator": {"name": "wls"}}
+    with pytest.raises(SettingsError, match=r"'wls' does not read; set \[estimator\] name"):
+        job_from_settings(table, "job.toml", tmp_path)
+    table["estimator"] = {"name": "simulation"}
+    assert job_from_settings(table, "job.toml", tmp_path).controller.kp == 20.0
