@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.signal
 from helpers.synthetic import exact_log, truth
 
 from robotid.commands.job import LogEntry, read_job
@@ -238,3 +239,22 @@ def test_a_joint_that_rests_but_for_a_few_rows_does_not_outweigh_the_others(ur5,
     assert found.mass_std_error < 0.1
     assert abs(found.mass - MASS) < 3 * found.mass_std_error
     assert (np.abs(found.com - COM) < 3 * found.com_std_error).all()
+
+
+def test_errors_grow_with_the_correlation_of_the_noise(ur5):
+    rng, rho = np.random.default_rng(5), 0.9
+    white, coloured = [], []
+    for log in recorded(ur5, rng, friction=1.2):
+        e = LEVEL * rng.standard_normal(log.tau.shape)
+        correlated = scipy.signal.lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], e, axis=0)
+        white.append(replace(log, tau=log.tau + e))
+        coloured.append(replace(log, tau=log.tau + correlated))
+    errors = [
+        identify_payload(ur5, [one], [other], links=["tool0"], signals=EXACT)[
+            "tool0"
+        ].mass_std_error
+        for one, other in (white, coloured)
+    ]
+    # of a motion that is slow beside the noise; of this one, less
+    most = np.sqrt((1 + rho) / (1 - rho))
+    assert 0.4 * most < errors[1] / errors[0] < most
