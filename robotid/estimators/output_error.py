@@ -125,8 +125,7 @@ class OutputError:
         progress: Told of the steps.
 
     References:
-        Ljung (1999), System identification, 4.3 and 10.2; Janot, Vandanjon, Gautier (2014), A
-        generic instrumental variable approach for industrial robot identification, for DIDIM.
+        Ljung (1999), System identification, 4.3 and 10.2.
     """
 
     whitens: bool = True

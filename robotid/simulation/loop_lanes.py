@@ -148,7 +148,7 @@ def _move(work, own, up, joint, v, a):
 
 
 @compiled
-def _force(work, own, body):
+def _force(work, own, body, at):
     """Write the force J A + V x* J V on a body; body has its ten parameters."""
     m, c, J = body[0], (body[1], body[2], body[3]), body[4:10]
     for lane in range(LANES):
@@ -156,8 +156,8 @@ def _force(work, own, body):
         dw, a = _get3(work, own + _DW, lane), _get3(work, own + _A, lane)
         f, n = _momentum(m, c, J, dw, a)
         lin, ang = _momentum(m, c, J, w, v)
-        _put3(work, own + _F, lane, add(f, cross(w, lin)))
-        _put3(work, own + _F + 3, lane, add(n, add(cross(w, ang), cross(v, lin))))
+        _put3(work, own + at, lane, add(f, cross(w, lin)))
+        _put3(work, own + at + 3, lane, add(n, add(cross(w, ang), cross(v, lin))))
 
 
 @compiled
@@ -185,7 +185,7 @@ def _inverse_dynamics(work, parents, joints, bodies, v, a, tau):
     n = len(parents)
     for i in range(n):
         _move(work, (i + 1) * _BODY, (parents[i] + 1) * _BODY, joints[i], v + i, a + i)
-        _force(work, (i + 1) * _BODY, bodies[i])
+        _force(work, (i + 1) * _BODY, bodies[i], _F)
     for i in range(n - 1, -1, -1):
         own = (i + 1) * _BODY
         for lane in range(LANES):
@@ -562,16 +562,7 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
 @compiled
 def _inertial_column(work, parents, joints, works, body, index, own):
     """Write the torques of a change of a body's ten parameters."""
-    direction = works[index]
-    m, c, J = direction[0], (direction[1], direction[2], direction[3]), direction[4:10]
-    at = (body + 1) * _BODY
-    for lane in range(LANES):
-        w, v = _get3(work, at + _W, lane), _get3(work, at + _V, lane)
-        dw, a = _get3(work, at + _DW, lane), _get3(work, at + _A, lane)
-        f, n = _momentum(m, c, J, dw, a)
-        lin, ang = _momentum(m, c, J, w, v)
-        _put3(work, at + _TF, lane, add(f, cross(w, lin)))
-        _put3(work, at + _TF + 3, lane, add(n, add(cross(w, ang), cross(v, lin))))
+    _force(work, (body + 1) * _BODY, works[index], _TF)
     i = body
     while i >= 0:
         at, up = (i + 1) * _BODY, (parents[i] + 1) * _BODY

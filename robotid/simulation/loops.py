@@ -5,7 +5,7 @@ each is rolled out by itself. Windows of logs go side by side in the lanes of th
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -411,19 +411,6 @@ def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
     elif isinstance(term, Harmonic):
         shape = term.order, math.pi / 2 if term.is_sine else 0.0
     return code, *shape, *term.seen
-
-
-def checked_terms(terms: Iterable[DriveTerm]) -> None:
-    """Refuse terms that roll-outs do not have.
-
-    Args:
-        terms: Terms of drives.
-
-    Raises:
-        SettingsError: If there is one.
-    """
-    for term in terms:
-        _coded(term)
 
 
 def _lanes() -> ModuleType:
