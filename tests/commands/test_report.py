@@ -18,6 +18,7 @@ from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import run_job
 from robotid.commands.job import Job, LogEntry
 from robotid.export.result import load_result
+from robotid.identification.settings import SimulationSettings
 from robotid.logs.read import write_log
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
@@ -146,7 +147,11 @@ def test_a_controller_that_carries_the_weight_does_so_in_the_report_too(tmp_path
     log, _ = recorded(arm, np.random.default_rng(1), duration=0.5, rate=200.0)
     write_log(log, tmp_path / "log.csv")
     entry, result = LogEntry(tmp_path / "log.csv"), load_result(written_result(arm, tmp_path / "a"))
-    job = Job(Path(arm.model.tree.path), controller=LoopSettings(gravity_compensation=True))
+    job = Job(
+        Path(arm.model.tree.path),
+        estimator=SimulationSettings(),
+        controller=LoopSettings(gravity_compensation=True),
+    )
     heard = log_of_commands(job, entry, result)
     pi, still = arm.model.standard_parameters(), np.zeros_like(log.q)
     weight = predict_instants(arm.model, pi, log.q, still, still)
