@@ -441,7 +441,7 @@ def plant_log(plant, rng, seconds, noise=NOISE):
     robot = mujoco_plant.loaded(plant, RATE, FINE)
     robot.dof_solref[:] = 2 * FINE, 1.0
     robot.dof_solimp[:] = STIFF
-    q, _ = mujoco_plant.rolled_out(robot, q_ref, RATE)
+    q, *_ = mujoco_plant.rolled_out(robot, q_ref, RATE)
     q = q + noise * rng.standard_normal(q.shape)
     return Log(t, q, 0 * q, plant.model.joints, q_ref=q_ref, has_torque=False)
 

@@ -6,23 +6,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.drive_torques import find_behind
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
-from robotid.commanded.unknowns import LoopSimulator, TorqueRows, Unknown, body_unknowns
+from robotid.commanded.unknowns import (
+    LoopSimulator,
+    TorqueRows,
+    Unknown,
+    body_unknowns,
+    with_terms,
+)
 from robotid.commanded.zeros import Encoders, find_encoders, same_encoders
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
+from robotid.exceptions import DataError, SettingsError
+from robotid.findings import listed
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
+from robotid.logs.measured_velocity import is_trustworthy
 from robotid.robot.drives import DriveTerm, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
 from robotid.simulation.settings import PerJoint, by_joint
 
-__all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops", "with_terms"]
+__all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops"]
 
 #: What the fit of a job does, from files to files.
 STAGES = (
@@ -90,10 +100,12 @@ def fit_loops(
         progress: Told of the stages.
 
     Raises:
+        DataError: If a log lacks what is to be compared.
         MissingDependencyError: If Numba is not installed.
         NotConvergedError: If nothing that is tried can be rolled out.
         SettingsError: If a setting does not fit the robot.
     """
+    _check_settings(model, logs, loop, settings)
     robot = LoopedRobot(model, step=settings.step)
     encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
     logs = [log.turned(encoders.sign) for log in logs]
@@ -105,26 +117,29 @@ def fit_loops(
     has_gain = _is_stated(loop.kp, model)
     usual = _usual(robot, plain, windows, has_gain)
     base = _begin(model, stated, plain, usual, finds_limit=loop.limit == "find")
-    weighs = settings.torques and all(log.has_torque for log in logs)
+    compares = settings.error != "output"  # torques along roll-outs, not along what was measured
+    weighs = settings.torques and not compares and all(log.has_torque for log in logs)
     # positions alone tell the sum of kd and viscous friction
-    tells_kd = weighs or all(log.v_ref is not None for log in logs)
+    tells_kd = compares or weighs or all(log.v_ref is not None for log in logs)
     unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=tells_kd)
     unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
-    estimator = OutputError(
-        whitens=settings.whiten, most=np.exp(-_WHITE * dt / plain.time_constant), progress=progress
-    )
-    simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
+    most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 2)  # of positions, of speeds
+    estimator = OutputError(whitens=settings.whiten, most=most, progress=progress)
+    velocities = not compares and _has_velocities(settings, logs)
+    simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=velocities)
     report_stage(progress, "fitting loops", STAGES)
     if weighs:
         simulator = replace(simulator, torque=_torque_rows(model, base, logs))
     few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
     begun = replace(estimator, rounds=1).fit(few, simulator.prior)
     theta = begun.theta
+    if compares:
+        simulator = _of_torques(simulator, few, theta, settings.error)
     for _ in range(_STARTS):
         simulator = simulator.begun_better(theta)
-        estimate = estimator.fit(simulator, theta)
+        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
         theta = estimator.joint_step(simulator, estimate.theta)
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
@@ -144,8 +159,57 @@ def fit_loops(
         simulator, theta = _with(simulator, estimate.theta, taken)
         if weighs:
             simulator = replace(simulator, torque=_torque_rows(model, simulator.base, logs))
-        estimate = estimator.fit(simulator, theta)
+        estimate = estimator.fit(simulator, theta, exact=simulator.exact)
     return Fitted(simulator, estimate, plain, encoders, tuple(tried), tuple(groups))
+
+
+def _check_settings(
+    model: RobotModel, logs: Sequence[Log], loop: LoopSettings, settings: SimulationSettings
+) -> None:
+    """Refuse logs without what is to be compared, and unknown loops where they must be known."""
+    error = f"estimator: error = {settings.error!r}"
+    for log in logs:
+        if settings.velocities is True and log.v is None:
+            raise DataError(
+                f"estimator: velocities is true, but {log.name} has none; record columns dq_ of "
+                "each joint, or set velocities = 'auto'"
+            )
+        if settings.error != "output" and not log.has_torque:
+            raise DataError(
+                f"{error} compares torques, but {log.name} has none; record columns tau_ of each "
+                "joint, or set error = 'output'"
+            )
+    if settings.error != "direct":
+        return
+    unknown = [
+        key for key in ("kp", "kd", "delay") if not _is_stated(getattr(loop, key), model).all()
+    ]
+    unknown += ["limit"] * (loop.limit == "find") + ["zeros"] * (loop.zeros == "find")
+    if unknown:
+        raise SettingsError(
+            f"{error} needs a controller that is known, whose {listed(unknown)} would be found; "
+            "state them of each joint in [controller] (delay = 0 if there is none), or set "
+            "error = 'input'"
+        )
+
+
+def _has_velocities(settings: SimulationSettings, logs: Sequence[Log]) -> bool:
+    """Return whether measured velocities are compared."""
+    if settings.velocities != "auto":
+        return bool(settings.velocities)
+    return all(log.v is not None and is_trustworthy(log) for log in logs)
+
+
+def _of_torques(
+    simulator: LoopSimulator, few: LoopSimulator, theta: Array, error: str
+) -> LoopSimulator:
+    """Return the simulator with torques compared; some windows tell which command they follow."""
+    is_open = np.zeros((2, len(simulator.base.kp)), dtype=bool)
+    for unknown in simulator.unknowns:
+        if unknown.what in ("kp", "kd"):
+            is_open[("kp", "kd").index(unknown.what), list(unknown.joints)] = True
+    behind = find_behind(few.roll_out(theta), few.loops(theta), is_open)
+    return replace(simulator, error=error, behind=behind)
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
@@ -191,31 +255,6 @@ def _zeros(model: RobotModel, encoders: Encoders) -> list[Unknown]:
         Unknown(f"{model.joints[j]}.zero", "zero", (int(j),), float(encoders.zero[j]), _TURN)
         for j in np.flatnonzero(encoders.gain > 0)
     ]
-
-
-def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
-    """Return the model with the terms of loops that it has not yet.
-
-    Args:
-        model: The robot.
-        loops: Its loops.
-    """
-    own = {
-        joint: [
-            *model.layout.own.get(joint, ()),
-            *(t for t in terms if t not in _has(model, joint)),
-        ]
-        for joint, terms in zip(model.joints, loops.terms, strict=True)
-    }
-    return RobotModel.from_urdf(
-        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
-    )
-
-
-def _has(model: RobotModel, joint: str) -> list[object]:
-    """Return the terms that the model has of a joint."""
-    layout = model.layout
-    return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
 
 
 def _likeness(model: RobotModel) -> list[tuple[object, ...]]:

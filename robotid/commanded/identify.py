@@ -8,10 +8,11 @@ import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.errors import OpenLoop, run_open_loop
-from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_terms
+from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops
 from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.term_choice import Tried
+from robotid.commanded.unknowns import with_terms
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
@@ -216,7 +217,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"the fit has not settled after {estimate.n_iter} steps: its parameters may still "
             "move; state what you know of the loop in [controller], or use shorter windows",
         )
-    if not found.has_gains and found.fitted.simulator.torque is None:
+    if not found.has_gains and not found.fitted.simulator.knows_torques:
         yield Finding(
             "scale",
             "warning",

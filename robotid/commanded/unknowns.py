@@ -1,20 +1,24 @@
 """What is unknown of drives, loops and bodies, and the simulator that an estimator asks."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from robotid._typing import Array
+from robotid.commanded.drive_torques import drive_torques
 from robotid.estimators.output_error import Residual
 from robotid.exceptions import NotConvergedError
+from robotid.logs.data import Trajectory
+from robotid.regressor.memory import remember
+from robotid.regressor.prediction import predict
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
-from robotid.simulation.loops import LoopedRobot, Loops, RollOut, Window
+from robotid.simulation.loops import Column, LoopedRobot, Loops, RollOut, Window
 
-__all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns"]
+__all__ = ["LoopSimulator", "TorqueRows", "Unknown", "body_unknowns", "with_terms"]
 
 _STARTS = 2  # steps towards better starts of windows ...
 _SHARES = (1.0, 0.3, 0.1)  # ... of which these are tried
@@ -105,6 +109,11 @@ class LoopSimulator:
         base: All that is known; unknowns stand over it.
         unknowns: What is to be found.
         torque: Rows of measured torques, if there are any.
+        velocities: Whether measured velocities are compared beside the positions.
+        error: What is compared: "output", positions; "input", torques of the drives; "direct", the
+            same, whose derivatives neglect that the motion changes.
+        behind: How many rows the command that a torque follows is behind it, shape (n,), int; None
+            if no torques are compared.
     """
 
     robot: LoopedRobot
@@ -112,6 +121,9 @@ class LoopSimulator:
     base: Loops
     unknowns: tuple[Unknown, ...]
     torque: "TorqueRows | None" = None
+    velocities: bool = False
+    error: str = "output"
+    behind: Array | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -241,43 +253,119 @@ class LoopSimulator:
     def residuals(self, theta: Array, *, with_slopes: bool) -> list[Residual]:
         """Return what is measured less what comes out, window by window; see ``Simulator``.
 
+        Of ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
+
         Args:
             theta: Values of the unknowns, shape (c,).
             with_slopes: Whether derivatives are wanted.
 
         Raises:
             NotConvergedError: If a step has no solution.
+
+        References:
+            Janot, Vandanjon, Gautier (2014), A generic instrumental variable approach for
+            industrial robot identification, IEEE TCST 22(1), and the papers on DIDIM named there.
         """
-        everything = np.arange(len(self.base.kp))
-        none = np.array([], dtype=int)
-        if not with_slopes:
-            return [Residual(_error(out), None, everything, none) for out in self.roll_out(theta)]
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns, owners = self._columns(loops)
-        count = len(columns)
-        columns += self._starts()
+        rolls = with_slopes and self.error != "direct"
+        outs = self.robot.roll_out(
+            loops,
+            self.windows,
+            [*columns, *self._starts()] if rolls else (),
+            directions,
+            with_speeds=self.velocities or self.error != "output",
+        )
+        if rolls:
+            return [part for out in outs for part in self._parts(out, loops, columns, owners)]
+        everything, none = np.arange(self._outputs), np.array([], dtype=int)
+        if not with_slopes:
+            return [Residual(self._error(out, loops), None, everything, none) for out in outs]
+        slopes, own = self._inverse_dynamics(outs, theta), np.arange(len(theta))
+        return [
+            Residual(self._error(out, loops)[:, joints], Y[:, joints], joints, own)
+            for out, Y in zip(outs, slopes, strict=True)
+            for joints in self.robot.parts
+        ]
+
+    @property
+    def exact(self) -> "LoopSimulator | None":
+        """The same with exact derivatives, if its own neglect that the motion changes."""
+        return replace(self, error="input") if self.error == "direct" else None
+
+    @property
+    def knows_torques(self) -> bool:
+        """Whether measured torques weigh, along what was measured or along roll-outs."""
+        return self.torque is not None or self.error != "output"
+
+    @property
+    def _outputs(self) -> int:
+        """How many outputs are compared: positions, positions and speeds, or torques."""
+        return len(self.base.kp) * (2 if self.velocities and self.error == "output" else 1)
+
+    def _error(self, out: RollOut, loops: Loops) -> Array:
+        """Return what is measured less what comes out, shape (N, outputs)."""
+        if self.error != "output":
+            given = drive_torques(out, loops, self._behind).given
+            missed: Array = out.window.log.tau[out.window.counted] - given
+            return missed
+        error = _error(out)
+        if self.velocities:
+            error = np.hstack([error, out.window.log.v[out.window.counted] - out.v])  # type: ignore[index]
+        return error
+
+    @property
+    def _behind(self) -> Array:
+        return np.zeros(len(self.base.kp), dtype=int) if self.behind is None else self.behind
+
+    def _parts(
+        self, out: RollOut, loops: Loops, columns: list[Column], owners: Array
+    ) -> Iterator[Residual]:
+        """Yield the residuals of a roll-out's parts, with all that they change with."""
+        error, wanted, n = self._error(out, loops), [*columns, *self._starts()], len(loops.kp)
+        for joints, places, slopes in out.slopes:
+            outputs = joints
+            if self.error != "output":
+                torques, kinds = drive_torques(out, loops, self._behind), self.robot.kinds
+                slopes = torques.slopes(joints, [wanted[p] for p in places], slopes, kinds)
+            elif self.velocities:
+                outputs = np.concatenate([joints, n + joints])
+            is_start = places >= len(columns)
+            by_start, slopes = slopes[:, :, is_start], slopes[:, :, ~is_start]
+            owner = owners[places[~is_start]]
+            own = np.unique(owner)
+            if len(own) < len(owner):  # a column of each joint that shares it
+                shared = np.zeros((len(owner), len(own)))
+                shared[np.arange(len(owner)), np.searchsorted(own, owner)] = 1.0
+                slopes = slopes @ shared
+            else:
+                slopes = slopes[:, :, np.argsort(owner)]
+            yield Residual(error[:, outputs], slopes, outputs, own, by_start)
+
+    def _inverse_dynamics(self, outs: Sequence[RollOut], theta: Array) -> list[Array]:
+        """Return Y(q, v, a) d pi along roll-outs, window by window, shape (N, n, c)."""
+        model, (_, slopes) = self._described, self.standard(self._described, theta)
         found = []
-        for out in self.robot.roll_out(loops, self.windows, columns, directions):
-            error = _error(out)
-            for joints, places, slopes in out.slopes:
-                by_start = slopes[:, :, places >= count]
-                slopes, places = slopes[:, :, places < count], places[places < count]
-                own = np.unique(owners[places])
-                if len(own) < len(places):  # a column of each joint that shares it
-                    shared = np.zeros((len(places), len(own)))
-                    shared[np.arange(len(places)), np.searchsorted(own, owners[places])] = 1.0
-                    slopes = slopes @ shared
-                else:
-                    slopes = slopes[:, :, np.argsort(owners[places])]
-                found.append(Residual(error[:, joints], slopes, joints, own, by_start))
+        for out in outs:
+            t = out.window.log.t[out.window.counted]
+            a, none = np.gradient(out.v, t, axis=0), np.zeros_like(out.q)
+            segment = np.zeros(len(t), dtype=int)
+            motion = Trajectory(t, out.q, out.v, a, none, model.joints, None, segment)
+            torques = predict(model, list(slopes.T), remember(model, motion))
+            found.append(np.stack(torques, axis=-1))
         return found
 
-    def _starts(self) -> list[tuple[int, int, int]]:
+    @cached_property
+    def _described(self) -> RobotModel:
+        """The robot with the terms of its loops."""
+        return with_terms(self.robot.model, self.base)
+
+    def _starts(self) -> list[Column]:
         """Return the columns of positions and speeds where windows begin."""
         kinds, n = self.robot.kinds, len(self.base.kp)
         return [(kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
 
-    def _columns(self, loops: Loops) -> tuple[list[tuple[int, int, int]], Array]:
+    def _columns(self, loops: Loops) -> tuple[list[Column], Array]:
         """Return what to differentiate by, and the unknown that each column is of."""
         kinds = self.robot.kinds
         columns, owners, body = [], [], 0
@@ -323,6 +411,31 @@ class LoopSimulator:
                 half = U @ change @ T.T @ U.T
                 directions.append(inertial_from_pseudo_inertia(half + half.T))
         return bodies, np.array(directions).reshape(-1, 10)
+
+
+def with_terms(model: RobotModel, loops: Loops) -> RobotModel:
+    """Return the model with the terms of loops that it has not yet.
+
+    Args:
+        model: The robot.
+        loops: Its loops.
+    """
+    own = {
+        joint: [
+            *model.layout.own.get(joint, ()),
+            *(t for t in terms if t not in _has(model, joint)),
+        ]
+        for joint, terms in zip(model.joints, loops.terms, strict=True)
+    }
+    return RobotModel.from_urdf(
+        model.tree, **{**model.options, "own_terms": {k: v for k, v in own.items() if v}}
+    )
+
+
+def _has(model: RobotModel, joint: str) -> list[object]:
+    """Return the terms that the model has of a joint."""
+    layout = model.layout
+    return [term for d, term in layout.drive_parameters if layout.drives[d].name == joint]
 
 
 def _better_start(out: RollOut, sigma: Array) -> Array:

@@ -26,6 +26,8 @@ _ROUNDS = 5  # of whitening and noise levels ...
 _SETTLED = 2e-2  # ... until they change by less than that
 _ROUGH, _CLOSE = 1e-3, 1e-5  # relative decrease that ends a round, and the last one
 _TOO_STIFF = 1e10  # damping at which no step lowers the cost any more
+_UPHILL = 1e-2  # relative increase that a step with inexact derivatives may cost
+_NEAR = 1e-2  # of a standard error, squared, that such a step ends at
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
 _NO_TRACE = 1e-3  # noise levels that a start moves a window by, below which it is no matter
 _STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
@@ -134,12 +136,18 @@ class OutputError:
     rounds: int = _ROUNDS
     progress: ProgressCallback = field(default=ignore_progress)
 
-    def fit(self, simulator: Simulator, start: Array) -> Estimate:
+    def fit(
+        self, simulator: Simulator, start: Array, *, exact: Simulator | None = None
+    ) -> Estimate:
         """Estimate the parameters.
+
+        Where the simulator's derivatives A are not those S of its residuals e, steps end where
+        A'e = 0, and errors are those of that equation, (A'S)^-1 A'e.
 
         Args:
             simulator: What rolls out.
             start: Where to begin, shape (c,).
+            exact: The same with exact derivatives, if its own are not.
 
         Raises:
             DataError: If there are fewer samples than parameters.
@@ -149,14 +157,16 @@ class OutputError:
         weights, rounds, count, converged = self.weights(simulator, theta), 0, 0, False
         for rounds in range(1, self.rounds + 1):
             close = _ROUGH if rounds == 1 else _CLOSE
-            theta, steps, converged = self._descend(simulator, weights, theta, close)
+            theta, steps, converged = self._descend(
+                simulator, weights, theta, close, is_exact=exact is None
+            )
             count += steps
             before, weights = weights, self.weights(simulator, theta)
             change = np.abs(weights.sigma / before.sigma - 1.0).max()
             if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
                 break
             converged = False
-        return self._estimate(simulator, weights, theta, converged, count, rounds)
+        return self._estimate(simulator, weights, theta, converged, count, rounds, exact)
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
         """Return correlation and level of the residuals, which they are weighed by.
@@ -213,7 +223,13 @@ class OutputError:
         return H + A.T @ A, g + A.T @ b
 
     def _descend(
-        self, simulator: Simulator, weights: _Weights, theta: Array, close: float
+        self,
+        simulator: Simulator,
+        weights: _Weights,
+        theta: Array,
+        close: float,
+        *,
+        is_exact: bool,
     ) -> tuple[Array, int, bool]:
         """Minimise with given weights; return where it ends, its steps, and whether it settled."""
         damping, cost = 1e-3, self._cost(simulator, weights, theta)
@@ -223,20 +239,22 @@ class OutputError:
                 "gains nearer to the drive's in [controller]",
                 "no start",
             )
+        highest = 1.0 if is_exact else 1.0 + _UPHILL
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
             H, g = self._normal(simulator, weights, theta)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.lowest, damping)
                 new = self._cost(simulator, weights, trial)
-                if new < cost or damping > _TOO_STIFF:
+                if new < highest * cost or damping > _TOO_STIFF:
                     break
                 damping *= 6.0
-            if not new < cost:
+            if not new < highest * cost:
                 return theta, step, True  # no step lowers it: it is the minimum to rounding
+            is_near = float(g @ (trial - theta)) < _NEAR
             decrease, theta, cost = (cost - new) / cost, trial, new
             damping = max(damping / 6.0, 1e-9)
-            if decrease < close:
+            if decrease < close if is_exact else is_near:
                 return theta, step, True
         return theta, self.steps, False
 
@@ -248,6 +266,7 @@ class OutputError:
         converged: bool,
         steps: int,
         rounds: int,
+        exact: Simulator | None,
     ) -> Estimate:
         """Return the estimate, its errors from how much the scores of stretches scatter."""
         H, _ = self._normal(simulator, weights, theta, frees=True)
@@ -267,7 +286,9 @@ class OutputError:
             meat, inflation, freedom = found.meat, found.inflation, found.freedom()
             further = simulator.rows(theta)[0]
             meat = meat + further.T @ further
-        covariance = bread @ (meat + np.diag(known)) @ bread
+        if exact is not None:
+            bread = np.linalg.inv(_cross(simulator, exact, weights, theta) + np.diag(known))
+        covariance = bread @ (meat + np.diag(known)) @ bread.T
         # never better known than independent rows would make it
         spread = np.sqrt(np.maximum(np.diag(covariance), np.diag(bread)))
         correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
@@ -331,6 +352,15 @@ def linearised(
             U = U[:, sizes > _NO_TRACE]
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
         yield A, b, r.columns
+
+
+def _cross(simulator: Simulator, exact: Simulator, weights: _Weights, theta: Array) -> Array:
+    """Return A'S of a simulator's derivatives A and the exact ones S, whitened, shape (c, c)."""
+    product = np.zeros((len(theta), len(theta)))
+    parts = (linearised(one, weights, theta) for one in (simulator, exact))
+    for (A, _, rows), (S, _, columns) in zip(*parts, strict=True):
+        product[np.ix_(rows, columns)] += A.T @ S
+    return product
 
 
 def _given(r: Residual) -> Array:

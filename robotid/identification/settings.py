@@ -358,12 +358,40 @@ class SimulationSettings(EstimatorSettings):
         "plausible relative error of the URDF's bodies, by which they may change; 0: they stay",
         within=_NOT_NEGATIVE,
     )
+    error: str = setting(
+        "output",
+        "what is compared: output, the positions (closed-loop output error, CLOE); input, the "
+        "torques of the loops, rolled out, with those logged (closed-loop input error, CLIE); "
+        "direct, the same with derivatives that neglect that the motion changes, which are those "
+        "of inverse dynamics (DIDIM; gains and delay must be stated)",
+        among=("output", "input", "direct"),
+    )
+    velocities: bool | str = setting(
+        "auto",
+        "whether logged velocities weigh beside the positions; auto: where those of all logs are "
+        "timely, fine and their positions' own",
+        among=("auto",),
+    )
     torques: bool = setting(
         True, "whether torques weigh beside the positions, where all logs have them"
     )
     whiten: bool = setting(
         True, "whether the correlation of the residuals is estimated and taken out"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.error == "output":
+            return
+        compared = f"estimator: error = {self.error!r} compares torques"
+        if not self.torques:
+            raise SettingsError(
+                f"{compared}, but torques is false; leave it out, or set error = 'output'"
+            )
+        if self.velocities is True:
+            raise SettingsError(
+                f"{compared}, but velocities is true; leave it out, or set error = 'output'"
+            )
 
 
 #: The settings of each estimator, by its name.

@@ -652,7 +652,8 @@ def roll_out(
         start: Positions and speeds, shape (2, n, LANES).
         out_q: Positions of the samples, shape (N, n, LANES); written.
         out_v: Speeds, likewise; written.
-        out_S: Sensitivities of position, shape (N, n, P, LANES); written.
+        out_S: Sensitivities of position, shape (N, n, P, LANES), or of position and then of speed,
+            shape (N, 2n, P, LANES); written.
         work: Work space of ``work_size``.
     """
     n, P = len(parents), len(columns)
@@ -675,8 +676,8 @@ def roll_out(
             if columns[p, 0] == START or columns[p, 0] == SPEED:
                 row = columns[p, 1] + (n if columns[p, 0] == SPEED else 0)
                 _put(work, S + row * P + p, lane, 1.0)
-                if columns[p, 0] == START:
-                    out_S[0, columns[p, 1], p, lane] = 1.0
+                if row < out_S.shape[1]:
+                    out_S[0, row, p, lane] = 1.0
     for k in range(len(steps)):
         step = steps[k]
         for i in range(n):
@@ -712,7 +713,9 @@ def roll_out(
                 for lane in range(LANES):
                     out_q[sample, i, lane] = _get(work, q + i, lane)
                     out_v[sample, i, lane] = _get(work, v + i, lane)
-                    for p in range(P):
+            for i in range(out_S.shape[1]):
+                for p in range(P):
+                    for lane in range(LANES):
                         out_S[sample, i, p, lane] = _get(work, S + i * P + p, lane)
     return -1
 

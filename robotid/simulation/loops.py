@@ -36,7 +36,7 @@ from robotid.robot.drives import (
 )
 from robotid.robot.model import RobotModel
 
-__all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows"]
+__all__ = ["Column", "LoopedRobot", "Loops", "RollOut", "Window", "cut_windows"]
 
 #: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
@@ -174,7 +174,8 @@ class RollOut:
         q: Positions of the samples that count, shape (N, n) [rad or m].
         v: Speeds, likewise.
         slopes: For each part of the robot its joints, shape (k,), the columns that move them, shape
-            (c,), and the derivatives of their positions, shape (N, k, c).
+            (c,), and the derivatives of their positions, shape (N, k, c); where those of speeds
+            were asked for, they follow, shape (N, 2k, c).
     """
 
     window: Window
@@ -241,6 +242,11 @@ class LoopedRobot:
         }
 
     @property
+    def parts(self) -> tuple[Array, ...]:
+        """The joints of each part that moves by itself."""
+        return tuple(part.joints for part in self._parts)
+
+    @property
     def joint_of_body(self) -> tuple[int, ...]:
         """The joint that moves each body of the layout."""
         found = {
@@ -256,6 +262,8 @@ class LoopedRobot:
         windows: Sequence[Window],
         columns: Sequence[Column] = (),
         directions: Array | None = None,
+        *,
+        with_speeds: bool = False,
     ) -> list[RollOut]:
         """Return what windows come out as.
 
@@ -264,6 +272,7 @@ class LoopedRobot:
             windows: The windows.
             columns: What to differentiate by: kind, joint, and index of a term or a direction.
             directions: Changes of a body's ten parameters, shape (D, 10).
+            with_speeds: Whether speeds are differentiated, too.
 
         Raises:
             NotConvergedError: If a step has no solution, as where friction falls below 0.
@@ -273,8 +282,11 @@ class LoopedRobot:
         lanes = _lanes()
         blocks = [windows[k : k + lanes.LANES] for k in range(0, len(windows), lanes.LANES)]
         pieces = [(part, block) for block in blocks for part in self._parts]
+        outputs = 2 if with_speeds else 1
         with ThreadPoolExecutor(max_workers=min(len(pieces), cpu_count() or 1) or 1) as pool:
-            done = list(pool.map(lambda p: self._block(p[0], p[1], loops, wanted, along), pieces))
+            done = list(
+                pool.map(lambda p: self._block(p[0], p[1], loops, wanted, along, outputs), pieces)
+            )
         n, each = len(self.model.joints), len(self._parts)
         found = []
         for b, block in enumerate(blocks):
@@ -293,7 +305,13 @@ class LoopedRobot:
         return found
 
     def _block(
-        self, part: _Part, windows: Sequence[Window], loops: Loops, wanted: Array, along: Array
+        self,
+        part: _Part,
+        windows: Sequence[Window],
+        loops: Loops,
+        wanted: Array,
+        along: Array,
+        outputs: int,
     ) -> tuple[Array, Array, Array, Array]:
         """Return columns, positions, speeds and derivatives of one part in a block of windows."""
         lanes = _lanes()
@@ -316,7 +334,7 @@ class LoopedRobot:
         command, steps, every, start = self._commands(part, windows, loops)
         samples = len(steps) // every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
-        S = np.zeros((samples, n, len(columns), lanes.LANES))
+        S = np.zeros((samples, outputs * n, len(columns), lanes.LANES))
         q[0], v[0] = start
         failed = lanes.roll_out(
             part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],

@@ -85,7 +85,7 @@ def plant(name, rng, **changes):
     return Plant(model, tuple(drives), np.array(middle), np.array(reach))
 
 
-def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None):
+def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None, speed=None):
     """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
 
     Args:
@@ -95,16 +95,18 @@ def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None):
         rate: Rows per second, each a command that is held until the next [Hz].
         noise: Standard deviation of the encoders [rad].
         torque: Standard deviation of the drives' logged torques [N m]; None: none are logged.
+        speed: Standard deviation of the logged speeds [rad/s]; None: none are logged.
     """
     t = np.arange(round(duration * rate)) / rate
     q_ref = multisine(t, plant.middle, plant.reach, rng)
-    q, force = rolled_out(loaded(plant, rate), q_ref, rate)
+    q, force, v = rolled_out(loaded(plant, rate), q_ref, rate)
+    v = None if speed is None else v + speed * rng.standard_normal(v.shape)
     q = q + noise * rng.standard_normal(q.shape)
     tau = np.zeros_like(q)
     if torque is not None:  # of the drive, whose offset does not reach the joint
         tau = force + [drive.offset for drive in plant.drives]
         tau += torque * rng.standard_normal(q.shape)
-    log = Log(t, q, tau, plant.model.joints, q_ref=q_ref, has_torque=torque is not None)
+    log = Log(t, q, tau, plant.model.joints, v=v, q_ref=q_ref, has_torque=torque is not None)
     return log, plant.truth
 
 
@@ -154,7 +156,7 @@ def followed(robot, q_ref, rate, settles=_SETTLES):
 
 
 def rolled_out(robot, q_ref, rate, settles=_SETTLES):
-    """Return positions and forces of MuJoCo's robot, shape (N, n), at the times of held commands.
+    """Return positions, forces and speeds of MuJoCo's robot, (N, n), at times of held commands.
 
     Args:
         robot: MuJoCo's model; its actuators are in the order of the commands.
@@ -179,4 +181,6 @@ def rolled_out(robot, q_ref, rate, settles=_SETTLES):
     states, forces = rollout.rollout(robot, data, state[None], control[None])
     qpos = states[0, :, 1 : 1 + robot.nq]  # after the time; a row after each step
     q = qpos[before - 1 :][: held * len(q_ref) : held, at]
-    return q, forces[0, before::held]  # which a step tells of the state that it begins with
+    qvel = states[0, before - 1 :, 1 + robot.nq : 1 + robot.nq + robot.nv]
+    v = qvel[: held * len(q_ref) : held, robot.jnt_dofadr[robot.actuator_trnid[:, 0]]]
+    return q, forces[0, before::held], v  # forces: of the state that a step begins with
