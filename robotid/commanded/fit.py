@@ -169,9 +169,9 @@ def _check_settings(
     """Refuse logs without what is to be compared, and unknown loops where they must be known."""
     error = f"estimator: error = {settings.error!r}"
     for log in logs:
-        if settings.velocities is True and log.v is None:
+        if settings.velocities == "measured" and log.v is None:
             raise DataError(
-                f"estimator: velocities is true, but {log.name} has none; record columns dq_ of "
+                f"estimator: velocities is 'measured', but {log.name} has none; record columns dq_ of "
                 "each joint, or set velocities = 'auto'"
             )
         if settings.error != "output" and not log.has_torque:
@@ -196,7 +196,7 @@ def _check_settings(
 def _has_velocities(settings: SimulationSettings, logs: Sequence[Log]) -> bool:
     """Return whether measured velocities are compared."""
     if settings.velocities != "auto":
-        return bool(settings.velocities)
+        return settings.velocities == "measured"
     return all(log.v is not None and is_trustworthy(log) for log in logs)
 
 

@@ -147,8 +147,13 @@ def test_a_gear_loses_a_share_of_its_load(planar):
 
 
 def differences(model, loops, log, change, h):
-    """Return the derivative of the positions by central differences of fourth order."""
-    near, far = ([rolled(model, change(loops, s * x), log).q for s in (1, -1)] for x in (h, 2 * h))
+    """Return the derivative of positions and speeds by central differences of fourth order."""
+
+    def motion(x):
+        out = rolled(model, change(loops, x), log)
+        return np.stack([out.q, out.v])
+
+    near, far = ([motion(s * x) for s in (1, -1)] for x in (h, 2 * h))
     return (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
 
 
@@ -185,22 +190,27 @@ def test_sensitivities_are_those_of_differences(request, name):
         columns.append((kinds["body"], joint, 10 * body + k))
         changes.append(by("bodies", (body, k)))
     directions = np.tile(np.eye(10), (n, 1))
-    [out] = robot.roll_out(loops, cut_windows(log, np.inf, 0.0), columns, directions)
+    [out] = robot.roll_out(
+        loops, cut_windows(log, np.inf, 0.0), columns, directions, with_speeds=True
+    )
     assert len(out.slopes) == (1 if name == "ur5" else 2)
     np.testing.assert_array_equal(out.q, rolled(model, loops, log).q)
     worst, unseen, seen = {}, set(), set()
     for joints, places, slopes in out.slopes:
+        k = len(joints)
         for c, p in enumerate(places):
-            size = np.abs(slopes[:, :, c]).max()
+            size = np.abs(slopes[:, :k, c]).max()
             h = 3e-7 / max(size, 1e-3)  # friction turns over 1e-3 rad/s: no step may be wider
             exact = differences(model, loops, log, changes[p], h)
-            assert not np.delete(exact, joints, axis=1).any(), "parts move by themselves"
-            scale = np.abs(exact).max()
+            assert not np.delete(exact, joints, axis=2).any(), "parts move by themselves"
+            scale = np.abs(exact[0]).max()
             if scale < 1e-9:
                 unseen.add(columns[p][0])
             else:
                 seen.add(columns[p])
-            worst[columns[p]] = np.abs(slopes[:, :, c] - exact[:, joints]).max() / max(scale, 1e-9)
+            parts = zip((slopes[:, :k, c], slopes[:, k:, c]), exact[:, :, joints], strict=True)
+            missed = [np.abs(s - x).max() / max(np.abs(x).max(), 1e-9) for s, x in parts]
+            worst[columns[p]] = max(missed)
     assert max(worst.values()) < 1e-6, worst
     assert unseen <= {kinds["zero"], kinds["body"], kinds["limit"]}, "about the vertical, or idle"
     assert any(kind == kinds["limit"] for kind, *_ in seen)
@@ -269,7 +279,8 @@ def test_sensitivities_by_the_start_are_those_of_differences(legs):
     robot, loops, n = LoopedRobot(legs), loops_of(legs, TERMS), len(legs.joints)
     [window] = cut_windows(commanded(legs, 0.2), np.inf, 0.0)
     columns = [(robot.kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
-    [out] = robot.roll_out(loops, [window], columns)
+    [out] = robot.roll_out(loops, [window], columns, with_speeds=True)
+    [plain] = robot.roll_out(loops, [window], columns)
     h = 1e-7
     for joints, places, slopes in out.slopes:
         for c, p in enumerate(places):
@@ -277,9 +288,13 @@ def test_sensitivities_by_the_start_are_those_of_differences(legs):
             step[p] = h
             ends = [replace(window, given=window.start + s * step.reshape(2, n)) for s in (1, -1)]
             up, down = robot.roll_out(loops, ends)
-            exact = (up.q - down.q)[:, joints] / (2 * h)
-            np.testing.assert_allclose(slopes[:, :, c], exact, atol=1e-5)
-            assert np.abs(exact).max() > 1e-3
+            exact = (np.hstack([up.q, up.v]) - np.hstack([down.q, down.v])) / (2 * h)
+            exact = exact[:, [*joints, *(n + joints)]]
+            size = np.abs(exact[:, : len(joints)]).max()
+            np.testing.assert_allclose(slopes[:, :, c], exact, atol=1e-5 * np.abs(exact).max())
+            assert size > 1e-3
+    for (_, _, both), (joints, _, positions) in zip(out.slopes, plain.slopes, strict=True):
+        np.testing.assert_array_equal(positions, both[:, : len(joints)])
 
 
 def test_lanes_know_nothing_of_each_other(legs):
