@@ -62,7 +62,7 @@ class DriveTorques:
         for c, (kind, joint, _) in enumerate(columns):
             if kind == kinds["limit"]:
                 side = np.sign(self.asked[:, [joint]])
-                change[:, joints == joint, c] = np.where(at_limit[:, joints == joint], side, 0.0)
+                change[:, joints == joint, c] += at_limit[:, joints == joint] * side
         return change
 
 

@@ -127,8 +127,7 @@ def fit_loops(
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 2)  # of positions, of speeds
     estimator = OutputError(whitens=settings.whiten, most=most, progress=progress)
-    velocities = not compares and _has_velocities(settings, logs)
-    simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=velocities)
+    simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=settings.velocities)
     report_stage(progress, "fitting loops", STAGES)
     if weighs:
         simulator = replace(simulator, torque=_torque_rows(model, base, logs))
@@ -169,10 +168,11 @@ def _check_settings(
     """Refuse logs without what is to be compared, and unknown loops where they must be known."""
     error = f"estimator: error = {settings.error!r}"
     for log in logs:
-        if settings.velocities == "measured" and log.v is None:
+        if settings.velocities and (log.v is None or not is_trustworthy(log)):
+            found = "none" if log.v is None else "late or coarse ones, or not its positions' own"
             raise DataError(
-                f"estimator: velocities is 'measured', but {log.name} has none; record columns dq_ of "
-                "each joint, or set velocities = 'auto'"
+                f"estimator: velocities is true, but {log.name} has {found}; record columns dq_ "
+                "of each joint, or leave velocities out"
             )
         if settings.error != "output" and not log.has_torque:
             raise DataError(
@@ -191,13 +191,6 @@ def _check_settings(
             "state them of each joint in [controller] (delay = 0 if there is none), or set "
             "error = 'input'"
         )
-
-
-def _has_velocities(settings: SimulationSettings, logs: Sequence[Log]) -> bool:
-    """Return whether measured velocities are compared."""
-    if settings.velocities != "auto":
-        return settings.velocities == "measured"
-    return all(log.v is not None and is_trustworthy(log) for log in logs)
 
 
 def _of_torques(

@@ -27,6 +27,7 @@ __all__ = ["Commanded", "identify_commands", "with_gravity"]
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _FROM_PRIOR = 0.9  # ... above this share, what was assumed of it
 _TOGETHER = 0.98  # correlation from which two parameters are told together only
+_SOFT = 0.5  # of what a step should correct: a loop that leaves more is soft
 _NAMED = 8  # parameters that a sentence names
 
 
@@ -216,6 +217,16 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             "fit",
             f"the fit has not settled after {estimate.n_iter} steps: its parameters may still "
             "move; state what you know of the loop in [controller], or use shorter windows",
+        )
+    if (left := estimate.details["left"]) > _SOFT:
+        yield Finding(
+            "soft_loop",
+            "warning",
+            "fit",
+            f"a step of error = 'direct' leaves {100 * left:.0f} % of what it should correct, "
+            "because it neglects how the motion changes; errors are large in a loop as soft as "
+            "this. Set error = 'input'",
+            {"left": left},
         )
     if not found.has_gains and not found.fitted.simulator.knows_torques:
         yield Finding(

@@ -142,7 +142,8 @@ class OutputError:
         """Estimate the parameters.
 
         Where the simulator's derivatives A are not those S of its residuals e, steps end where
-        A'e = 0, and errors are those of that equation, (A'S)^-1 A'e.
+        A'e = 0, and errors are those of that equation, (A'S)^-1 A'e. A step leaves the share
+        1 - (A'A)^-1 A'S of what it should correct; ``details`` has the largest, ``left``.
 
         Args:
             simulator: What rolls out.
@@ -286,14 +287,18 @@ class OutputError:
             meat, inflation, freedom = found.meat, found.inflation, found.freedom()
             further = simulator.rows(theta)[0]
             meat = meat + further.T @ further
+        left = 0.0
         if exact is not None:
-            bread = np.linalg.inv(_cross(simulator, exact, weights, theta) + np.diag(known))
+            C = _cross(simulator, exact, weights, theta) + np.diag(known)
+            left = float(np.abs(np.linalg.eigvals(np.eye(len(theta)) - bread @ C)).max())
+            bread = np.linalg.inv(C)
         covariance = bread @ (meat + np.diag(known)) @ bread.T
         # never better known than independent rows would make it
-        spread = np.sqrt(np.maximum(np.diag(covariance), np.diag(bread)))
+        independent = np.diag(bread @ H @ bread.T)
+        spread = np.sqrt(np.maximum(np.diag(covariance), independent))
         correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
         covariance = correlation * np.outer(spread, spread)
-        gained = 1.0 - np.diag(bread) * known  # of each parameter's prior variance
+        gained = 1.0 - independent * known  # of each parameter's prior variance
         undetermined = tuple(
             name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
         )
@@ -306,7 +311,7 @@ class OutputError:
             rank=len(theta) - len(undetermined),
             condition=float(np.sqrt(values[-1] / max(values[0], 1e-300))),
             undetermined=undetermined,
-            converged=converged,
+            converged=converged and left < 1.0,
             n_iter=steps,
             message=f"output error, {steps} steps in {rounds} rounds, {state}",
             prior_std=simulator.prior_std,
@@ -314,6 +319,7 @@ class OutputError:
                 "correlation": weights.rho,
                 "inflation": inflation,
                 "freedom": freedom,
+                "left": left,
                 "at_bound": tuple(
                     name
                     for name, x, low in zip(simulator.names, theta, simulator.lowest, strict=True)

@@ -366,11 +366,10 @@ class SimulationSettings(EstimatorSettings):
         "of inverse dynamics (DIDIM; gains and delay must be stated)",
         among=("output", "input", "direct"),
     )
-    velocities: str = setting(
-        "auto",
-        "velocities that weigh beside the positions: measured, of logs that all have them; auto, "
-        "where those are timely, fine and their positions' own; or none",
-        among=("auto", "measured", "none"),
+    velocities: bool = setting(
+        False,
+        "whether logged velocities weigh beside the positions; those that a drive differentiates "
+        "from its encoder tell nothing more",
     )
     torques: bool = setting(
         True, "whether torques weigh beside the positions, where all logs have them"
@@ -388,9 +387,9 @@ class SimulationSettings(EstimatorSettings):
             raise SettingsError(
                 f"{compared}, but torques is false; leave it out, or set error = 'output'"
             )
-        if self.velocities == "measured":
+        if self.velocities:
             raise SettingsError(
-                f"{compared}, but velocities is 'measured'; leave it out, or set error = 'output'"
+                f"{compared}, but velocities is true; leave it out, or set error = 'output'"
             )
 
 

@@ -1,12 +1,17 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from helpers.mujoco_plant import plant, recorded
+from helpers.mujoco_plant import multisine, plant, recorded
 
+from robotid.commanded.drive_torques import drive_torques, find_behind
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
+from robotid.estimators.output_error import OutputError
+from robotid.export.commanded import loops_of
+from robotid.logs.data import Log
 from robotid.robot.drives import Coulomb, Viscous
 from robotid.robot.parameters import pseudo_inertia
 from robotid.simulation.loops import LoopedRobot, cut_windows
@@ -17,7 +22,7 @@ def simulator():
     """A leg whose upper joints share armature and viscous friction, its bodies free."""
     rng = np.random.default_rng(0)
     robot = plant("leg", rng)
-    log, _ = recorded(robot, rng, duration=0.5)
+    log, _ = recorded(robot, rng, duration=0.5, torque=0.1, speed=0.01)
     looped = LoopedRobot(robot.model)
     base = replace(
         stated_loops(robot.model, LoopSettings(kp=20.0, kd=1.5)),
@@ -35,15 +40,39 @@ def simulator():
     return LoopSimulator(looped, cut_windows(log, 0.25, 0.0), base, unknowns)
 
 
-def test_slopes_of_residuals_are_those_of_differences(simulator, rng):
-    theta = simulator.prior + np.array(
-        [0.05 * rng.standard_normal() if u.what == "body" else 0.0 for u in simulator.unknowns]
+def limited(simulator):
+    """The same with a largest torque, which is unknown as gains and zeros are."""
+    limit = np.array([np.inf, 0.3, 0.3])
+    unknowns = (
+        Unknown("lower.limit", "limit", (1, 2), 0.3, 3.0, 0.1),
+        Unknown("lower.kd", "kd", (1, 2), 1.5, 1.0, 0.0),
+        Unknown("calf.zero", "zero", (2,), 0.0, 0.3),
     )
+    base = replace(simulator.base, limit=limit)
+    return replace(simulator, base=base, unknowns=simulator.unknowns + unknowns)
+
+
+def off(simulator, rng):
+    """Parameters whose bodies are not the URDF's."""
+    is_body = np.array([u.what == "body" for u in simulator.unknowns])
+    return simulator.prior + np.where(is_body, 0.05 * rng.standard_normal(len(is_body)), 0.0)
+
+
+@pytest.mark.parametrize("compared", ["positions", "speeds", "torques"])
+def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
+    if compared == "speeds":
+        simulator = replace(simulator, velocities=True)
+    if compared == "torques":
+        simulator = replace(limited(simulator), error="input", behind=np.array([3, 2, 3]))
+    theta = off(simulator, rng)
     found = simulator.residuals(theta, with_slopes=True)
     slopes = np.concatenate([r.slopes for r in found])  # of the outputs
     np.testing.assert_array_equal(found[0].columns, np.arange(len(theta)))
+    assert slopes.shape[1] == (6 if compared == "speeds" else 3)
     for k, name in enumerate(simulator.names):
-        h = 3e-8 / max(np.abs(slopes[..., k]).max(), 1e-4)
+        h = 3e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
+        if compared == "torques":
+            h = 1e-6 * max(abs(theta[k]), 0.1)
         ends = []
         for s in (1, -1):
             moved = theta.copy()
@@ -52,8 +81,15 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng):
                 np.concatenate([r.e for r in simulator.residuals(moved, with_slopes=False)])
             )
         exact = -(ends[0] - ends[1]) / (2 * h)
-        size = max(np.abs(exact).max(), 1e-6)
-        np.testing.assert_allclose(slopes[..., k], exact, atol=1e-5 * size, err_msg=name)
+        size = np.maximum(np.abs(exact).max(axis=0), 1e-6)
+        close = 1e-4 if compared == "torques" else 1e-5  # by a wider step
+        assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size.max()).all(), name
+    if compared == "torques":
+        given = np.concatenate([out.window.log.tau[out.window.counted] - r.e for out, r in zip(
+            simulator.roll_out(theta), simulator.residuals(theta, with_slopes=False), strict=True
+        )])  # fmt: skip
+        at_limit = np.isclose(np.abs(given), 0.3)
+        assert 0.02 < at_limit[:, 1:].mean() < 0.9, "drives are at their limit, and are not"
 
 
 def test_unknowns_stand_over_what_is_known(simulator):
@@ -79,3 +115,116 @@ def test_every_value_is_a_body_that_can_be(simulator, rng):
     body = simulator.robot.joint_of_body.index(simulator.unknowns[k].joints[0])
     ratio = simulator.loops(theta).bodies[body, 0] / simulator.base.bodies[body, 0]
     assert ratio == pytest.approx(np.exp(0.2), rel=1e-9)
+
+
+def test_what_is_compared_is_what_was_logged(simulator):
+    theta = simulator.prior
+    log, n = simulator.windows[0].log, 3
+    outs = simulator.roll_out(theta)
+    both = replace(simulator, velocities=True).residuals(theta, with_slopes=False)
+    behind = np.array([0, 3, 2])
+    torques = replace(simulator, error="input", behind=behind).residuals(theta, with_slopes=False)
+    for out, moved, given in zip(outs, both, torques, strict=True):
+        k = out.window.counted
+        np.testing.assert_array_equal(moved.e[:, :n], log.q[k] - out.q)
+        np.testing.assert_array_equal(moved.e[:, n:], log.v[k] - out.v)
+        rows = np.arange(k.start, k.stop)
+        for j in range(n):
+            told = log.q_ref[np.maximum(rows - behind[j], 0), j]
+            tau = 20.0 * (told - out.q[:, j]) - 1.5 * out.v[:, j]
+            np.testing.assert_allclose(given.e[:, j], log.tau[k, j] - tau, atol=1e-12)
+
+
+def test_direct_slopes_are_those_of_inverse_dynamics_along_the_roll_out(simulator, rng):
+    """By the recursive Newton-Euler algorithm, with bodies a little different."""
+    theta = off(simulator, rng)
+    direct = replace(simulator, error="direct", behind=np.full(3, 3))
+    found = direct.residuals(theta, with_slopes=True)
+    torques = direct.exact.residuals(theta, with_slopes=False)
+    model = simulator.robot.model
+    outs, names = simulator.roll_out(theta), simulator.names
+    for out, one, exact in zip(outs, found, torques, strict=True):
+        np.testing.assert_array_equal(one.e, exact.e)
+        t = out.window.log.t[out.window.counted]
+        a = np.gradient(out.v, t, axis=0)
+        own = one.slopes[:, :, names.index("upper.armature")]
+        np.testing.assert_allclose(own, a * [1, 1, 0], atol=1e-9)
+        own = one.slopes[:, :, names.index("calf.coulomb")]
+        np.testing.assert_array_equal(own, np.sign(out.v) * [0, 0, 1])
+        assert not one.slopes[:, :, [names.index("delay"), names.index("hip.kp")]].any()
+        for k, unknown in enumerate(simulator.unknowns):
+            if unknown.what != "body":
+                continue
+            ends = []
+            for s in (1, -1):
+                moved = theta.copy()
+                moved[k] += s * 1e-5
+                pi = model.standard_parameters()
+                pi[: model.layout.n_inertial] = simulator.loops(moved).bodies.reshape(-1)
+                engine = model.with_parameters(pi).pin_model
+                data = engine.createData()
+                ends.append([pin.rnea(engine, data, *x) for x in zip(out.q, out.v, a, strict=True)])
+            slope = (np.array(ends[0]) - ends[1]) / 2e-5
+            np.testing.assert_allclose(one.slopes[:, :, k], slope, atol=1e-6)
+
+
+def truth_of(arm):
+    """The standard parameters of a plant, and its loops."""
+    pi, names = arm.model.standard_parameters(), arm.model.layout.names
+    for drive in arm.drives:
+        for term in ("armature", "viscous", "coulomb"):
+            pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
+    return loops_of(arm.model, pi, arm.drives)
+
+
+def stiff(error, highest=1.5):
+    """A stiff arm with exact logs, windows that begin as it did, its drives unknown."""
+    rng, behind = np.random.default_rng(2), np.zeros(2, dtype=int)
+    arm = plant("planar", rng, delay=0.0, kp=2e4, kd=1.6e3)
+    t = np.arange(1000) / 500.0
+    q_ref = multisine(t, arm.middle, arm.reach, rng, highest=highest)
+    told = Log(t, q_ref, 0 * q_ref, arm.model.joints, q_ref=q_ref, has_torque=False)
+    robot, loops = LoopedRobot(arm.model), truth_of(arm)
+    [out] = robot.roll_out(loops, cut_windows(told, np.inf, 0.0))
+    tau = drive_torques(out, loops, behind).given
+    log, unknowns = replace(told, q=out.q, tau=tau, has_torque=True), []
+    for j in range(2):
+        J = loops.armature[j]
+        unknowns.append(Unknown(f"{j}.armature", "armature", (j,), J, 1e6, 0.0))
+        for term in loops.terms[j]:
+            value, name = loops.values[loops.place(j, term)], f"{j}.{term.name}"
+            unknowns.append(Unknown(name, "term", (j,), value, 1e6, term=term))
+    windows = [
+        replace(w, given=np.stack([out.q[w.begin], out.v[w.begin]]))
+        for w in cut_windows(log, 0.5, 0.0)
+    ]
+    return LoopSimulator(robot, tuple(windows), loops, tuple(unknowns), error=error, behind=behind)
+
+
+@pytest.mark.parametrize("error", ["output", "input", "direct"])
+def test_drives_of_exact_data_are_recovered_from_20_percent_off(error):
+    simulator = stiff(error)
+    truth = simulator.prior
+    estimator, exact = OutputError(whitens=False), simulator.exact
+    first = replace(estimator, rounds=1).fit(simulator, 0.8 * truth, exact=exact)
+    np.testing.assert_allclose(first.theta, truth, rtol=0.02, atol=0.1)
+    assert first.n_iter <= {"output": 20, "input": 8, "direct": 6}[error], "a few steps"
+    found = estimator.fit(simulator, 0.8 * truth, exact=exact)
+    np.testing.assert_allclose(found.theta, truth, rtol=1e-4, atol=1e-3)
+    assert found.converged
+    left = found.details["left"]
+    assert 0.05 < left < 0.4 if error == "direct" else left == 0.0
+
+
+def test_the_row_whose_command_a_torque_follows_is_found():
+    rng = np.random.default_rng(6)
+    arm = plant("planar", rng, delay=0.0053)  # within the third row of 2 ms
+    log, _ = recorded(arm, rng, duration=1.0, torque=0.3)
+    loops = truth_of(arm)
+    outs = LoopedRobot(arm.model).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    known, unknown = np.zeros((2, 2), dtype=bool), np.array([[False, True], [True, False]])
+    np.testing.assert_array_equal(find_behind(outs, loops, known), [3, 3])
+    np.testing.assert_array_equal(find_behind(outs, loops, unknown), [3, 3])
+    early = replace(log, tau=np.vstack([log.tau[1:], log.tau[-1:]]))  # logged a row later
+    outs = [replace(out, window=replace(out.window, log=early)) for out in outs]
+    np.testing.assert_array_equal(find_behind(outs, loops, known), [2, 2])
