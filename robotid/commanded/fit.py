@@ -117,10 +117,9 @@ def fit_loops(
     has_gain = _is_stated(loop.kp, model)
     usual = _usual(robot, plain, windows, has_gain)
     base = _begin(model, stated, plain, usual, finds_limit=loop.limit == "find")
-    compares = settings.error != "output"  # torques along roll-outs, not along what was measured
-    weighs = settings.torques and not compares and all(log.has_torque for log in logs)
+    weighs = settings.torques and all(log.has_torque for log in logs)
     # positions alone tell the sum of kd and viscous friction
-    tells_kd = compares or weighs or all(log.v_ref is not None for log in logs)
+    tells_kd = weighs or all(log.v_ref is not None for log in logs)
     unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=tells_kd)
     unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
@@ -134,7 +133,7 @@ def fit_loops(
     few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
     begun = replace(estimator, rounds=1).fit(few, simulator.prior)
     theta = begun.theta
-    if compares:
+    if settings.error != "output":
         simulator = _of_torques(simulator, few, theta, settings.error)
     for _ in range(_STARTS):
         simulator = simulator.begun_better(theta)
@@ -156,7 +155,7 @@ def fit_loops(
             break
         report_stage(progress, "fitting loops", STAGES)
         simulator, theta = _with(simulator, estimate.theta, taken)
-        if weighs:
+        if simulator.torque is not None:
             simulator = replace(simulator, torque=_torque_rows(model, simulator.base, logs))
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
     return Fitted(simulator, estimate, plain, encoders, tuple(tried), tuple(groups))
@@ -196,13 +195,13 @@ def _check_settings(
 def _of_torques(
     simulator: LoopSimulator, few: LoopSimulator, theta: Array, error: str
 ) -> LoopSimulator:
-    """Return the simulator with torques compared; some windows tell which command they follow."""
+    """Return the simulator with torques compared along its roll-outs, as they begin in few."""
     is_open = np.zeros((2, len(simulator.base.kp)), dtype=bool)
     for unknown in simulator.unknowns:
         if unknown.what in ("kp", "kd"):
             is_open[("kp", "kd").index(unknown.what), list(unknown.joints)] = True
     behind = find_behind(few.roll_out(theta), few.loops(theta), is_open)
-    return replace(simulator, error=error, behind=behind)
+    return replace(simulator, error=error, behind=behind, torque=None)
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:

@@ -381,7 +381,9 @@ def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: floa
     free = (theta > lowest) | (g > 0)
     trial = theta.copy()
     while free.any():
-        step = scipy.linalg.solve(H[np.ix_(free, free)], g[free], assume_a="pos")
+        scale = 1.0 / np.sqrt(np.diag(H)[free])  # units differ by many orders of magnitude
+        own = H[np.ix_(free, free)] * np.outer(scale, scale)
+        step = scale * scipy.linalg.solve(own, scale * g[free], assume_a="pos")
         trial[free] = theta[free] + step
         below = free & (trial < lowest)
         if not below.any():

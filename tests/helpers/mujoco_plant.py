@@ -85,7 +85,10 @@ def plant(name, rng, **changes):
     return Plant(model, tuple(drives), np.array(middle), np.array(reach))
 
 
-def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None, speed=None):
+def recorded(
+    plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None, speed=None, highest=4.0,
+    step=_STEP,
+):  # fmt: skip
     """Return the log of a multi-sine that a plant was commanded to follow, and its truth.
 
     Args:
@@ -96,10 +99,12 @@ def recorded(plant, rng, *, duration=10.0, rate=500.0, noise=1e-4, torque=None, 
         noise: Standard deviation of the encoders [rad].
         torque: Standard deviation of the drives' logged torques [N m]; None: none are logged.
         speed: Standard deviation of the logged speeds [rad/s]; None: none are logged.
+        highest: Highest tone of the commands [Hz].
+        step: Of MuJoCo, at most [s]; forces that are logged are half a step early.
     """
     t = np.arange(round(duration * rate)) / rate
-    q_ref = multisine(t, plant.middle, plant.reach, rng)
-    q, force, v = rolled_out(loaded(plant, rate), q_ref, rate)
+    q_ref = multisine(t, plant.middle, plant.reach, rng, highest=highest)
+    q, force, v = rolled_out(loaded(plant, rate, step), q_ref, rate)
     v = None if speed is None else v + speed * rng.standard_normal(v.shape)
     q = q + noise * rng.standard_normal(q.shape)
     tau = np.zeros_like(q)

@@ -1,0 +1,128 @@
+"""What is compared: positions, speeds, and torques of roll-outs with those of a log."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import plant, recorded
+
+from robotid.commanded.fit import fit_loops
+from robotid.commanded.identify import identify_commands
+from robotid.commanded.settings import LoopSettings
+from robotid.exceptions import DataError, SettingsError
+from robotid.identification.settings import SimulationSettings
+
+KP, KD, DELAY, TORQUE = 80.0, 3.0, 0.0053, 0.05
+LOOP = LoopSettings(kp=KP, kd=KD, delay=DELAY)
+METHODS = {"output": "CLOE", "input": "CLIE", "direct": "DIDIM"}
+
+
+def settings(**changes):
+    return SimulationSettings(
+        **{"window": 1.0, "lead": 0.3, "bodies": 0.0, "torques": "error" in changes} | changes
+    )
+
+
+@pytest.fixture(scope="module")
+def leg():
+    """A leg whose loops are stiff for its commands, and a log with torques and speeds."""
+    rng = np.random.default_rng(3)
+    robot = plant("leg", rng, kp=KP, kd=KD, delay=DELAY)
+    quiet = {"torque": TORQUE, "speed": 0.002, "noise": 4e-4, "step": 1e-4, "highest": 1.5}
+    return robot, recorded(robot, rng, duration=4.0, **quiet)[0]
+
+
+def fitted(leg, loop=LOOP, **changes):
+    robot, log = leg
+    return fit_loops(robot.model, [log], loop, settings(**changes), chooses=False)
+
+
+@pytest.fixture(scope="module")
+def methods(leg):
+    return {error: fitted(leg, error=error, torques=error != "output") for error in METHODS}
+
+
+@pytest.mark.parametrize("error", METHODS)
+def test_the_drives_are_recovered_whatever_is_compared(leg, methods, error):
+    truth, found = leg[0].truth, methods[error]
+    estimate = found.estimate
+    assert estimate.converged
+    if error != "output":
+        np.testing.assert_array_equal(found.simulator.behind, np.full(3, 3))
+        np.testing.assert_allclose(estimate.sigma, TORQUE, rtol=0.06)
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        assert abs(value - truth[name]) < 4 * std, name
+        if name.endswith(("armature", "viscous", "coulomb")):
+            assert std < 0.2 * truth[name], name
+
+
+def test_gains_and_delay_are_found_from_torques_of_roll_outs(leg):
+    robot, rng = leg[0], np.random.default_rng(4)
+    fast, _ = recorded(robot, rng, duration=3.0, torque=TORQUE, step=1e-4, highest=6.0)
+    found = fitted((robot, fast), LoopSettings(), error="input")
+    assert found.simulator.knows_torques
+    estimate, gains = found.estimate, {"kp": KP, "kd": KD, "delay": DELAY}
+    assert {name.rpartition(".")[2] for name in estimate.names} > set(gains)
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        truth = gains.get(name.rpartition(".")[2], robot.truth.get(name))
+        assert abs(value - truth) < 4 * std, name
+        if truth:
+            assert std < 0.2 * truth, name
+
+
+def test_speeds_that_are_better_than_positions_make_it_surer(leg, methods):
+    truth, plain, both = leg[0].truth, methods["output"], fitted(leg, velocities=True)
+    assert len(plain.estimate.sigma) == 3
+    np.testing.assert_allclose(both.estimate.sigma, 3 * [4e-4] + 3 * [0.002], rtol=0.06)
+    names, estimate = plain.estimate.names, both.estimate
+    assert estimate.names == names
+    surer = estimate.std_error / plain.estimate.std_error
+    is_fast = np.array([not name.endswith("offset") for name in names])
+    assert np.median(surer[is_fast]) < 0.8
+    for name, value, std in zip(names, estimate.theta, estimate.std_error, strict=True):
+        assert abs(value - truth[name]) < 4 * std, name
+
+
+def test_logs_without_what_is_compared_are_refused(leg):
+    robot, log = leg
+    bare = replace(log, v=None, tau=0 * log.tau, has_torque=False)
+    for error in ("input", "direct"):
+        with pytest.raises(DataError, match=rf"error = '{error}' compares torques, but log has no"):
+            fit_loops(robot.model, [log, bare], LOOP, settings(error=error))
+    with pytest.raises(DataError, match=r"velocities is true, but log has none; record columns dq"):
+        fit_loops(robot.model, [log, bare], LOOP, settings(velocities=True))
+    late = replace(log, v=np.vstack([np.zeros((25, 3)), log.v[:-25]]))
+    with pytest.raises(DataError, match=r"velocities is true, but log has late or coarse ones"):
+        fit_loops(robot.model, [late], LOOP, settings(velocities=True))
+
+
+@pytest.mark.parametrize(
+    ("loop", "named"),
+    [
+        (LoopSettings(), "kp, kd, delay"),
+        (LoopSettings(kp=KP, kd={"FL_hip_joint": KD}, delay=0.0), "kd"),
+        (LoopSettings(kp=KP, kd=KD, delay=0.0, limit="find", zeros="find"), "limit, zeros"),
+    ],
+)
+def test_a_controller_that_is_not_known_has_no_inverse_dynamics(leg, loop, named):
+    with pytest.raises(SettingsError, match=rf"needs a controller that is known, whose {named} w"):
+        fitted(leg, loop, error="direct")
+
+
+def test_settings_that_contradict_each_other_are_refused():
+    with pytest.raises(SettingsError, match=r"error = 'input' compares torques, but torques is f"):
+        SimulationSettings(error="input", torques=False)
+    with pytest.raises(SettingsError, match=r"'direct' compares torques, but velocities is true"):
+        SimulationSettings(error="direct", velocities=True)
+
+
+def test_a_loop_that_is_soft_for_the_direct_method_is_named():
+    rng = np.random.default_rng(5)
+    robot = plant("leg", rng, kp=8.0, kd=0.4, delay=0.0)
+    log, _ = recorded(robot, rng, duration=1.5, torque=0.05)
+    loop = LoopSettings(kp=8.0, kd=0.4, delay=0.0)
+    found = identify_commands(robot.model, [log], [], loop, settings(error="direct"), chooses=False)
+    [soft] = [f for f in found.findings if f.code == "soft_loop"]
+    assert soft.severity == "warning"
+    assert soft.message.endswith("Set error = 'input'")
+    assert soft.evidence["left"] > 0.5
