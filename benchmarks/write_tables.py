@@ -39,6 +39,7 @@ PAGES = {
     "designs": "excitation.md",
     "motions": "excitation.md",
     "commands": "commands_and_positions.md",
+    "methods": "commands_and_positions.md",
 }
 BLOCK = re.compile(
     r"<!-- table of bench_(?P<name>\w+), (?P<digest>[-\w]+) -->\n"

@@ -40,6 +40,7 @@ STAGES = (
 )  # fmt: skip
 
 
+_NAMES = {"output": "output error", "input": "input error", "direct": "direct input error"}
 _WIDE = 10.0  # spreads of drives are so many times their usual size: they bind nothing
 _SHARE = 0.5  # of the loop's inertia by which gains are unknown, that bodies have to begin with
 _SLOWEST = 0.1  # [s] spread of a delay
@@ -125,7 +126,7 @@ def fit_loops(
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
     most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 2)  # of positions, of speeds
-    estimator = OutputError(whitens=settings.whiten, most=most, progress=progress)
+    estimator = OutputError(_NAMES[settings.error], settings.whiten, most, progress=progress)
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=settings.velocities)
     report_stage(progress, "fitting loops", STAGES)
     if weighs:

@@ -119,6 +119,7 @@ class OutputError:
     then parameters by these weights, until both have settled.
 
     Attributes:
+        name: What it is called, by what is compared.
         whitens: Whether the residual's correlation is estimated and taken out.
         most: Largest correlation of one sample with the next that is taken out, shape (n,): beyond
             the loop's own, whitening takes away what the loop shows. 0.95 if None.
@@ -130,6 +131,7 @@ class OutputError:
         Ljung (1999), System identification, 4.3 and 10.2.
     """
 
+    name: str = "output error"
     whitens: bool = True
     most: Array | None = None
     steps: int = _STEPS
@@ -313,7 +315,7 @@ class OutputError:
             undetermined=undetermined,
             converged=converged and left < 1.0,
             n_iter=steps,
-            message=f"output error, {steps} steps in {rounds} rounds, {state}",
+            message=f"{self.name}, {steps} steps in {rounds} rounds, {state}",
             prior_std=simulator.prior_std,
             details={
                 "correlation": weights.rho,

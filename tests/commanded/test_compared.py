@@ -14,7 +14,7 @@ from robotid.identification.settings import SimulationSettings
 
 KP, KD, DELAY, TORQUE = 80.0, 3.0, 0.0053, 0.05
 LOOP = LoopSettings(kp=KP, kd=KD, delay=DELAY)
-METHODS = {"output": "CLOE", "input": "CLIE", "direct": "DIDIM"}
+METHODS = {"output": "output error", "input": "input error", "direct": "direct input error"}
 
 
 def settings(**changes):
@@ -47,6 +47,7 @@ def test_the_drives_are_recovered_whatever_is_compared(leg, methods, error):
     truth, found = leg[0].truth, methods[error]
     estimate = found.estimate
     assert estimate.converged
+    assert estimate.message.startswith(METHODS[error])
     if error != "output":
         np.testing.assert_array_equal(found.simulator.behind, np.full(3, 3))
         np.testing.assert_allclose(estimate.sigma, TORQUE, rtol=0.06)
