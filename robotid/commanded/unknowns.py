@@ -263,8 +263,8 @@ class LoopSimulator:
             NotConvergedError: If a step has no solution.
 
         References:
-            Janot, Vandanjon, Gautier (2014), A generic instrumental variable approach for
-            industrial robot identification, IEEE TCST 22(1), and the papers on DIDIM named there.
+            Gautier, Janot, Vandanjon (2013), A new closed-loop output error method for parameter
+            identification of robot dynamics, IEEE TCST 21(2): DIDIM.
         """
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns, owners = self._columns(loops)

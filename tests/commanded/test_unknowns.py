@@ -69,6 +69,10 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
     slopes = np.concatenate([r.slopes for r in found])  # of the outputs
     np.testing.assert_array_equal(found[0].columns, np.arange(len(theta)))
     assert slopes.shape[1] == (6 if compared == "speeds" else 3)
+    plain = simulator.residuals(theta, with_slopes=False)
+    for one, bare in zip(found, plain, strict=True):
+        np.testing.assert_array_equal(one.e, bare.e)
+        np.testing.assert_array_equal(one.joints, bare.joints)
     for k, name in enumerate(simulator.names):
         h = 3e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
         if compared == "torques":
