@@ -429,7 +429,7 @@ def one_run(name, rng, seconds):
     loop = LoopSettings(**gains, groups={first: [first]})  # every joint has a drive of its own
     settings = SimulationSettings(bodies=0.0, step=STEP)
     found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
-    estimate, truth = found.fitted.estimate, {**plant.truth, "delay": delay}
+    estimate, truth = found.fitted.estimate, {**plant.truth, "robot.delay": delay}
     for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
         yield key.rpartition(".")[2], theta - truth[key], said
 
