@@ -468,7 +468,8 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
     gains = {key: {d.joint: getattr(d, key) for d in plant.drives} for key in ("kp", "kd")}
     first = plant.model.joints[0]
     gains = {} if finds_all else gains
-    loop = LoopSettings(**gains, groups={first: [first]})  # every joint has a drive of its own
+    # every joint has a drive of its own
+    loop = LoopSettings(**gains, groups={first: [first]}, delays="group")
     found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
     estimate = found.fitted.estimate
     for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
