@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from robotid._settings import Settings, setting
+from robotid._settings import POSITIVE, Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
@@ -38,6 +38,10 @@ class LoopSettings(Settings):
     delay: PerJoint | None = setting(
         None, "how late the command acts [s], likewise; found, one for each group, if not stated",
         **LEVEL,
+    )  # fmt: skip
+    rate: float | None = setting(
+        None, "how often a second a controller with a clock reads position and speed, to hold its "
+        "torque until the next time [Hz]; none if not stated: it follows at once", within=POSITIVE,
     )  # fmt: skip
     gravity_compensation: bool = setting(
         False, "whether the controller adds the torque of gravity by the URDF"

@@ -12,6 +12,10 @@ with D = M(q') + armature, q' = q + theta dt v, h the torque of gravity and spee
 friction and offset, r and w the commands as they are on average over the step; then
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
+
+A controller with a clock reads q and v at its ticks, and holds until the next what it then makes
+of them and of the commands, which are the averages over its tick. No step crosses a tick. The held
+torque has sensitivities of its own, which change at ticks alone.
 """
 
 import math
@@ -34,6 +38,7 @@ __all__ = [
     "TERM",
     "ZERO",
     "average_command",
+    "divide_rows",
     "roll_out",
     "work_size",
 ]
@@ -62,7 +67,7 @@ def work_size(joints: int, columns: int) -> int:
         columns: Number of sensitivities.
     """
     n = joints
-    return LANES * ((n + 1) * _BODY + 4 * n * n + 13 * n + 2 * n * columns)
+    return LANES * ((n + 1) * _BODY + 4 * n * n + 14 * n + 3 * n * columns)
 
 
 @compiled
@@ -442,7 +447,7 @@ def _balance(work, n, at, drives, terms, step, command):
     Row i is divided by e = 1 + mu s(u) sign(tau), by which a gear that loses a share mu of its
     load multiplies the bodies' torque tau: so H stays symmetric.
     """
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss = at
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held = at
     codes, shapes, values, first = terms
     for i in range(n):
         for lane in range(LANES):
@@ -468,11 +473,14 @@ def _balance(work, n, at, drives, terms, step, command):
                     f += values[k] * y
                     f_u += values[k] * y_u
                     f_q += values[k] * y_q
-            reach = command[i, 0, lane] - _get(work, q + i, lane) - span * speed
-            torque = kp * reach + kd * (command[i, 2, lane] - speed) + command[i, 3, lane]
-            is_free = abs(torque) < limit
-            torque = torque if is_free else math.copysign(limit, torque)
-            is_on = 1.0 if is_free else 0.0
+            if held >= 0:  # what the joint does within a tick changes nothing
+                torque, is_on = _get(work, held + i, lane), 0.0
+            else:
+                reach = command[i, 0, lane] - _get(work, q + i, lane) - span * speed
+                torque = kp * reach + kd * (command[i, 2, lane] - speed) + command[i, 3, lane]
+                is_free = abs(torque) < limit
+                torque = torque if is_free else math.copysign(limit, torque)
+                is_on = 1.0 if is_free else 0.0
             rest = armature * (speed - _get(work, v + i, lane)) / span + f - torque
             slope = armature / span + f_u + is_on * (kd + span * kp)
             _put(work, G + i, lane, tau + rest / e)
@@ -514,8 +522,8 @@ def _newton(work, n, at, drives, terms, step, command):
 @compiled
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss = at
-    T_q, T_v, S, own, change = sweeps
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held = at
+    T_q, T_v, S, own, change, by_hold = sweeps
     codes, shapes, values, first = terms
     P = len(columns)
     _combine(work, n, at, sweeps, drives, step)
@@ -541,22 +549,58 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                 is_on, x = _get(work, gains + j, lane), 0.0
                 if kind == ARMATURE:
                     x = (speed - _get(work, v + j, lane)) / span
-                elif kind == KP:
-                    x = -is_on * (command[j, 0, lane] - _get(work, q + j, lane) - span * speed)
-                elif kind == KD:
-                    x = -is_on * (command[j, 2, lane] - speed)
-                elif kind == LIMIT:
-                    asked = kp * (command[j, 0, lane] - _get(work, q + j, lane) - span * speed)
-                    asked += kd * (command[j, 2, lane] - speed) + command[j, 3, lane]
-                    x = 0.0 if is_on else math.copysign(1.0, -asked)
-                elif kind == LATE:
-                    x = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
-                    x *= -is_on
                 elif kind == TERM:
                     x, _, _ = term(codes[index], shapes[index], _get(work, middle + j, lane), speed)
                     x *= abs(_get(work, load + j, lane)) if codes[index] == LOAD else 1.0
+                elif held < 0:
+                    reach = command[j, 0, lane] - _get(work, q + j, lane) - span * speed
+                    slip = command[j, 2, lane] - speed
+                    asked = kp * reach + kd * slip + command[j, 3, lane]
+                    late = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
+                    x = -_by_loop(kind, is_on, reach, slip, late, asked)
                 _put(work, own + j, lane, x / _get(work, loss + j, lane))
+        if held >= 0:
+            for i in range(n):
+                for lane in range(LANES):
+                    x = _get(work, by_hold + i * P + p, lane) / _get(work, loss + i, lane)
+                    _put(work, own + i, lane, _get(work, own + i, lane) - x)
         _advance_column(work, n, at, sweeps, step, p, P)
+
+
+@compiled
+def _by_loop(kind, is_on, reach, slip, late, asked):
+    """Return how the torque of a loop changes with a gain, its delay or its limit."""
+    if kind == KP:
+        return is_on * reach
+    if kind == KD:
+        return is_on * slip
+    if kind == LATE:
+        return is_on * late
+    return (1.0 - is_on) * math.copysign(1.0, asked) if kind == LIMIT else 0.0
+
+
+@compiled
+def _hold(work, n, at, sweeps, columns, drives, command, is_tick):
+    """Write torques, and their sensitivities, of the lanes whose controllers have a tick."""
+    q, v, held = at[0], at[1], at[12]
+    S, by_hold, P = sweeps[2], sweeps[5], len(columns)
+    for i in range(n):
+        kp, kd, limit = drives[i, 1], drives[i, 2], drives[i, 3]
+        for lane in range(LANES):
+            if not is_tick[lane]:
+                continue
+            reach = command[i, 0, lane] - _get(work, q + i, lane)
+            slip = command[i, 2, lane] - _get(work, v + i, lane)
+            asked = kp * reach + kd * slip + command[i, 3, lane]
+            late = kp * command[i, 1, lane] + kd * command[i, 4, lane] + command[i, 5, lane]
+            is_on = 1.0 if abs(asked) < limit else 0.0
+            _put(work, held + i, lane, asked if is_on else math.copysign(limit, asked))
+            for p in range(P):
+                x = kp * _get(work, S + i * P + p, lane) + kd * _get(work, S + (n + i) * P + p, lane)
+                own = 0.0
+                if columns[p, 1] == i:
+                    own = _by_loop(columns[p, 0], is_on, reach, slip, late, asked)
+                _put(work, by_hold + i * P + p, lane, own - is_on * x)
 
 
 @compiled
@@ -606,7 +650,7 @@ def _combine(work, n, at, sweeps, drives, step):
 def _advance_column(work, n, at, sweeps, step, p, P):
     """Advance one sensitivity of position and speed over a step."""
     H = at[7]
-    T_q, T_v, S, own, change = sweeps
+    T_q, T_v, S, own, change = sweeps[:5]
     for i in range(n):
         for lane in range(LANES):
             _put(work, change + i, lane, -_get(work, own + i, lane))
@@ -627,7 +671,7 @@ def _advance_column(work, n, at, sweeps, step, p, P):
 @compiled
 def roll_out(
     parents, joints, zeros, bodies, is_below, gravity, drives, codes, shapes, values, first,
-    columns, directions, command, steps, every, start, out_q, out_v, out_S, work,
+    columns, directions, command, steps, ticks, every, start, out_q, out_v, out_S, work,
 ):  # fmt: skip
     """Roll out a block of lanes; return the first step that had no solution, -1 if all had.
 
@@ -648,6 +692,8 @@ def roll_out(
         command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
             and torque by the delay, on average over each step, shape (K, n, 6, LANES).
         steps: Length of each step, shape (K, LANES) [s].
+        ticks: Where the controllers have a tick as the step begins, shape (K, LANES), bool, all at
+            the first; of no entries if they have no clock.
         every: Steps from a sample to the next.
         start: Positions and speeds, shape (2, n, LANES).
         out_q: Positions of the samples, shape (N, n, LANES); written.
@@ -661,8 +707,9 @@ def roll_out(
     G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
     load, loss, M = change + n, change + 2 * n, change + 3 * n
     H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
-    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss)
-    sweeps, terms = (T_q, T_v, S, own, change), (codes, shapes, values, first)
+    by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
+    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held)
+    sweeps, terms = (T_q, T_v, S, own, change, by_hold), (codes, shapes, values, first)
     work[:] = 0.0
     for lane in range(LANES):
         for k in range(3):
@@ -679,6 +726,8 @@ def roll_out(
                     out_S[0, columns[p, 1], p, lane] = 1.0
     for k in range(len(steps)):
         step = steps[k]
+        if held >= 0 and ticks[k].any():
+            _hold(work, n, at, sweeps, columns, drives, command[k], ticks[k])
         for i in range(n):
             for lane in range(LANES):
                 ahead = THETA * step[lane] * _get(work, v + i, lane)
@@ -743,3 +792,41 @@ def average_command(stamps, values, times, delay, mean, change):
         mean[k] = total / (end - begin)
         change[k] = (before - values[i]) / (end - begin)
         begin = end
+
+
+@compiled
+def divide_rows(stamps, ticks, times, is_tick):
+    """Write where steps begin and end, as many from each row to the next, none across a tick.
+
+    Ticks divide a row; the longest steps are halved, then cut in three and so on, until there are
+    as many as in other rows.
+
+    Args:
+        stamps: Of the rows, shape (N,) [s].
+        ticks: Those after the first row, ascending; one at a row is its stamp [s].
+        times: Shape ((N - 1) every + 1,); written.
+        is_tick: Whether a step begins at a tick, or is the first, shape ((N - 1) every,); written.
+    """
+    every, i = len(is_tick) // (len(stamps) - 1), 0
+    edges, shares = np.empty(every + 1), np.empty(every, np.int64)
+    is_tick[:], is_tick[0] = False, True
+    for k in range(len(stamps) - 1):
+        edges[0], count = stamps[k], 1
+        while i < len(ticks) and ticks[i] < stamps[k + 1]:
+            if ticks[i] > stamps[k]:
+                edges[count] = ticks[i]
+                count += 1
+            else:
+                is_tick[k * every] = True
+            i += 1
+        edges[count] = stamps[k + 1]
+        shares[:count] = 1
+        for _ in range(every - count):
+            shares[np.argmax(np.diff(edges[: count + 1]) / shares[:count])] += 1
+        at = k * every
+        for j in range(count):
+            is_tick[at] = is_tick[at] or j > 0
+            for part in range(shares[j]):
+                times[at] = edges[j] + (edges[j + 1] - edges[j]) * part / shares[j]
+                at += 1
+    times[-1] = stamps[-1]

@@ -1,11 +1,14 @@
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.mujoco_plant import LEG
+from helpers.mujoco_plant import LEG, loaded, multisine, plant
 from helpers.paths import URDF
+from helpers.single_joint import slider
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from robotid.exceptions import MissingDependencyError, NotConvergedError, SettingsError
 from robotid.logs.data import Log
@@ -25,7 +28,7 @@ from robotid.robot.drives import (
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling
-from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
+from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
 
 RATE = 500.0  # [Hz]
 LEGS = (*LEG, *(name.replace("FL", "FR") for name in LEG))
@@ -152,16 +155,16 @@ def differences(model, loops, log, change, h):
     return (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
 
 
-@pytest.mark.parametrize("name", ["ur5", "legs"])
-def test_sensitivities_are_those_of_differences(request, name):
+@pytest.mark.parametrize(("name", "rate"), [("ur5", None), ("legs", None), ("legs", 330.0)])
+def test_sensitivities_are_those_of_differences(request, name, rate):
     model = request.getfixturevalue(name)
-    robot, log = LoopedRobot(model), commanded(model, 0.3)
+    robot, log = LoopedRobot(model), commanded(model, 0.3 if rate is None else 0.12)
     size = 1.0 if name == "legs" else 30.0
     n, kinds = len(model.joints), LoopedRobot(model).kinds
     values = size * np.array([*VALUES[:-1], VALUES[-1] / size])
     loops = loops_of(
         model, TERMS, values, kp=20.0 * size, delay=np.full(n, 0.0047),
-        limit=np.full(n, 2.5 * size if name == "legs" else 2.0 * size),
+        limit=np.full(n, 2.5 * size if name == "legs" else 2.0 * size), rate=rate,
     )  # fmt: skip
     columns, changes = [], []
 
@@ -220,6 +223,121 @@ def test_a_delay_is_exact_about_held_commands(legs):
     assert np.abs(late.q - rolled(legs, loops_of(legs), log).q).max() > 1e-3
 
 
+def held_slider(t, start, told, rate, begin, *, mass, kp, kd, viscous):
+    """Return positions of a mass under a loop that is held between ticks, by its closed form."""
+    A = np.zeros((3, 3))  # of position, speed and held force
+    A[0, 1], A[1, 1], A[1, 2] = 1.0, -viscous / mass, 1.0 / mass
+    ticks = t[0] + np.arange(np.ceil((t[-1] - t[0]) * rate) + 1) / rate
+    ticks = np.concatenate([[t[begin]], ticks[ticks > t[begin] + 1e-9], [np.inf]])
+    x, found = np.array([*start, 0.0]), []
+    for now, then in zip(ticks[:-1], ticks[1:], strict=True):
+        x[2] = kp * (told - x[0]) - kd * x[1]
+        rows = t[begin:][(t[begin:] > now - 1e-9) & (t[begin:] < then - 1e-9)]
+        found += [(expm(A * (row - now)) @ x)[0] for row in rows]
+        x = expm(A * (then - now)) @ x if np.isfinite(then) else x
+    return np.array(found)
+
+
+@pytest.mark.parametrize("rate", [100.0, 130.0, 700.0])
+@pytest.mark.parametrize("begin", [0, 52])
+def test_a_held_loop_has_the_closed_form_of_its_ticks(tmp_path, rate, begin):
+    body = {"mass": 2.0, "kp": 300.0, "kd": 40.0}
+    model, t = slider(tmp_path), np.arange(150) / RATE
+    rail = loops_of(
+        model, (Viscous(),), (0.0,), kp=300.0, kd=np.array([40.0]), armature=np.array([0.5]),
+        zero=np.zeros(1), rate=rate,
+    )  # fmt: skip
+    log = Log(t, np.zeros((150, 1)), np.zeros((150, 1)), ("j",), q_ref=np.full((150, 1), 0.3))
+    window = Window(log, begin, begin, 150, given=np.array([[0.1], [-0.4]]))
+    exact = held_slider(t, (0.1, -0.4), 0.3, rate, begin, **(body | {"mass": 2.5}), viscous=0.0)
+    [out] = LoopedRobot(model).roll_out(rail, [window])
+    np.testing.assert_allclose(out.q[:, 0], exact, atol=1e-12)
+    assert abs(exact[-1] - 0.3) < 0.07 < abs(exact[10] - 0.3), "it follows"
+    damped = held_slider(t, (0.1, -0.4), 0.3, rate, begin, **(body | {"mass": 2.5}), viscous=20.0)
+    [out] = LoopedRobot(model, step=2e-4).roll_out(replace(rail, values=np.array([20.0])), [window])
+    np.testing.assert_allclose(out.q[:, 0], damped, atol=1e-7)
+    [free] = LoopedRobot(model).roll_out(replace(rail, rate=None), [window])
+    assert np.abs(free.q[:, 0] - exact).max() > 3e-4
+
+
+def test_mujoco_moves_a_held_leg_alike():
+    """Motors of MuJoCo get what the loop computes at its ticks; Runge-Kutta's steps between."""
+    rng, rate = np.random.default_rng(1), 125.0
+    leg = plant("leg", rng, coulomb=0.0, kd=0.8, delay=0.0)
+    robot, t = loaded(leg, RATE, 1e-3, as_exported=True), np.arange(250) / RATE
+    robot.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    robot.actuator_gainprm[:, 0], robot.actuator_biasprm[:, :3] = 1.0, 0.0
+    q_ref = np.repeat(multisine(t, leg.middle, leg.reach, rng, lowest=0.5)[::4], 4, axis=0)[:250]
+    v_ref, feed = np.zeros_like(q_ref), np.repeat(rng.uniform(-2, 2, (63, 3)), 4, axis=0)[:250]
+    kp, kd = (np.array([getattr(d, key) for d in leg.drives]) for key in ("kp", "kd"))
+    data, q = mujoco.MjData(robot), []
+    data.qpos[:] = q_ref[0] + 0.1
+    for k in range(250):
+        q.append(data.qpos.copy())
+        if k % 4 == 0:
+            data.ctrl[:] = np.clip(kp * (q_ref[k] - data.qpos) - kd * data.qvel + feed[k], -9, 9)
+        mujoco.mj_step(robot, data, 2)
+    q = np.array(q)
+    log = Log(t, q, 0 * q, leg.model.joints, q_ref=q_ref, v_ref=v_ref, tau_ref=feed)
+    of = {key: np.array([getattr(d, key) for d in leg.drives]) for key in ("armature", "viscous")}
+    loops = replace(
+        loops_of(leg.model, (Viscous(),)), kp=kp, kd=kd, armature=of["armature"],
+        values=of["viscous"], zero=np.zeros(3), limit=np.full(3, 9.0),
+    )  # fmt: skip
+    window = Window(log, 0, 0, 250, given=np.array([q[0], np.zeros(3)]))
+    found = {}
+    for held in (rate, None):
+        [out] = LoopedRobot(leg.model, step=2.5e-4).roll_out(replace(loops, rate=held), [window])
+        found[held] = np.abs(out.q - q).max()
+    assert found[rate] < 2e-5
+    assert found[None] > 5e-3
+
+
+def test_a_command_counts_with_its_share_of_a_tick(planar):
+    """Of ticks of four rows, 1.5 rows late, each is told 2.5 rows of its own and 1.5 before."""
+    log, rate = commanded(planar, 0.2), RATE / 4
+    late = rolled(planar, loops_of(planar, kp=60.0, rate=rate, delay=np.full(2, 1.5 / RATE)), log)
+
+    def averaged(x):
+        first = np.arange(len(x)) // 4 * 4  # row of the tick
+        shares = ((0.5, -2), (1.0, -1), (1.0, 0), (1.0, 1), (0.5, 2))
+        return sum(w * x[np.clip(first + k, 0, len(x) - 1)] for w, k in shares) / 4
+
+    told = {name: averaged(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
+    same = rolled(planar, loops_of(planar, kp=60.0, rate=rate), replace(log, **told))
+    np.testing.assert_allclose(late.q, same.q, atol=1e-12)
+
+
+def test_jittered_rows_do_not_move_ticks(planar, rng):
+    t = np.arange(100) / RATE
+    t[1:] += rng.uniform(-0.4, 0.4, 99) / RATE
+    log = commanded(planar, t=t)
+    log = replace(log, q_ref=0 * log.q + 0.2, v_ref=None, tau_ref=None)
+    even = replace(log, t=np.arange(100) / RATE)
+    jittered, exact = (
+        rolled(planar, loops_of(planar, kp=60.0, rate=90.0), x, 5e-4) for x in (log, even)
+    )
+    for j in range(2):
+        between = np.interp(t[1:-1], even.t, exact.q[:, j])
+        np.testing.assert_allclose(jittered.q[1:-1, j], between, atol=2e-4)
+
+
+def test_a_controller_too_slow_for_its_gains_is_told_the_rate_it_needs(tmp_path):
+    model = slider(tmp_path)
+    log = Log(
+        np.arange(500) / RATE, np.zeros((500, 1)), np.zeros((500, 1)), ("j",),
+        q_ref=np.full((500, 1), 0.3),
+    )  # fmt: skip
+    rail = {"kp": 300.0, "kd": np.array([400.0]), "armature": np.array([0.5])}  # 400 / (2 2.5)
+    with pytest.raises(
+        NotConvergedError,
+        match=r"roll-out of j runs away: a controller of 40 Hz holds.*kd 400 need some 80 Hz",
+    ):
+        rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=40.0, **rail), log)
+    settled = rolled(model, loops_of(model, (Viscous(),), zero=np.zeros(1), rate=85.0, **rail), log)
+    assert np.abs(settled.q).max() < 0.5
+
+
 def test_no_drive_gives_more_than_its_limit(legs):
     log, n = commanded(legs, 0.05), len(legs.joints)
     far = replace(log, q_ref=log.q_ref + 100.0)
@@ -265,8 +383,9 @@ def test_a_window_begins_with_the_slope_of_what_was_measured(planar):
     np.testing.assert_allclose(v, [0.5 - 0.6 * 0.1, -5 * np.sin(0.5)], rtol=1e-2)
 
 
-def test_sensitivities_by_the_start_are_those_of_differences(legs):
-    robot, loops, n = LoopedRobot(legs), loops_of(legs, TERMS), len(legs.joints)
+@pytest.mark.parametrize("rate", [None, 330.0])
+def test_sensitivities_by_the_start_are_those_of_differences(legs, rate):
+    robot, loops, n = LoopedRobot(legs), loops_of(legs, TERMS, rate=rate), len(legs.joints)
     [window] = cut_windows(commanded(legs, 0.2), np.inf, 0.0)
     columns = [(robot.kinds[what], j, 0) for what in ("start", "speed") for j in range(n)]
     [out] = robot.roll_out(loops, [window], columns)
