@@ -25,8 +25,8 @@ _GRAVITY = (
 )
 _RATE = (
     "the controller reads its joints {rate:g} times a second and holds its torque between; the "
-    "actuators follow at once, at each step of the simulator. Let a loop of your own set torques at "
-    "that rate if it matters"
+    "actuators follow at each step of the simulator. Where it matters, let a loop of your own set "
+    "torques at that rate"
 )
 #: What says something of which formats.
 _OPTIONS = {

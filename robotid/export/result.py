@@ -215,11 +215,7 @@ def build_commanded(
             for run in found.kept
         ],
         "simulation": {
-            "controller": {
-                "kind": found.loop.kind,
-                "effort_limit": _stated_limits(found),
-                "rate": found.loop.rate,
-            },
+            "controller": _controller(found),
             "signs": dict(zip(model.joints, found.fitted.encoders.sign.tolist(), strict=True)),
             "fit": {
                 "message": estimate.message,
@@ -341,9 +337,11 @@ def _loop_parameters(found: Commanded) -> list[dict[str, Any]]:
     return entries
 
 
-def _stated_limits(found: Commanded) -> dict[str, float] | None:
+def _controller(found: Commanded) -> dict[str, Any]:
+    """Return what was stated of the controller beside gains and delay."""
     limits = dict(zip(found.model.joints, found.fitted.loops.limit.tolist(), strict=True))
-    return {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+    stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+    return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}
 
 
 def _unit_of(found: Commanded, j: int) -> str:

@@ -218,7 +218,9 @@ def _joint_axis(pin_model: pin.Model, body: int) -> Array:
     data, q = pin_model.createData(), pin.neutral(pin_model)
     joint = pin_model.joints[body]
     jacobian = pin.computeJointJacobian(pin_model, data, q, body)
-    axis: Array = jacobian.reshape(6, -1)[:, joint.idx_v]  # Pinocchio has one dimension of one joint
+    axis: Array = jacobian.reshape(6, -1)[
+        :, joint.idx_v
+    ]  # Pinocchio has one dimension of one joint
     return axis
 
 

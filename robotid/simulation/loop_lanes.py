@@ -13,9 +13,9 @@ friction and offset, r and w the commands as they are on average over the step; 
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
 
-A controller with a clock reads q and v at its ticks, and holds until the next what it then makes
-of them and of the commands, which are the averages over its tick. No step crosses a tick. The held
-torque has sensitivities of its own, which change at ticks alone.
+A controller with a clock reads q, v and its commands at its ticks, and holds the torque that it
+makes of them until the next. No step crosses a tick. The held torque has sensitivities of its own,
+which change at ticks alone.
 """
 
 import math
@@ -520,6 +520,17 @@ def _newton(work, n, at, drives, terms, step, command):
 
 
 @compiled
+def _advance(work, n, at, step):
+    """Advance positions and speeds over a step that is solved."""
+    q, v, u = at[0], at[1], at[2]
+    for i in range(n):
+        for lane in range(LANES):
+            speed, before = _get(work, u + i, lane), _get(work, v + i, lane)
+            _put(work, q + i, lane, _get(work, q + i, lane) + step[lane] * speed)
+            _put(work, v + i, lane, before + (speed - before) / THETA)
+
+
+@compiled
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held = at
@@ -596,7 +607,9 @@ def _hold(work, n, at, sweeps, columns, drives, command, is_tick):
             is_on = 1.0 if abs(asked) < limit else 0.0
             _put(work, held + i, lane, asked if is_on else math.copysign(limit, asked))
             for p in range(P):
-                x = kp * _get(work, S + i * P + p, lane) + kd * _get(work, S + (n + i) * P + p, lane)
+                x = kp * _get(work, S + i * P + p, lane) + kd * _get(
+                    work, S + (n + i) * P + p, lane
+                )
                 own = 0.0
                 if columns[p, 1] == i:
                     own = _by_loop(columns[p, 0], is_on, reach, slip, late, asked)
@@ -690,7 +703,8 @@ def roll_out(
         columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
         directions: Changes of a body's parameters, shape (D, 10).
         command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
-            and torque by the delay, on average over each step, shape (K, n, 6, LANES).
+            and torque by the delay, on average over each step, or those of its tick, shape
+            (K, n, 6, LANES).
         steps: Length of each step, shape (K, LANES) [s].
         ticks: Where the controllers have a tick as the step begins, shape (K, LANES), bool, all at
             the first; of no entries if they have no clock.
@@ -750,11 +764,7 @@ def roll_out(
                 work, n, at, sweeps, columns, drives, terms, step, command[k], parents, joints,
                 directions,
             )  # fmt: skip
-        for i in range(n):
-            for lane in range(LANES):
-                speed, before = _get(work, u + i, lane), _get(work, v + i, lane)
-                _put(work, q + i, lane, _get(work, q + i, lane) + step[lane] * speed)
-                _put(work, v + i, lane, before + (speed - before) / THETA)
+        _advance(work, n, at, step)
         if (k + 1) % every == 0:
             sample = (k + 1) // every
             for i in range(n):

@@ -59,9 +59,10 @@ class Loops:
     """What bodies and drives are, and how the drives close their loops.
 
     torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, the commands ``delay``
-    late; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``, q and v
-    are those of the controller's last tick, the commands what they are on average until its next,
-    and the torque stays until then; ticks are counted from the first row of a log.
+    late; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``, all are
+    those of the controller's last tick, and the torque stays until its next. Ticks are counted from
+    the first row of a log; a command counts by its share of a row from the tick on, so that a delay
+    of part of a row lies between those of whole ones.
 
     Attributes:
         bodies: Ten inertial parameters of each body, shape (n, 10), in the order of the layout.
@@ -333,7 +334,8 @@ class LoopedRobot:
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(
-                self._why_not(own, loops, windows[0].start[0]), f"step {failed % len(steps) + 1} of {len(steps)}"
+                self._why_not(own, loops, windows[0].start[0]),
+                f"step {failed % len(steps) + 1} of {len(steps)}",
             )
         return columns_of, q, v, S
 
@@ -380,11 +382,10 @@ class LoopedRobot:
             log, (times, is_tick) = windows[lane].log, grids[lane].divided(every)
             steps[:, lane] = np.diff(times)
             start[..., lane] = windows[lane].start[:, part.joints]
-            told, of_step = times, slice(None)
+            told, of_step = times, np.arange(size)
             if loops.rate is not None:
-                ticks[:, lane] = is_tick
-                told = np.append(times[:-1][is_tick], grids[lane].end)
-                of_step = np.cumsum(is_tick) - 1
+                ticks[:, lane], of_step = is_tick, 2 * (np.cumsum(is_tick) - 1)
+                told = grids[lane].heard(times[:-1][is_tick])
             mean, change = np.empty((2, len(told) - 1))
             for values, k, by_delay in ((log.q_ref, 0, 1), (log.v_ref, 2, 4), (log.tau_ref, 3, 5)):
                 if values is None:
@@ -420,10 +421,11 @@ class _Grid:
             ticks = np.where(np.abs(ticks - stamps[row]) < _SAME / rate, stamps[row], ticks)
         return cls(stamps, ticks[ticks > stamps[0]], dt)
 
-    @property
-    def end(self) -> float:
-        """When the tick ends in which the last step does."""
-        return float(self.ticks[np.searchsorted(self.ticks, self.stamps[-1])])
+    def heard(self, ticks: Array) -> Array:
+        """Return from when to when ticks take their commands: a row, but no longer than a tick."""
+        after = self.ticks[np.searchsorted(self.ticks, self.stamps[-1])]
+        ends = ticks + np.minimum(self.dt, np.diff(ticks, append=after))
+        return np.stack([ticks, ends], axis=1).reshape(-1)
 
     def least_steps(self, step: float, rate: float | None) -> int:
         """Return how many steps a row needs: as many make a tick, and end at each tick."""

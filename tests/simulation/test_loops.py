@@ -1,10 +1,10 @@
 from dataclasses import replace
+from itertools import pairwise
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.mujoco_plant import LEG, loaded, multisine, plant
+from helpers.mujoco_plant import LEG, held, multisine, plant
 from helpers.paths import URDF
 from helpers.single_joint import slider
 from scipy.integrate import solve_ivp
@@ -230,7 +230,7 @@ def held_slider(t, start, told, rate, begin, *, mass, kp, kd, viscous):
     ticks = t[0] + np.arange(np.ceil((t[-1] - t[0]) * rate) + 1) / rate
     ticks = np.concatenate([[t[begin]], ticks[ticks > t[begin] + 1e-9], [np.inf]])
     x, found = np.array([*start, 0.0]), []
-    for now, then in zip(ticks[:-1], ticks[1:], strict=True):
+    for now, then in pairwise(ticks):
         x[2] = kp * (told - x[0]) - kd * x[1]
         rows = t[begin:][(t[begin:] > now - 1e-9) & (t[begin:] < then - 1e-9)]
         found += [(expm(A * (row - now)) @ x)[0] for row in rows]
@@ -261,49 +261,36 @@ def test_a_held_loop_has_the_closed_form_of_its_ticks(tmp_path, rate, begin):
 
 
 def test_mujoco_moves_a_held_leg_alike():
-    """Motors of MuJoCo get what the loop computes at its ticks; Runge-Kutta's steps between."""
     rng, rate = np.random.default_rng(1), 125.0
-    leg = plant("leg", rng, coulomb=0.0, kd=0.8, delay=0.0)
-    robot, t = loaded(leg, RATE, 1e-3, as_exported=True), np.arange(250) / RATE
-    robot.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    robot.actuator_gainprm[:, 0], robot.actuator_biasprm[:, :3] = 1.0, 0.0
-    q_ref = np.repeat(multisine(t, leg.middle, leg.reach, rng, lowest=0.5)[::4], 4, axis=0)[:250]
-    v_ref, feed = np.zeros_like(q_ref), np.repeat(rng.uniform(-2, 2, (63, 3)), 4, axis=0)[:250]
-    kp, kd = (np.array([getattr(d, key) for d in leg.drives]) for key in ("kp", "kd"))
-    data, q = mujoco.MjData(robot), []
-    data.qpos[:] = q_ref[0] + 0.1
-    for k in range(250):
-        q.append(data.qpos.copy())
-        if k % 4 == 0:
-            data.ctrl[:] = np.clip(kp * (q_ref[k] - data.qpos) - kd * data.qvel + feed[k], -9, 9)
-        mujoco.mj_step(robot, data, 2)
-    q = np.array(q)
-    log = Log(t, q, 0 * q, leg.model.joints, q_ref=q_ref, v_ref=v_ref, tau_ref=feed)
-    of = {key: np.array([getattr(d, key) for d in leg.drives]) for key in ("armature", "viscous")}
-    loops = replace(
-        loops_of(leg.model, (Viscous(),)), kp=kp, kd=kd, armature=of["armature"],
-        values=of["viscous"], zero=np.zeros(3), limit=np.full(3, 9.0),
-    )  # fmt: skip
+    leg = plant("leg", rng, coulomb=0.0, kd=0.8, delay=0.0, effort_limit=2.0)
+    t = np.arange(250) / RATE
+    q_ref = multisine(t, leg.middle, leg.reach, rng, lowest=2.0, highest=8.0)
+    q = held(leg, q_ref, RATE, rate)
+    log = Log(t, q, 0 * q, leg.model.joints, q_ref=q_ref)
+    of = {key: np.array([getattr(d, key) for d in leg.drives])
+          for key in ("kp", "kd", "armature", "viscous")}  # fmt: skip
+    values = of.pop("viscous")
+    loops = replace(loops_of(leg.model, (Viscous(),)), values=values, zero=np.zeros(3), **of)
     window = Window(log, 0, 0, 250, given=np.array([q[0], np.zeros(3)]))
     found = {}
-    for held in (rate, None):
-        [out] = LoopedRobot(leg.model, step=2.5e-4).roll_out(replace(loops, rate=held), [window])
-        found[held] = np.abs(out.q - q).max()
-    assert found[rate] < 2e-5
-    assert found[None] > 5e-3
+    for limit, ticks in ((2.0, rate), (2.0, None), (np.inf, rate)):
+        own = replace(loops, limit=np.full(3, limit), rate=ticks)
+        [out] = LoopedRobot(leg.model, step=2.5e-4).roll_out(own, [window])
+        found[limit, ticks] = np.abs(out.q - q).max()
+    assert found.pop((2.0, rate)) < 2e-5
+    assert min(found.values()) > 5e-3, "hold and limit act"
 
 
-def test_a_command_counts_with_its_share_of_a_tick(planar):
-    """Of ticks of four rows, 1.5 rows late, each is told 2.5 rows of its own and 1.5 before."""
+def test_a_tick_takes_the_command_of_its_own_time(planar):
+    """Of ticks of four rows, 1.5 rows late, each is told the mean of the two rows about that."""
     log, rate = commanded(planar, 0.2), RATE / 4
     late = rolled(planar, loops_of(planar, kp=60.0, rate=rate, delay=np.full(2, 1.5 / RATE)), log)
 
-    def averaged(x):
+    def between(x):
         first = np.arange(len(x)) // 4 * 4  # row of the tick
-        shares = ((0.5, -2), (1.0, -1), (1.0, 0), (1.0, 1), (0.5, 2))
-        return sum(w * x[np.clip(first + k, 0, len(x) - 1)] for w, k in shares) / 4
+        return 0.5 * (x[np.maximum(first - 2, 0)] + x[np.maximum(first - 1, 0)])
 
-    told = {name: averaged(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
+    told = {name: between(getattr(log, name)) for name in ("q_ref", "v_ref", "tau_ref")}
     same = rolled(planar, loops_of(planar, kp=60.0, rate=rate), replace(log, **told))
     np.testing.assert_allclose(late.q, same.q, atol=1e-12)
 
