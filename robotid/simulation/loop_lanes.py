@@ -13,6 +13,9 @@ friction and offset, r and w the commands as they are on average over the step; 
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
 
+Friction that a joint takes up over a way, x z, has z as a further state: over a step, at the speed u,
+its equation is linear, and solved exactly. Force acts with the z of the instant t + theta dt.
+
 A controller with a clock reads q, v and its commands at its ticks, and holds the torque that it
 makes of them until the next. No step crosses a tick. The held torque has sensitivities of its own,
 which change at ticks alone.
@@ -26,6 +29,7 @@ from robotid.regressor.lanes import add, compiled, cos_sin, cross, dot, into_chi
 
 __all__ = [
     "ARMATURE",
+    "BRISTLES",
     "INERTIAL",
     "KD",
     "KP",
@@ -46,12 +50,14 @@ __all__ = [
 LANES = 8
 THETA = 0.5  # of a step, where its forces act: exact to second order
 _SIGN = 1e-4  # [rad/s or m/s]: the speed over which friction turns
+_SLID = 0.1  # [s] for which drives are taken to have moved before a roll-out begins
 _NEWTON = 60  # steps, of which three or four are usual
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
 # kinds of sensitivities
 ARMATURE, KP, KD, LIMIT, TERM, LATE, ZERO, INERTIAL, START, SPEED = range(10)
 LOAD = 9  # code of the term that multiplies the load of the gear
+BRISTLES = 10  # code of terms that are taken up over a way
 
 _R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
     0, 9, 12, 15, 18, 21, 24, 30, 36, 42, 52, 58, 64,
@@ -59,15 +65,17 @@ _R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
 _BODY = 70
 
 
-def work_size(joints: int, columns: int) -> int:
+def work_size(joints: int, columns: int, memories: int) -> int:
     """Return the number of entries of the work space.
 
     Args:
         joints: Number of joints.
         columns: Number of sensitivities.
+        memories: Number of terms that are taken up over a way.
     """
     n = joints
-    return LANES * ((n + 1) * _BODY + 4 * n * n + 14 * n + 3 * n * columns)
+    own = (n + 1) * _BODY + 4 * n * n + 16 * n + 3 * n * columns
+    return LANES * (own + memories * (5 + columns))
 
 
 @compiled
@@ -399,7 +407,25 @@ def term(code, shape, q, u):
         y_u = (1.0 - y * y) / x0
     elif code == 8:  # a harmonic of order x0, from phase x1
         y, y_q = math.cos(x0 * q - x1), -x0 * math.sin(x0 * q - x1)
+    elif code == BRISTLES:  # of their own state
+        y = 0.0
     return y, y_u, y_q
+
+
+@compiled
+def taken_up(shape, before, u, span):
+    """Return z after a time at the speed u, and its derivatives by u and by z before.
+
+    dz/dt = (u - |u| z / g(u)) / s_0, g = 1 + c exp(-(u / w)^2); see ``drives.Bristles``.
+    """
+    w, extra = shape[1], shape[2] * math.exp(-((u / shape[1]) ** 2))
+    g, g_u = 1.0 + extra, -2.0 * u / (w * w) * extra
+    s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest, of the stiffer side
+    way = span / (shape[0] * g)
+    kept = math.exp(-s * u * way)
+    kept_u = -kept * s * way * (1.0 - u * g_u / g)
+    z_u = s * g_u * (1.0 - kept) + (before - s * g) * kept_u
+    return s * g + (before - s * g) * kept, z_u, kept
 
 
 @compiled
@@ -447,8 +473,10 @@ def _balance(work, n, at, drives, terms, step, command):
     Row i is divided by e = 1 + mu s(u) sign(tau), by which a gear that loses a share mu of its
     load multiplies the bodies' torque tau: so H stays symmetric.
     """
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held = at
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
     codes, shapes, values, first = terms
+    if memory >= 0:
+        _hold_on(work, n, at, terms, step)
     for i in range(n):
         for lane in range(LANES):
             _put(work, load + i, lane, _get(work, h + i, lane))
@@ -462,7 +490,8 @@ def _balance(work, n, at, drives, terms, step, command):
         for lane in range(LANES):
             span, tau = THETA * step[lane], _get(work, load + i, lane)
             speed, angle = _get(work, u + i, lane), _get(work, middle + i, lane)
-            f, f_u, f_q, e, e_u = 0.0, 0.0, 0.0, 1.0, 0.0
+            f, f_u = _get(work, grip + i, lane), _get(work, grip + n + i, lane)
+            f_q, e, e_u = 0.0, 1.0, 0.0
             for k in range(first[i], first[i + 1]):
                 y, y_u, y_q = term(codes[k], shapes[k], angle, speed)
                 if codes[k] == LOAD:
@@ -489,6 +518,24 @@ def _balance(work, n, at, drives, terms, step, command):
             _put(work, by_q + i, lane, f_q)
             _put(work, gains + i, lane, is_on)
             _put(work, loss + i, lane, e)
+
+
+@compiled
+def _hold_on(work, n, at, terms, step):
+    """Write the friction of memories for the speeds u, and its derivative."""
+    u, memory, grip = at[2], at[13], at[14]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for lane in range(LANES):
+            speed, f, f_u = _get(work, u + i, lane), 0.0, 0.0
+            for k in range(first[i], first[i + 1]):
+                if codes[k] == BRISTLES:
+                    before = _get(work, memory + 5 * int(shapes[k, 3]), lane)
+                    z, z_u, _ = taken_up(shapes[k], before, speed, THETA * step[lane])
+                    f += values[k] * z
+                    f_u += values[k] * z_u
+            _put(work, grip + i, lane, f)
+            _put(work, grip + n + i, lane, f_u)
 
 
 @compiled
@@ -533,8 +580,8 @@ def _advance(work, n, at, step):
 @compiled
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held = at
-    T_q, T_v, S, own, change, by_hold = sweeps
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
+    T_q, T_v, S, own, change, by_hold, by_memory = sweeps
     codes, shapes, values, first = terms
     P = len(columns)
     _combine(work, n, at, sweeps, drives, step)
@@ -560,6 +607,8 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                 is_on, x = _get(work, gains + j, lane), 0.0
                 if kind == ARMATURE:
                     x = (speed - _get(work, v + j, lane)) / span
+                elif kind == TERM and codes[index] == BRISTLES:
+                    x = _get(work, memory + 5 * int(shapes[index, 3]) + 1, lane)
                 elif kind == TERM:
                     x, _, _ = term(codes[index], shapes[index], _get(work, middle + j, lane), speed)
                     x *= abs(_get(work, load + j, lane)) if codes[index] == LOAD else 1.0
@@ -575,7 +624,80 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                 for lane in range(LANES):
                     x = _get(work, by_hold + i * P + p, lane) / _get(work, loss + i, lane)
                     _put(work, own + i, lane, _get(work, own + i, lane) - x)
+        if memory >= 0:
+            _recall(work, n, at, sweeps, terms, p, P, False)
         _advance_column(work, n, at, sweeps, step, p, P)
+        if memory >= 0:
+            _recall(work, n, at, sweeps, terms, p, P, True)
+
+
+@compiled
+def _remember(work, n, at, terms, step):
+    """Write z after a step, that which acts in it, and derivatives of both.
+
+    These are of what acts by z before, of z after by the speed u, and by z before.
+    """
+    u, memory = at[2], at[13]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for k in range(first[i], first[i + 1]):
+            if codes[k] == BRISTLES:
+                z = memory + 5 * int(shapes[k, 3])
+                for lane in range(LANES):
+                    speed, before = _get(work, u + i, lane), _get(work, z, lane)
+                    acts, _, share = taken_up(shapes[k], before, speed, THETA * step[lane])
+                    after, by_speed, kept = taken_up(shapes[k], before, speed, step[lane])
+                    _put(work, z, lane, after)
+                    _put(work, z + 1, lane, acts)
+                    _put3(work, z + 2, lane, (share, by_speed, kept))
+
+
+@compiled
+def _slide(work, n, at, by_memory, columns, terms):
+    """Write z where roll-outs begin, and how it changes with the speed v there.
+
+    It is that of long sliding, but for joints that take longer than ``_SLID`` to go their way.
+    """
+    v, memory = at[1], at[13]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for k in range(first[i], first[i + 1]):
+            if codes[k] != BRISTLES:
+                continue
+            slot, P = int(shapes[k, 3]), len(columns)
+            for lane in range(LANES):
+                speed = _get(work, v + i, lane)
+                extra = shapes[k, 2] * math.exp(-((speed / shapes[k, 1]) ** 2))
+                slow = shapes[k, 0] / _SLID
+                root = math.sqrt(speed * speed + slow * slow)
+                _put(work, memory + 5 * slot, lane, speed / root * (1.0 + extra))
+                by_speed = slow * slow / root**3 * (1.0 + extra)
+                by_speed -= 2.0 * speed * speed / (root * shapes[k, 1] ** 2) * extra
+                for p in range(P):
+                    if columns[p, 0] == SPEED and columns[p, 1] == i:
+                        _put(work, by_memory + slot * P + p, lane, by_speed)
+
+
+@compiled
+def _recall(work, n, at, sweeps, terms, p, P, is_after):
+    """Add to one column what memories make of their past; after the step, advance theirs."""
+    loss, memory = at[11], at[13]
+    own, change, by_memory = sweeps[3], sweeps[4], sweeps[6]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for k in range(first[i], first[i + 1]):
+            if codes[k] != BRISTLES:
+                continue
+            slot = int(shapes[k, 3])
+            z, Z = memory + 5 * slot, by_memory + slot * P + p
+            for lane in range(LANES):
+                x = _get(work, Z, lane)
+                if is_after:
+                    x *= _get(work, z + 4, lane)
+                    _put(work, Z, lane, x + _get(work, z + 3, lane) * _get(work, change + i, lane))
+                else:
+                    x *= values[k] * _get(work, z + 2, lane) / _get(work, loss + i, lane)
+                    _put(work, own + i, lane, _get(work, own + i, lane) + x)
 
 
 @compiled
@@ -682,6 +804,27 @@ def _advance_column(work, n, at, sweeps, step, p, P):
 
 
 @compiled
+def _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S):
+    """Write where roll-outs begin, and how that changes with itself."""
+    q, v, u, S, P = at[0], at[1], at[2], sweeps[2], len(columns)
+    for lane in range(LANES):
+        for k in range(3):
+            _put(work, _A + k, lane, -gravity[k])
+        for i in range(n):
+            _put(work, q + i, lane, start[0, i, lane])
+            _put(work, v + i, lane, start[1, i, lane])
+            _put(work, u + i, lane, start[1, i, lane])
+        for p in range(P):
+            if columns[p, 0] == START or columns[p, 0] == SPEED:
+                row = columns[p, 1] + (n if columns[p, 0] == SPEED else 0)
+                _put(work, S + row * P + p, lane, 1.0)
+                if columns[p, 0] == START:
+                    out_S[0, columns[p, 1], p, lane] = 1.0
+    if at[13] >= 0:
+        _slide(work, n, at, sweeps[6], columns, terms)
+
+
+@compiled
 def roll_out(
     parents, joints, zeros, bodies, is_below, gravity, drives, codes, shapes, values, first,
     columns, directions, command, steps, ticks, every, start, out_q, out_v, out_S, work,
@@ -697,7 +840,8 @@ def roll_out(
         gravity: Shape (3,) [m/s^2].
         drives: Armature, kp, kd and largest torque of each joint, shape (n, 4).
         codes: Kind of each term of friction, shape (T,), int.
-        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4).
+        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4); way,
+            speed and excess of a term that is taken up, and its number among those.
         values: Its parameter, shape (T,).
         first: Where the terms of a joint begin, shape (n + 1,), int.
         columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
@@ -722,22 +866,14 @@ def roll_out(
     load, loss, M = change + n, change + 2 * n, change + 3 * n
     H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
     by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
-    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held)
-    sweeps, terms = (T_q, T_v, S, own, change, by_hold), (codes, shapes, values, first)
+    memories = (codes == BRISTLES).sum()
+    grip = S + (3 * P + 1) * n
+    memory, by_memory = grip + 2 * n if memories else -1, grip + 2 * n + 5 * memories
+    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip)
+    sweeps = (T_q, T_v, S, own, change, by_hold, by_memory)
+    terms = (codes, shapes, values, first)
     work[:] = 0.0
-    for lane in range(LANES):
-        for k in range(3):
-            _put(work, _A + k, lane, -gravity[k])
-        for i in range(n):
-            _put(work, q + i, lane, start[0, i, lane])
-            _put(work, v + i, lane, start[1, i, lane])
-            _put(work, u + i, lane, start[1, i, lane])
-        for p in range(P):
-            if columns[p, 0] == START or columns[p, 0] == SPEED:
-                row = columns[p, 1] + (n if columns[p, 0] == SPEED else 0)
-                _put(work, S + row * P + p, lane, 1.0)
-                if columns[p, 0] == START:
-                    out_S[0, columns[p, 1], p, lane] = 1.0
+    _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S)
     for k in range(len(steps)):
         step = steps[k]
         if held >= 0 and ticks[k].any():
@@ -752,6 +888,8 @@ def roll_out(
         _mass_matrix(work, parents, joints, bodies, M)
         if not _newton(work, n, at, drives, terms, step, command[k]):
             return k
+        if memory >= 0:
+            _remember(work, n, at, terms, step)
         if P:
             for i in range(n):
                 for lane in range(LANES):

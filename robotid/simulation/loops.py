@@ -28,8 +28,10 @@ from robotid.robot.drives import (
     DriveTerm,
     Harmonic,
     LoadFriction,
+    LuGre,
     Offset,
     PositionCoulomb,
+    Presliding,
     Stribeck,
     Tanh,
     Viscous,
@@ -50,7 +52,7 @@ _SAME = 1e-3  # of a tick, by which it may be off a row that is sent at it
 _FASTEST = 1e6  # [rad/s or m/s] of a joint whose held loop runs away
 _CODES: dict[type[DriveTerm], int] = {
     Viscous: 0, Coulomb: 1, Offset: 2, PositionCoulomb: 3, Stribeck: 4, Asymmetric: 5, Cubic: 6,
-    Tanh: 7, Harmonic: 8, LoadFriction: 9,
+    Tanh: 7, Harmonic: 8, LoadFriction: 9, Presliding: 10, LuGre: 10,
 }  # fmt: skip
 
 
@@ -318,6 +320,8 @@ class LoopedRobot:
         coded = [_coded(term) for term in terms]
         codes = np.array([code for code, *_ in coded], dtype=np.int64)
         shapes = np.array([shape for _, *shape in coded]).reshape(-1, 4)
+        remembers = codes == lanes.BRISTLES
+        shapes[remembers, 3] = np.arange(remembers.sum())
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
         )
@@ -330,7 +334,7 @@ class LoopedRobot:
             part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],
             part.is_below, self._gravity, drives, codes, shapes, loops.values[places],
             first, columns, along, command, steps, ticks, every, start, q, v, S,
-            np.zeros(lanes.work_size(n, len(columns))),
+            np.zeros(lanes.work_size(n, len(columns), int(remembers.sum()))),
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(
@@ -465,13 +469,17 @@ def _parts(tree: Tree) -> list[_Part]:
 
 
 def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
-    """Return code, two numbers of its shape, and the range seen of a term."""
+    """Return code, two numbers of its shape, and the range seen of a term; three of a memory."""
     code = _CODES.get(type(term))
     if code is None:
         known = listed(kind.__name__ for kind in _CODES)
         raise SettingsError(
             f"the term {type(term).__name__} has no place in roll-outs; they have {known}"
         )
+    if isinstance(term, Presliding):
+        return code, term.displacement, 1.0, 0.0, 0.0
+    if isinstance(term, LuGre):
+        return code, term.displacement, term.speed, term.excess, 0.0
     shape = (0.0, 0.0)
     if isinstance(term, PositionCoulomb):
         shape = float(term.order), term.centre
