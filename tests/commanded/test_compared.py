@@ -110,6 +110,12 @@ def test_a_controller_that_is_not_known_has_no_inverse_dynamics(leg, loop, named
         fitted(leg, loop, error="direct")
 
 
+def test_torques_that_a_clock_holds_are_refused(leg):
+    loop = replace(LOOP, rate=500.0)
+    with pytest.raises(SettingsError, match=r"follow at once, but \[controller\] has rate = 500,"):
+        fitted(leg, loop, error="input")
+
+
 def test_settings_that_contradict_each_other_are_refused():
     with pytest.raises(SettingsError, match=r"error = 'input' compares torques, but torques is f"):
         SimulationSettings(error="input", torques=False)

@@ -74,9 +74,9 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
         np.testing.assert_array_equal(one.e, bare.e)
         np.testing.assert_array_equal(one.joints, bare.joints)
     for k, name in enumerate(simulator.names):
-        h = 3e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
+        h = 1e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
         if compared == "torques":
-            h = 1e-6 * max(abs(theta[k]), 0.1)
+            h = 1e-7 * max(abs(theta[k]), 0.1)
         ends = []
         for s in (1, -1):
             moved = theta.copy()
