@@ -29,7 +29,7 @@ from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
 
 SECONDS, NOISE, TORQUE, DELAY = 6.0, 3e-4, 0.05, 0.005  # [s], [rad], [N m], [s]
-STEP = 5e-4  # [s] of our roll-outs
+STEP = 1e-3  # [s] of our roll-outs
 #: Gains of three joints [N m/rad], [N m s/rad], and the highest tone of their commands [Hz].
 CASES = {"stiff": (80.0, 3.0, 1.5), "soft": (20.0, 1.2, 4.0)}
 METHODS = {
@@ -43,7 +43,7 @@ METHODS = {
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one run of 2 s: a try-out")
-    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--runs", type=int, default=4)
     options = parser.parse_args()
     runs, seconds = (1, 2.0) if options.quick else (options.runs, SECONDS)
     print(f"| loops, {runs} runs | compared | median error over truth: armature | viscous "

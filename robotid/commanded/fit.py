@@ -194,7 +194,7 @@ def _check_settings(
     unknown = [
         key for key in ("kp", "kd", "delay") if not _is_stated(getattr(loop, key), model).all()
     ]
-    finds_limit = loop.limit == "find" or _largest_speeds(model, loop, logs).any()
+    finds_limit = loop.limit == "find" or bool(_largest_speeds(model, loop, logs).any())
     unknown += ["limit"] * finds_limit + ["zeros"] * (loop.zeros == "find")
     if unknown:
         raise SettingsError(
