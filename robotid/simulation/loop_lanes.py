@@ -13,8 +13,8 @@ friction and offset, r and w the commands as they are on average over the step; 
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
 
-Friction that a joint takes up over a way, x z, has z as a further state: over a step, at the speed
-u, its equation is linear, and solved exactly. Force acts with the z of the instant t + theta dt.
+Friction that a joint takes up over a way, x z, has z as a further state: over a step, at speed u,
+its equation is linear, and solved exactly. Force acts with the z of the instant t + theta dt.
 
 A controller with a clock reads q, v and its commands at its ticks, and holds the torque that it
 makes of them until the next. No step crosses a tick. The held torque has sensitivities of its own,

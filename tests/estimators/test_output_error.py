@@ -170,6 +170,7 @@ def test_slopes_that_are_far_too_small_never_settle(rng):
     found = OutputError(whitens=False).fit(small, TRUTH, exact=lag)
     assert found.details["left"] > 1
     assert not found.converged
+    assert found.n_iter == 25, "one round"
 
 
 def test_correlated_noise_does_not_make_plain_squares_sure(rng):
