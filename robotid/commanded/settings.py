@@ -30,14 +30,18 @@ class LoopSettings(Settings):
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "largest torque of the drive [N m or N], likewise; none if not stated, found if 'find'",
+        "largest torque of the drive [N m or N], likewise; found of joints that run at one largest "
+        "speed whatever their error if not stated, of every joint if 'find'",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found, one for each group, if not stated",
-        **LEVEL,
+        None, "how late the command acts [s], likewise; found if not stated", **LEVEL
+    )
+    delays: str = setting(
+        "one", "whether the robot has one delay that is found, that of bus and controller, or each "
+        "group its own", among=("one", "group"),
     )  # fmt: skip
     rate: float | None = setting(
         None, "how often a second a controller with a clock reads position and speed, to hold its "

@@ -49,7 +49,7 @@ __all__ = [
 
 LANES = 8
 THETA = 0.5  # of a step, where its forces act: exact to second order
-_SIGN = 1e-4  # [rad/s or m/s]: the speed over which friction turns
+_SIGN = 1e-5  # [rad/s or m/s]: the speed over which friction turns
 _SLID = 0.1  # [s] for which drives are taken to have moved before a roll-out begins
 _NEWTON = 60  # steps, of which three or four are usual
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size

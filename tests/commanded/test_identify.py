@@ -20,7 +20,7 @@ SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=1e-3)
 def stated(robot, **changes):
     drives = robot.drives
     gains = {"kp": {d.joint: d.kp for d in drives}, "kd": {d.joint: d.kd for d in drives}}
-    return LoopSettings(**(gains | changes))
+    return LoopSettings(**({"delays": "group"} | gains | changes))
 
 
 @pytest.fixture(scope="module")

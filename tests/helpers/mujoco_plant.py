@@ -43,12 +43,14 @@ class Plant:
         model: The robot as its URDF says, whose bodies are the truth.
         drives: Its drives.
         middle, reach: Of the commands, shape (n,) [rad].
+        bodies: Their inertial parameters, shape (10 n,); those of the URDF if None.
     """
 
     model: RobotModel
     drives: tuple[CommandedDrive, ...]
     middle: np.ndarray
     reach: np.ndarray
+    bodies: np.ndarray | None = None
 
     @property
     def truth(self) -> dict[str, float]:
@@ -126,6 +128,8 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
     """
     pi = plant.model.standard_parameters()
     names = plant.model.layout.names
+    if plant.bodies is not None:
+        pi[: plant.model.layout.n_inertial] = plant.bodies
     for drive in plant.drives:
         for term in ("armature", "viscous", "coulomb", "offset"):
             pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
