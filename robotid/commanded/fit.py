@@ -186,6 +186,7 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         zero=np.zeros(n),
         terms=((),) * n,
         values=np.zeros(0),
+        rate=loop.rate,
     )
 
 

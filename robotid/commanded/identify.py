@@ -355,8 +355,8 @@ def _untold_encoders(found: Commanded, open_: Sequence[str]) -> Iterator[Finding
             "note",
             names,
             f"gravity does not tell zero and sense of {names}: they move little, or bear so "
-            f"little that others leave {100 * margin:.0f} % more of the squared error of the loops at "
-            "most. They are taken to be the URDF's; compare them at a known pose",
+            f"little that others leave {100 * margin:.0f} % more of the squared error of the loops "
+            "at most. They are taken to be the URDF's; compare them at a known pose",
             {"margin": float(margin)},
         )
     for chain in parallel_axes(found.model):

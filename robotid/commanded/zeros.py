@@ -3,7 +3,7 @@
 A servo's position loop is held off its command by the torque of its load, q_ref - q = tau / kp +
 friction. So the error of the loops, regressed on the URDF's torques, tells at which angles and in
 which sense the URDF's joints stand where the encoders read what they do. What is slow tells it: in
-fast motion lags outweigh gravity, and in the mean over it friction, on either side in turn, is none.
+fast motion lags outweigh gravity, and friction, on either side in turn, has a mean of none.
 Joints with parallel axes cannot be told from their mirror image: gravity holds both off alike.
 """
 
