@@ -91,9 +91,10 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     drives, signs = loaded.commanded, loaded.content["simulation"]["signs"]
     sign = np.array([signs[joint] for joint in model.joints])
     robot, runs, logs = LoopedRobot(model), [], []
+    loops = loops_of(model, pi, drives, loaded.rate)
     for entry in entries:
         logs.append(log_of_commands(job, entry, loaded))
-        runs.append(run_open_loop(robot, loops_of(model, pi, drives), logs[-1].turned(sign)))
+        runs.append(run_open_loop(robot, loops, logs[-1].turned(sign)))
     hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
     is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
     alarms = alarming(diagnose(model, (), logs, job.signals), job.ignore)

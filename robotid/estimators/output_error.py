@@ -21,6 +21,7 @@ from robotid.regressor.factors import Factors, triangle_of
 
 __all__ = ["OutputError", "Residual", "Simulator", "linearised"]
 
+_CAUTIOUS = 1e-3  # damping of a step, with which what nothing tells stays where it is
 _STEPS = 25  # of the damped Gauss-Newton method in a round
 _ROUNDS = 5  # of whitening and noise levels ...
 _SETTLED = 2e-2  # ... until they change by less than that
@@ -198,7 +199,7 @@ class OutputError:
             theta: Parameters that fit best with the starts as they are, shape (c,).
         """
         H, g = self._normal(simulator, self.weights(simulator, theta), theta, frees=True)
-        return _bounded_step(H, g, theta, simulator.lowest, 0.0)
+        return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
 
     def _normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
@@ -216,7 +217,7 @@ class OutputError:
         self, simulator: Simulator, weights: _Weights, theta: Array, close: float
     ) -> tuple[Array, int, bool]:
         """Minimise with given weights; return where it ends, its steps, and whether it settled."""
-        damping, cost = 1e-3, self._cost(simulator, weights, theta)
+        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta)
         if not np.isfinite(cost):
             raise NotConvergedError(
                 "the loop cannot be simulated with the parameters that the fit begins with; state "
@@ -341,17 +342,18 @@ def _given(r: Residual) -> Array:
 
 def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: float) -> Array:
     """Return where a damped step leads; parameters that it would push below a bound stay there."""
-    H = H + damping * np.diag(np.diag(H))
+    scale = 1.0 / np.sqrt(np.diag(H))
+    H = H * np.outer(scale, scale) + damping * np.eye(len(H))  # its condition, not that of units
     free = (theta > lowest) | (g > 0)
     trial = theta.copy()
     while free.any():
-        step = scipy.linalg.solve(H[np.ix_(free, free)], g[free], assume_a="pos")
-        trial[free] = theta[free] + step
+        step = scipy.linalg.solve(H[np.ix_(free, free)], (scale * g)[free], assume_a="pos")
+        trial[free] = theta[free] + scale[free] * step
         below = free & (trial < lowest)
         if not below.any():
             break
         trial[below] = lowest[below]
-        g = g - H[:, below] @ (lowest[below] - theta[below])
+        g = g - H[:, below] @ ((lowest - theta) / scale)[below] / scale
         free = free & ~below
     return trial
 

@@ -110,13 +110,16 @@ def commanded_drives(
     )
 
 
-def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> Loops:
+def loops_of(
+    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], rate: float | None = None
+) -> Loops:
     """Return bodies, drives and loops as roll-outs take them.
 
     Args:
         model: The identified robot.
         pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
         drives: Its drives; armature, friction and offset are those of pi.
+        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
     """
     layout, n = model.layout, model.layout.n_inertial
     terms: list[list[DriveTerm]] = [[] for _ in drives]
@@ -134,12 +137,17 @@ def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> 
         limit=np.array([drive.effort_limit for drive in drives]),
         terms=tuple(map(tuple, terms)),
         values=np.concatenate(values),
+        rate=rate,
         **figures,
     )
 
 
 def follow_commands(
-    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], log: Log
+    model: RobotModel,
+    pi: Array,
+    drives: Sequence[CommandedDrive],
+    log: Log,
+    rate: float | None = None,
 ) -> Array:
     """Return the positions that a robot takes on the commands of a log, in open loop.
 
@@ -150,6 +158,7 @@ def follow_commands(
         pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
         drives: Its drives.
         log: The log, of its joints in its order, with commands.
+        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
 
     Returns:
         Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
@@ -160,7 +169,8 @@ def follow_commands(
         SettingsError: If a term of the drives cannot be rolled out.
     """
     robot, q = LoopedRobot(model), np.full_like(log.q, np.nan)
-    for out in robot.roll_out(loops_of(model, pi, drives), cut_windows(log, np.inf, 0.0)):
+    loops = loops_of(model, pi, drives, rate)
+    for out in robot.roll_out(loops, cut_windows(log, np.inf, 0.0)):
         q[out.window.counted] = out.q
     return q
 
