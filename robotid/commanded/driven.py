@@ -62,13 +62,14 @@ def identified_rows(
     return identify(model, logs, signals=signals, friction="none", doctor=False)
 
 
-def torque_rows(found: Identification) -> TorqueRows:
+def torque_rows(found: Identification, inflation: float = 1.0) -> TorqueRows:
     """Return what an identification's rows come down to.
 
     Their weight is that of rows as independent as the scatter of stretches shows them to be.
 
     Args:
         found: The identification.
+        inflation: By how much larger their variance counts beside.
     """
-    weight = found.wls.sigma * np.sqrt(max(found.errors.inflation, 1.0))
+    weight = found.wls.sigma * np.sqrt(inflation * max(found.errors.inflation, 1.0))
     return TorqueRows(found.model, found.factors.weighted(weight), found.mapping.K)

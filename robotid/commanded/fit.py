@@ -7,6 +7,7 @@ import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.commanded.driven import identified_rows, torque_rows
+from robotid.commanded.errors import DRIFTS
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
@@ -28,7 +29,8 @@ __all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops", "with_terms"]
 
 #: What the fit of a job does, from files to files.
 STAGES = (
-    "reading logs", "fitting torques", "trying plain loops", "fitting loops", "trying friction", "testing", "writing"
+    "reading logs", "fitting torques", "trying plain loops", "fitting loops", "trying friction",
+    "testing", "writing",
 )  # fmt: skip
 
 
@@ -43,7 +45,8 @@ _LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins 
 _WHITE = 2.0  # whitening ends at so many times the rate at which a loop follows
 _FEW = 12  # windows that are fitted first, of many
 _STARTS = 3  # fits with better starts of the windows
-_DRIFTS = 0.5  # [s] after which what a logged torque drives has drifted off
+_WINDOW, _LEAD = 2.5, 0.6  # [s] of what follows commands, if not stated
+_BOTH = 2.0  # one torque's noise is in its rows and in what it drives: each counts by half
 _PASSES = 2  # of choosing terms and fitting again
 
 
@@ -111,6 +114,8 @@ def fit_loops(
         simulator = simulator.begun_better(theta)
         estimate = estimator.fit(simulator, theta)
         theta = estimator.joint_step(simulator, estimate.theta)
+        if begun.linear is not None and simulator.torque is not None:
+            estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
     tried: list[Tried] = []
     for _ in range(_PASSES if chooses else 0):
         report_stage(progress, "trying friction", STAGES)
@@ -129,7 +134,8 @@ def fit_loops(
         simulator, theta = _with(simulator, estimate.theta, taken)
         if simulator.torque is not None:
             own = with_terms(model, simulator.base)
-            simulator = replace(simulator, torque=torque_rows(identified_rows(own, logs, signals)))
+            rows = torque_rows(identified_rows(own, logs, signals), begun.share)
+            simulator = replace(simulator, torque=rows)
         estimate = estimator.fit(simulator, theta)
     return Fitted(simulator, estimate, begun.plain, begun.encoders, tuple(tried), begun.linear)
 
@@ -146,6 +152,11 @@ class _Begun:
     plain: SecondOrder | None = None
     linear: Identification | None = None
 
+    @property
+    def share(self) -> float:
+        """How often each row of torque is counted, in rows and roll-outs."""
+        return 1.0 if self.linear is None else _BOTH
+
 
 def _begun_by_commands(
     model: RobotModel,
@@ -159,7 +170,8 @@ def _begun_by_commands(
     robot = LoopedRobot(model, step=settings.step)
     encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
     logs = [log.turned(encoders.sign) for log in logs]
-    windows = tuple(w for log in logs for w in cut_windows(log, settings.window, settings.lead))
+    length, lead = settings.window or _WINDOW, _LEAD if settings.lead is None else settings.lead
+    windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     stated = replace(stated_loops(model, loop), zero=encoders.zero)
     report_stage(progress, "trying plain loops", STAGES)
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
@@ -202,8 +214,8 @@ def _begun_by_torque(
     linear = open_loops(model, found.standard)
     base = linear if settings.torques else replace(linear, bodies=stated_loops(model, loop).bodies)
     robot = LoopedRobot(model, step=settings.step)
-    window = min(settings.window, _DRIFTS)
-    windows = tuple(w for log in logs for w in cut_windows(log, window, 0.0))
+    length, lead = settings.window or DRIFTS, settings.lead or 0.0
+    windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     usual = _usual_of_torques(model, found.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
     unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=False)
@@ -211,7 +223,7 @@ def _begun_by_torque(
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
     if settings.torques:
-        simulator = replace(simulator, torque=torque_rows(found))
+        simulator = replace(simulator, torque=torque_rows(found, _BOTH))
     estimator = OutputError(whitens=settings.whiten, progress=progress)
     encoders = same_encoders(model)
     return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, linear=found)

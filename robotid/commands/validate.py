@@ -37,7 +37,7 @@ from robotid.identification.survey import SurveyedLog
 from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot
+from robotid.simulation.loops import LoopedRobot, open_loops
 
 __all__ = ["validate_result"]
 
@@ -90,10 +90,11 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     model, pi = loaded.identified
     drives, signs = loaded.commanded, loaded.content["simulation"]["signs"]
     sign = np.array([signs[joint] for joint in model.joints])
+    loops = loops_of(model, pi, drives) if drives else open_loops(model, pi)
     robot, runs, logs = LoopedRobot(model), [], []
     for entry in entries:
         logs.append(log_of_commands(job, entry, loaded))
-        runs.append(run_open_loop(robot, loops_of(model, pi, drives), logs[-1].turned(sign)))
+        runs.append(run_open_loop(robot, loops, logs[-1].turned(sign)))
     hashes = {i["sha256"] for i in loaded.content["inputs"] if i["role"] == "identification"}
     is_kept = not any(file_sha256(entry.path) in hashes for entry in entries)
     alarms = alarming(diagnose(model, (), logs, job.signals), job.ignore)

@@ -122,6 +122,8 @@ class OutputError:
             the loop's own, whitening takes away what the loop shows. 0.95 if None.
         steps: Most steps in a round.
         rounds: Most rounds.
+        inflation: By how much larger the variance of residuals counts, which whitening does not
+            make independent: beside further rows it says how both weigh.
         progress: Told of the steps.
 
     References:
@@ -132,6 +134,7 @@ class OutputError:
     most: Array | None = None
     steps: int = _STEPS
     rounds: int = _ROUNDS
+    inflation: float = 1.0
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, simulator: Simulator, start: Array) -> Estimate:
@@ -176,7 +179,7 @@ class OutputError:
                 rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, most[j])
             size = sum(len(x) - 1 for x in own)
             level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
-            sigma[j] = max(level, 1e-12)
+            sigma[j] = max(level, 1e-12) * np.sqrt(self.inflation)
         return _Weights(rho, sigma)
 
     def _cost(self, simulator: Simulator, weights: _Weights, theta: Array) -> float:
@@ -281,7 +284,7 @@ class OutputError:
             theta=theta,
             covariance=covariance,
             names=simulator.names,
-            sigma=weights.sigma,
+            sigma=weights.sigma / np.sqrt(self.inflation),
             rank=len(theta) - len(undetermined),
             condition=float(np.sqrt(values[-1] / max(values[0], 1e-300))),
             undetermined=undetermined,
@@ -291,7 +294,7 @@ class OutputError:
             prior_std=simulator.prior_std,
             details={
                 "correlation": weights.rho,
-                "inflation": inflation,
+                "inflation": inflation * self.inflation,
                 "freedom": freedom,
                 "at_bound": tuple(
                     name

@@ -118,12 +118,11 @@ def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> 
         pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
         drives: Its drives; armature, friction and offset are those of pi.
     """
-    figures = {
-        key: np.array([getattr(drive, key) for drive in drives])
-        for key in ("armature", "kp", "kd", "delay", "zero")
-    }
-    limit = np.array([drive.effort_limit for drive in drives])
-    return replace(open_loops(model, pi), limit=limit, **figures)
+    kp, kd, delay, zero, limit = (
+        np.array([getattr(drive, key) for drive in drives])
+        for key in ("kp", "kd", "delay", "zero", "effort_limit")
+    )
+    return replace(open_loops(model, pi), kp=kp, kd=kd, delay=delay, zero=zero, limit=limit)
 
 
 def follow_commands(
