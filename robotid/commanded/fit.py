@@ -207,12 +207,13 @@ def _begun_by_torque(
 ) -> _Begun:
     """Return a robot that the logged torque drives, begun with what its rows tell by themselves.
 
-    Where these rows weigh, bodies change about what they tell; about the URDF's if not.
+    Where these rows weigh, bodies change about what they tell; else about the URDF's, or stay.
     """
     report_stage(progress, "fitting torques", STAGES)
     found = identified_rows(model, logs, signals)
     linear = open_loops(model, found.standard)
-    base = linear if settings.torques else replace(linear, bodies=stated_loops(model, loop).bodies)
+    is_urdf = not (settings.torques and settings.bodies)
+    base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
     robot = LoopedRobot(model, step=settings.step)
     length, lead = settings.window or DRIFTS, settings.lead or 0.0
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))

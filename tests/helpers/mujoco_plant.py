@@ -180,3 +180,25 @@ def rolled_out(robot, q_ref, rate, settles=_SETTLES):
     qpos = states[0, :, 1 : 1 + robot.nq]  # after the time; a row after each step
     q = qpos[before - 1 :][: held * len(q_ref) : held, at]
     return q, forces[0, before::held]  # which a step tells of the state that it begins with
+
+
+def torque_log(plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, torque=0.0):
+    """Return the log of a plant's positions and of the torques that move it, without commands.
+
+    The loop runs so much faster than the log is written that its torque is smooth between rows.
+
+    Args:
+        plant: The robot, whose controller is not in the log.
+        rng: Source of the motion and of the noise.
+        duration: Length [s].
+        rate: Rows per second of the log [Hz].
+        fine: Commands per second of the loop [Hz].
+        noise: Standard deviation of the encoders [rad].
+        torque: Standard deviation of the logged torques [N m].
+    """
+    log, _ = recorded(plant, rng, duration=duration, rate=fine, noise=0.0, torque=0.0)
+    kept = slice(None, None, round(fine / rate))
+    q, tau = log.q[kept], log.tau[kept]
+    q = q + noise * rng.standard_normal(q.shape)
+    tau = tau + torque * rng.standard_normal(tau.shape)
+    return Log(log.t[kept], q, tau, log.joints)

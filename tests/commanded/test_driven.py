@@ -1,0 +1,98 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import plant, recorded, torque_log
+
+from robotid.commanded.driven import driven_log
+from robotid.commanded.errors import DRIFTS, run_open_loop
+from robotid.commanded.identify import identify_commands
+from robotid.commanded.settings import LoopSettings
+from robotid.exceptions import DataError
+from robotid.identification.evaluation import evaluate_logs
+from robotid.identification.settings import SimulationSettings
+from robotid.identification.survey import hold_log
+from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
+from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot, open_loops
+
+SIGNALS = SignalSettings(cutoff=30.0)
+DRIVEN = LoopSettings(kind="torque")
+
+
+def true_parameters(robot):
+    pi, names = robot.model.standard_parameters(), robot.model.layout.names
+    for name, value in robot.truth.items():
+        if name in names:
+            pi[names.index(name)] = value
+    return pi
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A planar arm in MuJoCo, a log to fit and one kept apart: positions and torques."""
+    rng = np.random.default_rng(5)
+    robot = plant("planar", rng, delay=0.0)
+    logs = [torque_log(robot, rng, duration=d, noise=5e-5, torque=0.3) for d in (8.0, 4.0)]
+    return robot, *logs
+
+
+def found_by(arm, **settings):
+    robot, log, kept = arm
+    chosen = SimulationSettings(bodies=0.0, step=4e-3, **settings)
+    return identify_commands(
+        robot.model, [log], [kept], DRIVEN, chosen, signals=SIGNALS, chooses=False
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(arm):
+    return found_by(arm, torques=False)
+
+
+@pytest.fixture(scope="module")
+def both(arm):
+    return found_by(arm)
+
+
+def test_what_is_fed_forward_is_the_mean_torque_between_two_rows():
+    t = np.arange(5) * 0.01
+    tau = np.column_stack([t, t**2])
+    model = RobotModel.from_urdf(plant("planar", np.random.default_rng(0)).model.tree)
+    log = Log(t, np.zeros((5, 2)), tau, model.joints, v=np.ones((5, 2)))
+    heard = driven_log(model, log, SignalSettings())
+    np.testing.assert_allclose(heard.tau_ref[:4, 0], t[:4] + 0.005)
+    np.testing.assert_allclose(heard.tau_ref[:4, 1], (t[:4] ** 2 + t[1:] ** 2) / 2)
+    np.testing.assert_allclose(heard.tau_ref[4], tau[4])
+    assert heard.v_ref is None
+    late = driven_log(model, log, SignalSettings(torque_delay=0.01))
+    np.testing.assert_allclose(late.tau_ref[:3], heard.tau_ref[1:4])
+    np.testing.assert_array_equal(late.tau, log.tau)  # rows of torque are moved back elsewhere
+
+
+
+
+def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
+    robot, rng = arm[0], np.random.default_rng(8)
+    log = driven_log(
+        robot.model, torque_log(robot, rng, duration=4.0, rate=500.0), SIGNALS
+    )
+    loops = open_loops(robot.model, true_parameters(robot))
+    run = run_open_loop(LoopedRobot(robot.model, step=1e-3), loops, log)
+    # its friction is soft over 1e-2 rad/s, ours over 1e-4
+    assert (run.rmse < 3e-3).all()
+    assert (run.rmse < 0.05 * run.spread).all()
+
+
+def test_roll_outs_alone_find_the_drives_of_an_arm(arm, alone):
+    truth, estimate = arm[0].truth, alone.fitted.estimate
+    assert estimate.converged
+    kinds = {name.rpartition(".")[2] for name in estimate.names}
+    assert kinds == {"armature", "viscous", "coulomb", "offset"}, "no gain, no delay"
+    for name, value, error in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        if name.endswith("offset"):
+            assert abs(value) < 0.02 * truth[name.replace("offset", "coulomb")] + 3 * error
+        else:
+            assert abs(value - truth[name]) < 0.05 * truth[name], name
+    assert alone.fitted.simulator.torque is None
