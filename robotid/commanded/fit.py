@@ -225,7 +225,7 @@ def _begun_by_torque(
     report_stage(progress, "fitting loops", STAGES)
     if settings.torques:
         simulator = replace(simulator, torque=torque_rows(found, _BOTH))
-    estimator = OutputError(whitens=settings.whiten, progress=progress)
+    estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
     return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, linear=found)
 

@@ -7,7 +7,7 @@ beside what drifts.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -124,6 +124,8 @@ class OutputError:
         rounds: Most rounds.
         inflation: By how much larger the variance of residuals counts, which whitening does not
             make independent: beside further rows it says how both weigh.
+        frees: Whether the starts of windows move with the parameters, to first order, in each step:
+            wanted where nothing in a window makes up for a wrong start.
         progress: Told of the steps.
 
     References:
@@ -135,6 +137,7 @@ class OutputError:
     steps: int = _STEPS
     rounds: int = _ROUNDS
     inflation: float = 1.0
+    frees: bool = False
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, simulator: Simulator, start: Array) -> Estimate:
@@ -168,7 +171,9 @@ class OutputError:
             simulator: What rolls out.
             theta: Parameters, shape (c,).
         """
-        found = simulator.residuals(theta, with_slopes=False)
+        found = simulator.residuals(theta, with_slopes=self.frees)
+        if self.frees:
+            found = [replace(r, e=_freed(r)) for r in found]
         n = 1 + max(int(r.joints.max()) for r in found)
         rho, sigma = np.zeros(n), np.ones(n)
         most = np.full(n, _MOST_RHO) if self.most is None else self.most
@@ -188,7 +193,10 @@ class OutputError:
             found = simulator.residuals(theta, with_slopes=False)
         except NotConvergedError:
             return np.inf  # a step that leads there is too long
-        cost = _squares(weights.whiten(r.e, r.joints) for r in found)
+        if self.frees:
+            cost = _squares(b for _, b, _ in linearised(simulator, weights, theta, frees=True))
+        else:
+            cost = _squares(weights.whiten(r.e, r.joints) for r in found)
         cost += float(np.sum(((theta - simulator.prior) / simulator.prior_std) ** 2))
         cost += float(np.sum(simulator.rows(theta)[1] ** 2))
         return cost if np.isfinite(cost) else np.inf
@@ -228,7 +236,7 @@ class OutputError:
             )
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
-            H, g = self._normal(simulator, weights, theta)
+            H, g = self._normal(simulator, weights, theta, frees=self.frees)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.lowest, damping)
                 new = self._cost(simulator, weights, trial)
@@ -334,6 +342,17 @@ def linearised(
             U = U[:, sizes > _NO_TRACE]
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
         yield A, b, r.columns
+
+
+def _freed(r: Residual) -> Array:
+    """Return what a better start would leave of a residual, joints weighing by their size."""
+    if r.by_start is None:
+        return r.e
+    size = np.maximum(np.sqrt(np.mean(r.e**2, axis=0)), 1e-12)
+    G = (r.by_start / size[:, None]).reshape(r.e.size, -1)
+    moved = G @ np.linalg.lstsq(G, (r.e / size).reshape(-1), rcond=None)[0]
+    freed: Array = r.e - size * moved.reshape(r.e.shape)
+    return freed
 
 
 def _given(r: Residual) -> Array:

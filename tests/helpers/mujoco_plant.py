@@ -196,9 +196,14 @@ def torque_log(plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, tor
         noise: Standard deviation of the encoders [rad].
         torque: Standard deviation of the logged torques [N m].
     """
-    log, _ = recorded(plant, rng, duration=duration, rate=fine, noise=0.0, torque=0.0)
+    t = np.arange(round(duration * fine)) / fine
+    q_ref = multisine(t, plant.middle, plant.reach, rng)
+    robot = loaded(plant, fine, 1.0 / fine)
+    robot.dof_solref[:] = 2.0 / fine, 1.0  # friction as stiff as the steps allow
+    robot.dof_solimp[:] = 0.9999, 0.9999, 0.001, 0.5, 2.0
+    q, force = rolled_out(robot, q_ref, fine)
     kept = slice(None, None, round(fine / rate))
-    q, tau = log.q[kept], log.tau[kept]
-    q = q + noise * rng.standard_normal(q.shape)
+    q = q[kept] + noise * rng.standard_normal(q[kept].shape)
+    tau = force[kept] + [drive.offset for drive in plant.drives]
     tau = tau + torque * rng.standard_normal(tau.shape)
-    return Log(log.t[kept], q, tau, log.joints)
+    return Log(t[kept], q, tau, plant.model.joints)
