@@ -72,12 +72,15 @@ class Simulator(Protocol):
     @property
     def lowest(self) -> Array: ...
 
-    def residuals(self, theta: Array, *, with_slopes: bool) -> Sequence[Residual]:
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> Sequence[Residual]:
         """Return what is measured less what is simulated, window by window.
 
         Args:
             theta: Parameters, shape (c,).
             with_slopes: Whether derivatives are wanted.
+            with_starts: Whether those by the starts of windows are, without the others.
 
         Raises:
             NotConvergedError: If it cannot be simulated with these parameters.
@@ -171,7 +174,7 @@ class OutputError:
             simulator: What rolls out.
             theta: Parameters, shape (c,).
         """
-        found = simulator.residuals(theta, with_slopes=self.frees)
+        found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
         if self.frees:
             found = [replace(r, e=_freed(r)) for r in found]
         n = 1 + max(int(r.joints.max()) for r in found)
@@ -190,13 +193,14 @@ class OutputError:
     def _cost(self, simulator: Simulator, weights: _Weights, theta: Array) -> float:
         """Return the cost; infinite where it cannot be simulated."""
         try:
-            found = simulator.residuals(theta, with_slopes=False)
+            found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
         except NotConvergedError:
             return np.inf  # a step that leads there is too long
-        if self.frees:
-            cost = _squares(b for _, b, _ in linearised(simulator, weights, theta, frees=True))
-        else:
-            cost = _squares(weights.whiten(r.e, r.joints) for r in found)
+        cost = 0.0
+        for r in found:
+            b = weights.whiten(r.e, r.joints).reshape(-1)
+            U = _by_start(r, weights) if self.frees else np.zeros((len(b), 0))
+            cost += float(b @ b) - float(np.sum((U.T @ b) ** 2))
         cost += float(np.sum(((theta - simulator.prior) / simulator.prior_std) ** 2))
         cost += float(np.sum(simulator.rows(theta)[1] ** 2))
         return cost if np.isfinite(cost) else np.inf
@@ -336,12 +340,20 @@ def linearised(
         b = weights.whiten(r.e, r.joints)
         A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
         b = b.reshape(-1)
-        if frees and r.by_start is not None:
-            G = weights.whiten(r.by_start, r.joints).reshape(b.size, -1)
-            U, sizes, _ = np.linalg.svd(G, full_matrices=False)
-            U = U[:, sizes > _NO_TRACE]
+        if frees:
+            U = _by_start(r, weights)
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
         yield A, b, r.columns
+
+
+def _by_start(r: Residual, weights: _Weights) -> Array:
+    """Return an orthonormal basis of what the start of a window could do to its whitened rows."""
+    if r.by_start is None:
+        return np.zeros((r.e[1:].size, 0))
+    G = weights.whiten(r.by_start, r.joints).reshape(r.e[1:].size, -1)
+    U, sizes, _ = np.linalg.svd(G, full_matrices=False)
+    basis: Array = U[:, sizes > _NO_TRACE]
+    return basis
 
 
 def _freed(r: Residual) -> Array:

@@ -1,17 +1,12 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from helpers.mujoco_plant import plant, recorded, torque_log
+from helpers.mujoco_plant import plant, torque_log
 
 from robotid.commanded.driven import driven_log
-from robotid.commanded.errors import DRIFTS, run_open_loop
+from robotid.commanded.errors import run_open_loop
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
-from robotid.exceptions import DataError
-from robotid.identification.evaluation import evaluate_logs
 from robotid.identification.settings import SimulationSettings
-from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
 from robotid.logs.settings import SignalSettings
 from robotid.robot.model import RobotModel
@@ -71,13 +66,9 @@ def test_what_is_fed_forward_is_the_mean_torque_between_two_rows():
     np.testing.assert_array_equal(late.tau, log.tau)  # rows of torque are moved back elsewhere
 
 
-
-
 def test_the_true_robot_does_under_its_torque_what_mujocos_does(arm):
     robot, rng = arm[0], np.random.default_rng(8)
-    log = driven_log(
-        robot.model, torque_log(robot, rng, duration=4.0, rate=500.0), SIGNALS
-    )
+    log = driven_log(robot.model, torque_log(robot, rng, duration=4.0, rate=500.0), SIGNALS)
     loops = open_loops(robot.model, true_parameters(robot))
     run = run_open_loop(LoopedRobot(robot.model, step=1e-3), loops, log)
     # its friction is soft over 1e-2 rad/s, ours over 1e-4

@@ -35,7 +35,7 @@ class Lagging:
         A, b = self.further[:, :-1], self.further[:, -1]
         return A, b - A @ theta
 
-    def residuals(self, theta, *, with_slopes):
+    def residuals(self, theta, *, with_slopes, with_starts=False):
         e = self.measured - self.simulated(theta)
         slopes = None
         if with_slopes:

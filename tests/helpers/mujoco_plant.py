@@ -182,7 +182,9 @@ def rolled_out(robot, q_ref, rate, settles=_SETTLES):
     return q, forces[0, before::held]  # which a step tells of the state that it begins with
 
 
-def torque_log(plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, torque=0.0):
+def torque_log(
+    plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, torque=0.0, relative=0.0
+):
     """Return the log of a plant's positions and of the torques that move it, without commands.
 
     The loop runs so much faster than the log is written that its torque is smooth between rows.
@@ -195,6 +197,7 @@ def torque_log(plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, tor
         fine: Commands per second of the loop [Hz].
         noise: Standard deviation of the encoders [rad].
         torque: Standard deviation of the logged torques [N m].
+        relative: The same over their usual size [-].
     """
     t = np.arange(round(duration * fine)) / fine
     q_ref = multisine(t, plant.middle, plant.reach, rng)
@@ -205,5 +208,6 @@ def torque_log(plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, tor
     kept = slice(None, None, round(fine / rate))
     q = q[kept] + noise * rng.standard_normal(q[kept].shape)
     tau = force[kept] + [drive.offset for drive in plant.drives]
-    tau = tau + torque * rng.standard_normal(tau.shape)
+    level = torque + relative * np.sqrt(np.mean(tau**2, axis=0))
+    tau = tau + level * rng.standard_normal(tau.shape)
     return Log(t[kept], q, tau, plant.model.joints)
