@@ -125,7 +125,7 @@ def fit_loops(
             if set_[0].name not in simulator.names
         ]
         wide, theta = _with(simulator, estimate.theta, offered)
-        found = choose(wide, theta, offered, estimator)
+        found = choose(wide, theta, offered, replace(estimator, inflation=1.0))
         tried = [*(t for t in tried if t.is_chosen), *found]
         taken = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
         if not taken:
