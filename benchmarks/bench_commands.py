@@ -1,7 +1,7 @@
 """Drives from commands and positions: errors of open loops, intervals, and time.
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
-        [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS]
+        [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque]]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
@@ -23,6 +23,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -36,8 +37,10 @@ from mujoco import rollout
 
 from robotid.commanded.driven import driven_log
 from robotid.commanded.errors import run_open_loop
+from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
+from robotid.commanded.unknowns import LoopSimulator, body_unknowns
 from robotid.commands.job import read_job
 from robotid.export.commanded import CommandedDrive, loops_of
 from robotid.identification.evaluation import evaluate_logs
@@ -55,6 +58,7 @@ FINE = 5e-5  # [s] step of the plant
 STEP = 5e-4  # [s] of our roll-outs beside it
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)  # impedance of its friction
 RATE, DURATION, NOISE = 500.0, 10.0, 3e-4  # [Hz], [s], [rad]
+TORQUE_NOISE = 2e-3  # [rad]: times kp
 REACH = 1.96
 KHZ = 1e-3  # [s] step and period of the roll-outs that are timed
 
@@ -96,6 +100,9 @@ def main():
     parser.add_argument(
         "--robots", nargs="+", default=["planar", "leg", "arm"], help="of --coverage"
     )
+    parser.add_argument(
+        "--with-torque", action="store_true", help="of --coverage, again with logged torques"
+    )
     parser.add_argument("--sysid-steps", type=int, default=30, help="most steps; 0: as published")
     parser.add_argument("--out", type=Path, help="folder that bench_commands.json is written to")
     options = parser.parse_args()
@@ -104,7 +111,8 @@ def main():
         "so101": options.so101 and so101,
         "arms": options.arms and arms,
         "rollouts": options.rollouts and (lambda: rollouts(0.3 if options.quick else 3.0)),
-        "coverage": options.coverage and (lambda: coverage(options.robots, options.coverage)),
+        "coverage": options.coverage
+        and (lambda: coverage(options.robots, options.coverage, with_torque=options.with_torque)),
     }
     if not any(parts.values()):
         runs = (["planar"], 2, 4.0) if options.quick else (options.robots, 20)
@@ -473,61 +481,115 @@ def drive_pi(plant):
     return pi
 
 
-def coverage(robots, runs, seconds=DURATION):
+def coverage(robots, runs, seconds=DURATION, *, with_torque=False):
     """Print how well intervals hold the truth, by robot and kind of parameter; return the rows."""
-    print(f"| robot, {runs} runs | parameter | values | mean error over scatter | "
-          "error said over scatter | 95 % intervals hold |")  # fmt: skip
-    print("|---" * 6 + "|")
+    print(f"| robot, {runs} runs | parameter | values | mean error over scatter | error said over "
+          "scatter | 95 % intervals hold | said, over no torque's | error, likewise |")  # fmt: skip
+    print("|---" * 8 + "|")
     rows = []
     for name in robots:
-        found, begun = {}, time.process_time()
-        for seed in range(runs):
-            for kind, error, said in one_run(name, np.random.default_rng([17, seed]), seconds):
-                found.setdefault(kind, []).append((error, said))
-        for kind, pairs in found.items():
-            error, said = np.array(pairs).T
-            row = {
-                "robot": name,
-                "parameter": kind,
-                "values": len(error),
-                "bias": float(np.mean(error / said)),
-                "said": float(1.0 / np.std(error / said)),
-                "held": float(np.mean(np.abs(error) <= REACH * said)),
-            }
-            rows.append(row)
-            print(f"| {name} | {kind} | {len(error)} | {row['bias']:+.2f} | {row['said']:.2f} | "
-                  f"{100 * row['held']:.1f} % |", flush=True)  # fmt: skip
-        took = (time.process_time() - begun) / runs
-        print(f"| {name} | {took:.1f} s of processor a run | | | | |", flush=True)
+        rows += coverage_rows(name, covered(name, runs, seconds))
+        if with_torque:
+            alone = covered(name, runs, seconds, finds_all=True)
+            rows += coverage_rows(f"{name}, all found", alone)
+            both = covered(name, runs, seconds, finds_all=True, torque=True)
+            rows += coverage_rows(f"{name}, all found, torque", both, alone)
     print()
     return rows
 
 
-def one_run(name, rng, seconds):
-    """Yield kind, error and standard error of each parameter of a run."""
+def covered(name, runs, seconds, **how):
+    """Return errors and standard errors by kind of parameter, each of shape (2, values)."""
+    found, begun = {}, time.process_time()
+    for seed in range(runs):
+        rng = np.random.default_rng([17, seed])
+        for kind, error, said in one_run(name, rng, seconds, **how):
+            found.setdefault(kind, []).append((error, said))
+    print(f"{name}: {(time.process_time() - begun) / runs:.1f} s of processor a run",
+          file=sys.stderr)  # fmt: skip
+    return {kind: np.array(pairs).T for kind, pairs in found.items()}
+
+
+def coverage_rows(name, found, alone=None):
+    """Print and return a row for each kind of parameter; alone: of the same runs without torque."""
+    rows = []
+    for kind, (error, said) in found.items():
+        row = {
+            "robot": name,
+            "parameter": kind,
+            "values": len(error),
+            "bias": float(np.mean(error / said)),
+            "said": float(1.0 / np.std(error / said)),
+            "held": float(np.mean(np.abs(error) <= REACH * said)),
+        }
+        less = "| | |"
+        if alone and kind in alone and kind != "viscous":  # which stood for kd, too
+            before, said_before = alone[kind]
+            row["said_less"] = float(np.exp(np.mean(np.log(said / said_before))))
+            row["less"] = float(np.sqrt(np.mean((error / said_before) ** 2)
+                                        / np.mean((before / said_before) ** 2)))  # fmt: skip
+            less = f"| {row['said_less']:.2f} | {row['less']:.2f} |"
+        rows.append(row)
+        print(f"| {name} | {kind} | {len(error)} | {row['bias']:+.2f} | {row['said']:.2f} | "
+              f"{100 * row['held']:.1f} % {less}", flush=True)  # fmt: skip
+    return rows
+
+
+def one_run(name, rng, seconds, *, finds_all=False, torque=False):
+    """Yield kind, error and standard error of each parameter of a run.
+
+    Where all is found, bodies are drawn about the URDF's, by as much as they are taken to be
+    unknown, and no gain is stated. Without torque, that of the speed is counted as friction.
+    """
     delay = 2e-4 * rng.integers(20, 41)
     plant = mujoco_plant.plant(name, rng, delay=delay)
-    log = plant_log(plant, rng, seconds)
+    settings = SimulationSettings(step=STEP, **({} if finds_all else {"bodies": 0.0}))
+    truth = plant.truth
+    if finds_all:
+        plant, drawn = with_drawn_bodies(plant, rng, settings.bodies)
+        truth |= drawn
+    log = plant_log(plant, rng, seconds, torque=torque)
     gains = {key: {d.joint: getattr(d, key) for d in plant.drives} for key in ("kp", "kd")}
     first = plant.model.joints[0]
-    loop = LoopSettings(**gains, groups={first: [first]})  # every joint has a drive of its own
-    settings = SimulationSettings(bodies=0.0, step=STEP)
+    gains = {} if finds_all else gains
+    # every joint has a drive of its own
+    loop = LoopSettings(**gains, groups={first: [first]}, delays="group")
     found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
-    estimate, truth = found.fitted.estimate, {**plant.truth, "delay": delay}
+    estimate = found.fitted.estimate
     for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
-        yield key.rpartition(".")[2], theta - truth[key], said
+        joint, _, kind = key.rpartition(".")
+        true = truth[key]
+        if kind == "viscous" and finds_all and f"{joint}.kd" not in estimate.names:
+            true += truth[f"{joint}.kd"]
+        yield kind, theta - true, said
 
 
-def plant_log(plant, rng, seconds, noise=NOISE):
-    """Return the log of a plant on a multi-sine, at a fine step and with stiff friction."""
+def with_drawn_bodies(plant, rng, spread):
+    """Return a plant whose bodies differ from the URDF's, and how, by name of the coordinate."""
+    robot = LoopedRobot(plant.model)
+    unknowns = tuple(body_unknowns(robot, spread))
+    simulator = LoopSimulator(robot, (), stated_loops(plant.model, LoopSettings()), unknowns)
+    coordinates = spread * rng.standard_normal(len(unknowns))
+    bodies = simulator.loops(coordinates).bodies
+    drawn = dict(zip(simulator.names, coordinates.tolist(), strict=True))
+    return replace(plant, bodies=bodies.reshape(-1)), drawn
+
+
+def plant_log(plant, rng, seconds, noise=NOISE, *, torque=False):
+    """Return the log of a plant on a multi-sine, at a fine step and with stiff friction.
+
+    Torques, if there are any, are the drives' with noise of a share of the position's gain.
+    """
     t = np.arange(round(seconds * RATE)) / RATE
     q_ref = mujoco_plant.multisine(t, plant.middle, plant.reach, rng)
     robot = mujoco_plant.loaded(plant, RATE, FINE)
     robot.dof_solref[:] = 2 * FINE, 1.0
     robot.dof_solimp[:] = STIFF
-    q, _ = mujoco_plant.rolled_out(robot, q_ref, RATE)
+    q, force = mujoco_plant.rolled_out(robot, q_ref, RATE)
     q = q + noise * rng.standard_normal(q.shape)
-    return Log(t, q, 0 * q, plant.model.joints, q_ref=q_ref, has_torque=False)
+    level = TORQUE_NOISE * np.array([drive.kp for drive in plant.drives])
+    tau = force + level * rng.standard_normal(q.shape) if torque else 0 * q
+    return Log(t, q, tau, plant.model.joints, q_ref=q_ref, has_torque=torque)
 
 
 if __name__ == "__main__":

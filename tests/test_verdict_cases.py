@@ -15,8 +15,8 @@ from verdict_cases import CASES, ROBOTS, build, make, move
 
 
 @pytest.fixture(scope="module")
-def arm():
-    return build(ROBOTS["ur5"], (0, 1))
+def clean(tmp_path_factory):
+    return make(ROBOTS["ur5"], CASES["clean"], (0, 6), tmp_path_factory.mktemp("clean"))
 
 
 @pytest.mark.parametrize("name", ["ur5", "kinova j2s6", "tiago", "planar 2R"])
@@ -44,10 +44,8 @@ def test_true_robots_are_possible_and_move_within_their_limits(name):
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("clean")])
-def test_a_fault_changes_what_is_recorded(name, tmp_path):
-    case = CASES[name]
-    found = make(ROBOTS["ur5"], case, (0, 6), tmp_path)
-    clean = make(ROBOTS["ur5"], CASES["clean"], (0, 6), tmp_path)
+def test_a_fault_changes_what_is_recorded(name, clean, tmp_path):
+    found = make(ROBOTS["ur5"], CASES[name], (0, 6), tmp_path)
     same = [
         kind.keys() == right.keys() and all(np.array_equal(kind[k], right[k]) for k in kind)
         for kind, right in ((found.fitted, clean.fitted), (found.kept, clean.kept))

@@ -13,6 +13,7 @@ from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
 from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
 from robotid.commanded.zeros import Encoders, find_encoders, same_encoders
+from robotid.doctor.command_channels import largest_speeds
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
 from robotid.identification.pipeline import Identification
@@ -177,12 +178,16 @@ def _begun_by_commands(
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, _likeness(model))
     has_gain = _is_stated(loop.kp, model)
-    usual = _usual(robot, plain, windows, has_gain)
-    base = _begin(model, stated, plain, usual, finds_limit=loop.limit == "find")
+    top = _largest_speeds(model, loop, logs)
+    usual = _usual(robot, plain, windows, has_gain, top)
+    finds_limit = (top > 0.0) | (loop.limit == "find")
+    base = _begin(model, stated, plain, usual, finds_limit)
     weighs = settings.torques and all(log.has_torque for log in logs)
     # positions alone tell the sum of kd and viscous friction
     tells_kd = weighs or all(log.v_ref is not None for log in logs)
-    unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=tells_kd)
+    unknowns = _unknowns(
+        model, loop, groups, base, usual, tells_kd=tells_kd, finds_limit=finds_limit
+    )
     unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
@@ -219,7 +224,8 @@ def _begun_by_torque(
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     usual = _usual_of_torques(model, found.standard, base.armature, windows)
     groups = groups_of(loop, model.joints, range(len(model.joints)))
-    unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=False)
+    none = np.zeros(len(groups), dtype=bool)
+    unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=False, finds_limit=none)
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
@@ -228,6 +234,16 @@ def _begun_by_torque(
     estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
     return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, linear=found)
+
+
+def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) -> Array:
+    """Return the largest speed of joints that run at it, and whose limit is not stated; or 0."""
+    speed = np.zeros(len(model.joints))
+    for log in logs:
+        found = largest_speeds(log)
+        speed = np.maximum(speed, [found.get(joint, 0.0) for joint in model.joints])
+    is_open = ~_is_stated(None if loop.limit == "find" else loop.limit, model)
+    return np.where(is_open, speed, 0.0)
 
 
 def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
@@ -253,6 +269,7 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         zero=np.zeros(n),
         terms=((),) * n,
         values=np.zeros(0),
+        rate=loop.rate,
     )
 
 
@@ -313,9 +330,12 @@ class _Usual:
 
 
 def _usual(
-    robot: LoopedRobot, plain: SecondOrder, windows: Sequence[Window], has_gain: Array
+    robot: LoopedRobot, plain: SecondOrder, windows: Sequence[Window], has_gain: Array, top: Array
 ) -> _Usual:
-    """Return usual sizes; where a gain is unknown, the bodies' inertia measures all torques."""
+    """Return usual sizes; where a gain is unknown, the bodies' inertia measures all torques.
+
+    A joint at its largest speed, ``top`` if more than 0, gives what friction takes there.
+    """
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
     bodies = _inertia(model, model.standard_parameters(), windows)
@@ -323,7 +343,9 @@ def _usual(
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
     inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
     error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
-    largest = _LIMITED * plain.loops.kp * scale * np.abs(error).max(axis=0)
+    asked = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
+    taken = plain.friction("viscous") * top + plain.friction("coulomb")
+    largest = scale * np.where(top > 0.0, np.minimum(taken, asked), asked)
     return _Usual(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
 
 
@@ -354,10 +376,12 @@ def _speed(windows: Sequence[Window]) -> Array:
 
 
 def _begin(
-    model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual, *, finds_limit: bool
+    model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual, finds_limit: Array
 ) -> Loops:
     """Return the loops that the fit begins with."""
-    friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
+    # from no friction at all there is no slope that tells where joints stick
+    sticks = np.maximum(plain.friction("coulomb") * usual.scale, _LEAST * usual.torque)
+    friction = {"viscous": plain.friction("viscous") * usual.scale, "coulomb": sticks}
     none = np.zeros(len(usual.scale))
     terms = tuple(
         tuple(
@@ -373,7 +397,7 @@ def _begin(
         kp=stated.kp * usual.scale,
         armature=np.maximum(usual.inertia - usual.bodies, _LEAST * usual.inertia),
         delay=plain.loops.delay,
-        limit=usual.largest if finds_limit else stated.limit,
+        limit=np.where(finds_limit, usual.largest, stated.limit),
         terms=terms,
         values=np.array(values),
     )
@@ -387,17 +411,24 @@ def _unknowns(
     usual: _Usual,
     *,
     tells_kd: bool,
+    finds_limit: Array,
 ) -> list[Unknown]:
     """Return what is unknown of drives and loops, beginning with what the loops have."""
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
         members.setdefault(group, []).append(j)
     is_closed = np.full(len(groups), loop.kind != "torque")
+    # a limit is a setting of each drive, a delay mostly the bus's and the controller's
+    sharing: dict[str, dict[str, list[int]]] = {
+        "limit": {joint: [j] for j, joint in enumerate(model.joints)}
+    }
+    if loop.delays == "one":
+        sharing["delay"] = {"robot": [*range(len(groups))]}
     open_ = {
         "armature": np.full(len(groups), "armature" in model.layout.terms),
         "kp": ~_is_stated(loop.kp, model) & is_closed,
         "kd": ~_is_stated(loop.kd, model) & tells_kd,
-        "limit": np.full(len(groups), loop.limit == "find"),
+        "limit": finds_limit,
         "delay": ~_is_stated(loop.delay, model) & is_closed,
     }
     spread = {
@@ -409,20 +440,20 @@ def _unknowns(
     }
     found = []
     for what, is_open in open_.items():
-        for group, joints in members.items():
+        for name, joints in sharing.get(what, members).items():
             own = tuple(j for j in joints if is_open[j])
             if own:
                 begin = float(np.median(getattr(base, what)[list(own)]))
                 wide = _WIDE * float(np.median(spread[what][list(own)]))
                 lowest = _LEAST * begin if what in ("kp", "limit") else 0.0
-                found.append(Unknown(f"{group}.{what}", what, own, begin, wide, lowest))
+                found.append(Unknown(f"{name}.{what}", what, own, begin, wide, lowest))
     for group, joints in members.items():
         for term in {t: None for j in joints for t in base.terms[j]}:
             having = [j for j in joints if term in base.terms[j]]
             # what wears and what leans differ from drive to drive, grease and motor do not
-            for sharing in [having] if isinstance(term, Viscous) else [[j] for j in having]:
-                name = group if len(sharing) > 1 else model.joints[sharing[0]]
-                found.append(_term(name, term, sharing, base, usual))
+            for owners in [having] if isinstance(term, Viscous) else [[j] for j in having]:
+                name = group if len(owners) > 1 else model.joints[owners[0]]
+                found.append(_term(name, term, owners, base, usual))
     return found
 
 
@@ -437,7 +468,7 @@ def _term(
     return Unknown(f"{owner}.{term.name}", "term", tuple(joints), begin, wide, lowest, term=term)
 
 
-def _is_stated(value: PerJoint | None, model: RobotModel) -> Array:
+def _is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
     """Return for which joints a number is stated, shape (n,), bool."""
     named = [
         value is not None and (not isinstance(value, Mapping) or joint in value)

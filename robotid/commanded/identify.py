@@ -281,8 +281,29 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"the logs say nothing of {names}: they keep what was assumed; command a motion that "
             "needs them",
         )
+    yield from _limits_found(found)
     yield from _encoder_findings(found)
     yield from map(_friction_found, (t for t in found.fitted.tried if t.is_chosen))
+
+
+def _limits_found(found: Commanded) -> Iterator[Finding]:
+    """Yield the largest torques that were found."""
+    estimate = found.fitted.estimate
+    for unknown, value, error in zip(
+        found.fitted.simulator.unknowns, estimate.theta, estimate.std_error, strict=True
+    ):
+        if unknown.what == "limit":
+            joint = found.model.limits[unknown.joints[0]]
+            unit = "N" if joint.type == "prismatic" else "N m"
+            yield Finding(
+                "limit",
+                "note",
+                joint.name,
+                f"{joint.name}: its drive gives at most {value:.3g} +- {error:.2g} {unit}, beyond "
+                "which it no longer follows its command; if you know its limit, state it in "
+                "[controller]",
+                {"limit": float(value), "std_error": float(error)},
+            )
 
 
 def _friction_found(tried: Tried) -> Finding:

@@ -145,8 +145,9 @@ def _coarse(
     for delay in delays if finds_delay else ():
         best, found = _better(robot, windows, replace(found, delay=np.full(n, delay)), best, found)
     if not np.isfinite(best).all():
+        rate = "" if bare.rate is None else f" and a rate other than {bare.rate:g} Hz, or none,"
         raise NotConvergedError(
-            "no plain loop that was tried can be rolled out; state gains in [controller]",
+            f"no plain loop that was tried can be rolled out; state gains{rate} in [controller]",
             "no start",
         )
     return found

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-from robotid._settings import Settings, setting
+from robotid._settings import POSITIVE, Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
@@ -13,7 +13,7 @@ from robotid.simulation.settings import GAIN, LEVEL, PerJoint
 __all__ = ["LoopSettings", "groups_of"]
 
 #: What a loop has that a logged torque has not.
-_OF_LOOPS = ("kp", "kd", "limit", "delay", "gravity_compensation", "zeros")
+_OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,22 @@ class LoopSettings(Settings):
     )  # fmt: skip
     limit: PerJoint | str | None = setting(
         None,
-        "largest torque of the drive [N m or N], likewise; none if not stated, found if 'find'",
+        "largest torque of the drive [N m or N], likewise; found of joints that run at one largest "
+        "speed whatever their error if not stated, of every joint if 'find'",
         reads=(int, float, dict, str),
         within=GAIN["within"],
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found, one for each group, if not stated",
-        **LEVEL,
+        None, "how late the command acts [s], likewise; found if not stated", **LEVEL
+    )
+    delays: str = setting(
+        "one", "whether the robot has one delay that is found, that of bus and controller, or each "
+        "group its own", among=("one", "group"),
+    )  # fmt: skip
+    rate: float | None = setting(
+        None, "how often a second a controller with a clock reads position and speed, to hold its "
+        "torque until the next time [Hz]; none if not stated: it follows at once", within=POSITIVE,
     )  # fmt: skip
     gravity_compensation: bool = setting(
         False, "whether the controller adds the torque of gravity by the URDF"

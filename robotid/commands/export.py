@@ -23,6 +23,11 @@ _GRAVITY = (
     "the controller adds the torque of gravity by the URDF, for which there is no place; add it to "
     "what the actuators give (in MuJoCo, gravcomp = 1 of each body is near it)"
 )
+_RATE = (
+    "the controller reads its joints {rate:g} times a second and holds its torque between; the "
+    "actuators follow at each step of the simulator. Where it matters, let a loop of your own set "
+    "torques at that rate"
+)
 #: What says something of which formats.
 _OPTIONS = {
     "step": ("mjcf", "isaac"),
@@ -69,6 +74,8 @@ def export_result(
         commanded = commanded_drives(model, pi, result.content, result.path.name)
     if commanded and result.content["settings"].get("controller", {}).get("gravity_compensation"):
         said = (*said, _GRAVITY)
+    if commanded and result.rate is not None:
+        said = (*said, _RATE.format(rate=result.rate))
     sources = (entry["path"] for entry in result.content["inputs"] if entry["role"] == "urdf")
     files, original = [str(goal)], next(sources, None)
     given: dict[str, Any] = {"step": step, "delay": delay}

@@ -92,6 +92,7 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     sign = np.array([signs[joint] for joint in model.joints])
     loops = loops_of(model, pi, drives) if drives else open_loops(model, pi)
     robot, runs, logs = LoopedRobot(model), [], []
+    loops = loops_of(model, pi, drives, loaded.rate)
     for entry in entries:
         logs.append(log_of_commands(job, entry, loaded))
         runs.append(run_open_loop(robot, loops, logs[-1].turned(sign)))

@@ -13,7 +13,7 @@ from robotid.findings import Finding, listed, log_finding
 from robotid.logs.data import Log
 from robotid.logs.measured_velocity import quantum
 
-__all__ = ["check_commands"]
+__all__ = ["check_commands", "largest_speeds"]
 
 _SECONDS = 5.0  # [s] of the stretches whose spectra are averaged
 _GAP = 5  # median steps from which a gap ends the stretch that is looked at
@@ -79,6 +79,16 @@ def check_commands(log: Log) -> Iterator[Finding]:
         yield from _slow(log, moved)
     yield from _sampled(log, moved)
     yield from _gives_way(log, loops)
+
+
+def largest_speeds(log: Log) -> dict[str, float]:
+    """Return the speeds of the joints that run at one largest speed whatever their error is.
+
+    Args:
+        log: The log, with commands.
+    """
+    moved = [loop for j in range(len(log.joints)) if (loop := _Loop(log, j)).is_told]
+    return {name: float(found.evidence["speed"]) for name, found in _saturated(log, moved)}
 
 
 @dataclass(frozen=True, eq=False)

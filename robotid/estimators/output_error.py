@@ -375,17 +375,18 @@ def _given(r: Residual) -> Array:
 
 def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: float) -> Array:
     """Return where a damped step leads; parameters that it would push below a bound stay there."""
-    H = H + damping * np.diag(np.diag(H))
+    scale = 1.0 / np.sqrt(np.diag(H))
+    H = H * np.outer(scale, scale) + damping * np.eye(len(H))  # its condition, not that of units
     free = (theta > lowest) | (g > 0)
     trial = theta.copy()
     while free.any():
-        step = scipy.linalg.solve(H[np.ix_(free, free)], g[free], assume_a="pos")
-        trial[free] = theta[free] + step
+        step = scipy.linalg.solve(H[np.ix_(free, free)], (scale * g)[free], assume_a="pos")
+        trial[free] = theta[free] + scale[free] * step
         below = free & (trial < lowest)
         if not below.any():
             break
         trial[below] = lowest[below]
-        g = g - H[:, below] @ (lowest[below] - theta[below])
+        g = g - H[:, below] @ ((lowest - theta) / scale)[below] / scale
         free = free & ~below
     return trial
 

@@ -110,23 +110,31 @@ def commanded_drives(
     )
 
 
-def loops_of(model: RobotModel, pi: Array, drives: Sequence[CommandedDrive]) -> Loops:
+def loops_of(
+    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], rate: float | None = None
+) -> Loops:
     """Return bodies, drives and loops as roll-outs take them.
 
     Args:
         model: The identified robot.
         pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
         drives: Its drives; armature, friction and offset are those of pi.
+        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
     """
     kp, kd, delay, zero, limit = (
         np.array([getattr(drive, key) for drive in drives])
         for key in ("kp", "kd", "delay", "zero", "effort_limit")
     )
-    return replace(open_loops(model, pi), kp=kp, kd=kd, delay=delay, zero=zero, limit=limit)
+    found = open_loops(model, pi)
+    return replace(found, kp=kp, kd=kd, delay=delay, zero=zero, limit=limit, rate=rate)
 
 
 def follow_commands(
-    model: RobotModel, pi: Array, drives: Sequence[CommandedDrive], log: Log
+    model: RobotModel,
+    pi: Array,
+    drives: Sequence[CommandedDrive],
+    log: Log,
+    rate: float | None = None,
 ) -> Array:
     """Return the positions that a robot takes on the commands of a log, in open loop.
 
@@ -137,6 +145,7 @@ def follow_commands(
         pi: Its standard parameters, shape (p,), SI units, in ``layout.names`` order.
         drives: Its drives.
         log: The log, of its joints in its order, with commands.
+        rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
 
     Returns:
         Positions that encoders would read, shape (N, n) [rad or m]; NaN of a sample between gaps.
@@ -147,7 +156,8 @@ def follow_commands(
         SettingsError: If a term of the drives cannot be rolled out.
     """
     robot, q = LoopedRobot(model), np.full_like(log.q, np.nan)
-    for out in robot.roll_out(loops_of(model, pi, drives), cut_windows(log, np.inf, 0.0)):
+    loops = loops_of(model, pi, drives, rate)
+    for out in robot.roll_out(loops, cut_windows(log, np.inf, 0.0)):
         q[out.window.counted] = out.q
     return q
 

@@ -90,7 +90,7 @@ _SHAPE = {
     "standard_parameters": [_PARAMETER],
     "drive_parameters": [{**_PARAMETER, "with_urdf?": NUMBER}],
     "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
-    "simulation?": {"controller": {"kind": TEXT}},
+    "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
@@ -215,7 +215,7 @@ def build_commanded(
             for run in found.kept
         ],
         "simulation": {
-            "controller": {"kind": found.loop.kind, "effort_limit": _stated_limits(found)},
+            "controller": _controller(found),
             "signs": dict(zip(model.joints, found.fitted.encoders.sign.tolist(), strict=True)),
             "fit": {
                 "message": estimate.message,
@@ -339,9 +339,11 @@ def _loop_parameters(found: Commanded) -> list[dict[str, Any]]:
     return entries
 
 
-def _stated_limits(found: Commanded) -> dict[str, float] | None:
+def _controller(found: Commanded) -> dict[str, Any]:
+    """Return what was stated of the controller beside gains and delay."""
     limits = dict(zip(found.model.joints, found.fitted.loops.limit.tolist(), strict=True))
-    return {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+    stated = {joint: x for joint, x in limits.items() if math.isfinite(x)} or None
+    return {"kind": found.loop.kind, "effort_limit": stated, "rate": found.loop.rate}
 
 
 def _unit_of(found: Commanded, j: int) -> str:
@@ -491,6 +493,12 @@ class Result:
         """The drives that follow position commands, joint by joint; none without gains."""
         return commanded_drives(*self.identified, self.content, self.path.name)
 
+    @property
+    def rate(self) -> float | None:
+        """Ticks per second of the controller of those drives [Hz]; None if it has no clock."""
+        stated: float | None = self.content["simulation"]["controller"].get("rate")
+        return stated
+
     def follow_commands(self, log: Log) -> Array:
         """Return the positions that the robot takes on the commands of a log, in open loop.
 
@@ -510,7 +518,8 @@ class Result:
             raise DataError(f"{log.name} has no commands, columns qref_ of each joint")
         signs = self.content["simulation"].get("signs", {})
         sign = np.array([signs.get(joint, 1.0) for joint in log.joints])
-        return sign * follow_commands(*self.identified, self.commanded, log.turned(sign))
+        turned = log.turned(sign)
+        return sign * follow_commands(*self.identified, self.commanded, turned, self.rate)
 
     def predict(
         self, q: ArrayLike, v: ArrayLike | None = None, a: ArrayLike | None = None

@@ -217,7 +217,10 @@ def _joint_axis(pin_model: pin.Model, body: int) -> Array:
     """Return the axis (v, w) of a joint in its own frame, at its neutral position, shape (6,)."""
     data, q = pin_model.createData(), pin.neutral(pin_model)
     joint = pin_model.joints[body]
-    axis: Array = pin.computeJointJacobian(pin_model, data, q, body)[:, joint.idx_v]
+    jacobian = pin.computeJointJacobian(pin_model, data, q, body)
+    axis: Array = jacobian.reshape(6, -1)[
+        :, joint.idx_v
+    ]  # Pinocchio has one dimension of one joint
     return axis
 
 

@@ -12,6 +12,13 @@ with D = M(q') + armature, q' = q + theta dt v, h the torque of gravity and spee
 friction and offset, r and w the commands as they are on average over the step; then
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
+
+Friction that a joint takes up over a way, x z, has z as a further state: over a step, at the speed u,
+its equation is linear, and solved exactly. Force acts with the z of the instant t + theta dt.
+
+A controller with a clock reads q, v and its commands at its ticks, and holds the torque that it
+makes of them until the next. No step crosses a tick. The held torque has sensitivities of its own,
+which change at ticks alone.
 """
 
 import math
@@ -22,6 +29,7 @@ from robotid.regressor.lanes import add, compiled, cos_sin, cross, dot, into_chi
 
 __all__ = [
     "ARMATURE",
+    "BRISTLES",
     "INERTIAL",
     "KD",
     "KP",
@@ -34,19 +42,22 @@ __all__ = [
     "TERM",
     "ZERO",
     "average_command",
+    "divide_rows",
     "roll_out",
     "work_size",
 ]
 
 LANES = 8
 THETA = 0.5  # of a step, where its forces act: exact to second order
-_SIGN = 1e-4  # [rad/s or m/s]: the speed over which friction turns
+_SIGN = 1e-5  # [rad/s or m/s]: the speed over which friction turns
+_SLID = 0.1  # [s] for which drives are taken to have moved before a roll-out begins
 _NEWTON = 60  # steps, of which three or four are usual
 _CLOSE = 1e-12  # of the speed, relative to 1 + its size
 
 # kinds of sensitivities
 ARMATURE, KP, KD, LIMIT, TERM, LATE, ZERO, INERTIAL, START, SPEED = range(10)
 LOAD = 9  # code of the term that multiplies the load of the gear
+BRISTLES = 10  # code of terms that are taken up over a way
 
 _R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
     0, 9, 12, 15, 18, 21, 24, 30, 36, 42, 52, 58, 64,
@@ -54,15 +65,17 @@ _R, _P, _W, _V, _DW, _A, _XV, _XA, _F, _C, _TV, _TA, _TF = (
 _BODY = 70
 
 
-def work_size(joints: int, columns: int) -> int:
+def work_size(joints: int, columns: int, memories: int) -> int:
     """Return the number of entries of the work space.
 
     Args:
         joints: Number of joints.
         columns: Number of sensitivities.
+        memories: Number of terms that are taken up over a way.
     """
     n = joints
-    return LANES * ((n + 1) * _BODY + 4 * n * n + 13 * n + 2 * n * columns)
+    own = (n + 1) * _BODY + 4 * n * n + 16 * n + 3 * n * columns
+    return LANES * (own + memories * (5 + columns))
 
 
 @compiled
@@ -394,7 +407,25 @@ def term(code, shape, q, u):
         y_u = (1.0 - y * y) / x0
     elif code == 8:  # a harmonic of order x0, from phase x1
         y, y_q = math.cos(x0 * q - x1), -x0 * math.sin(x0 * q - x1)
+    elif code == BRISTLES:  # of their own state
+        y = 0.0
     return y, y_u, y_q
+
+
+@compiled
+def taken_up(shape, before, u, span):
+    """Return z after a time at the speed u, and its derivatives by u and by z before.
+
+    dz/dt = (u - |u| z / g(u)) / s_0, g = 1 + c exp(-(u / w)^2); see ``drives.Bristles``.
+    """
+    w, extra = shape[1], shape[2] * math.exp(-((u / shape[1]) ** 2))
+    g, g_u = 1.0 + extra, -2.0 * u / (w * w) * extra
+    s = 1.0 if u > 0.0 or (u == 0.0 and before < 0.0) else -1.0  # at rest, of the stiffer side
+    way = span / (shape[0] * g)
+    kept = math.exp(-s * u * way)
+    kept_u = -kept * s * way * (1.0 - u * g_u / g)
+    z_u = s * g_u * (1.0 - kept) + (before - s * g) * kept_u
+    return s * g + (before - s * g) * kept, z_u, kept
 
 
 @compiled
@@ -442,8 +473,10 @@ def _balance(work, n, at, drives, terms, step, command):
     Row i is divided by e = 1 + mu s(u) sign(tau), by which a gear that loses a share mu of its
     load multiplies the bodies' torque tau: so H stays symmetric.
     """
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss = at
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
     codes, shapes, values, first = terms
+    if memory >= 0:
+        _hold_on(work, n, at, terms, step)
     for i in range(n):
         for lane in range(LANES):
             _put(work, load + i, lane, _get(work, h + i, lane))
@@ -457,7 +490,8 @@ def _balance(work, n, at, drives, terms, step, command):
         for lane in range(LANES):
             span, tau = THETA * step[lane], _get(work, load + i, lane)
             speed, angle = _get(work, u + i, lane), _get(work, middle + i, lane)
-            f, f_u, f_q, e, e_u = 0.0, 0.0, 0.0, 1.0, 0.0
+            f, f_u = _get(work, grip + i, lane), _get(work, grip + n + i, lane)
+            f_q, e, e_u = 0.0, 1.0, 0.0
             for k in range(first[i], first[i + 1]):
                 y, y_u, y_q = term(codes[k], shapes[k], angle, speed)
                 if codes[k] == LOAD:
@@ -468,11 +502,14 @@ def _balance(work, n, at, drives, terms, step, command):
                     f += values[k] * y
                     f_u += values[k] * y_u
                     f_q += values[k] * y_q
-            reach = command[i, 0, lane] - _get(work, q + i, lane) - span * speed
-            torque = kp * reach + kd * (command[i, 2, lane] - speed) + command[i, 3, lane]
-            is_free = abs(torque) < limit
-            torque = torque if is_free else math.copysign(limit, torque)
-            is_on = 1.0 if is_free else 0.0
+            if held >= 0:  # what the joint does within a tick changes nothing
+                torque, is_on = _get(work, held + i, lane), 0.0
+            else:
+                reach = command[i, 0, lane] - _get(work, q + i, lane) - span * speed
+                torque = kp * reach + kd * (command[i, 2, lane] - speed) + command[i, 3, lane]
+                is_free = abs(torque) < limit
+                torque = torque if is_free else math.copysign(limit, torque)
+                is_on = 1.0 if is_free else 0.0
             rest = armature * (speed - _get(work, v + i, lane)) / span + f - torque
             slope = armature / span + f_u + is_on * (kd + span * kp)
             _put(work, G + i, lane, tau + rest / e)
@@ -481,6 +518,24 @@ def _balance(work, n, at, drives, terms, step, command):
             _put(work, by_q + i, lane, f_q)
             _put(work, gains + i, lane, is_on)
             _put(work, loss + i, lane, e)
+
+
+@compiled
+def _hold_on(work, n, at, terms, step):
+    """Write the friction of memories for the speeds u, and its derivative."""
+    u, memory, grip = at[2], at[13], at[14]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for lane in range(LANES):
+            speed, f, f_u = _get(work, u + i, lane), 0.0, 0.0
+            for k in range(first[i], first[i + 1]):
+                if codes[k] == BRISTLES:
+                    before = _get(work, memory + 5 * int(shapes[k, 3]), lane)
+                    z, z_u, _ = taken_up(shapes[k], before, speed, THETA * step[lane])
+                    f += values[k] * z
+                    f_u += values[k] * z_u
+            _put(work, grip + i, lane, f)
+            _put(work, grip + n + i, lane, f_u)
 
 
 @compiled
@@ -512,10 +567,21 @@ def _newton(work, n, at, drives, terms, step, command):
 
 
 @compiled
+def _advance(work, n, at, step):
+    """Advance positions and speeds over a step that is solved."""
+    q, v, u = at[0], at[1], at[2]
+    for i in range(n):
+        for lane in range(LANES):
+            speed, before = _get(work, u + i, lane), _get(work, v + i, lane)
+            _put(work, q + i, lane, _get(work, q + i, lane) + step[lane] * speed)
+            _put(work, v + i, lane, before + (speed - before) / THETA)
+
+
+@compiled
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
-    q, v, u, middle, h, M, G, H, by_q, gains, load, loss = at
-    T_q, T_v, S, own, change = sweeps
+    q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
+    T_q, T_v, S, own, change, by_hold, by_memory = sweeps
     codes, shapes, values, first = terms
     P = len(columns)
     _combine(work, n, at, sweeps, drives, step)
@@ -541,22 +607,135 @@ def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, paren
                 is_on, x = _get(work, gains + j, lane), 0.0
                 if kind == ARMATURE:
                     x = (speed - _get(work, v + j, lane)) / span
-                elif kind == KP:
-                    x = -is_on * (command[j, 0, lane] - _get(work, q + j, lane) - span * speed)
-                elif kind == KD:
-                    x = -is_on * (command[j, 2, lane] - speed)
-                elif kind == LIMIT:
-                    asked = kp * (command[j, 0, lane] - _get(work, q + j, lane) - span * speed)
-                    asked += kd * (command[j, 2, lane] - speed) + command[j, 3, lane]
-                    x = 0.0 if is_on else math.copysign(1.0, -asked)
-                elif kind == LATE:
-                    x = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
-                    x *= -is_on
+                elif kind == TERM and codes[index] == BRISTLES:
+                    x = _get(work, memory + 5 * int(shapes[index, 3]) + 1, lane)
                 elif kind == TERM:
                     x, _, _ = term(codes[index], shapes[index], _get(work, middle + j, lane), speed)
                     x *= abs(_get(work, load + j, lane)) if codes[index] == LOAD else 1.0
+                elif held < 0:
+                    reach = command[j, 0, lane] - _get(work, q + j, lane) - span * speed
+                    slip = command[j, 2, lane] - speed
+                    asked = kp * reach + kd * slip + command[j, 3, lane]
+                    late = kp * command[j, 1, lane] + kd * command[j, 4, lane] + command[j, 5, lane]
+                    x = -_by_loop(kind, is_on, reach, slip, late, asked)
                 _put(work, own + j, lane, x / _get(work, loss + j, lane))
+        if held >= 0:
+            for i in range(n):
+                for lane in range(LANES):
+                    x = _get(work, by_hold + i * P + p, lane) / _get(work, loss + i, lane)
+                    _put(work, own + i, lane, _get(work, own + i, lane) - x)
+        if memory >= 0:
+            _recall(work, n, at, sweeps, terms, p, P, False)
         _advance_column(work, n, at, sweeps, step, p, P)
+        if memory >= 0:
+            _recall(work, n, at, sweeps, terms, p, P, True)
+
+
+@compiled
+def _remember(work, n, at, terms, step):
+    """Write z after a step, that which acts in it, and derivatives of both.
+
+    These are of what acts by z before, of z after by the speed u, and by z before.
+    """
+    u, memory = at[2], at[13]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for k in range(first[i], first[i + 1]):
+            if codes[k] == BRISTLES:
+                z = memory + 5 * int(shapes[k, 3])
+                for lane in range(LANES):
+                    speed, before = _get(work, u + i, lane), _get(work, z, lane)
+                    acts, _, share = taken_up(shapes[k], before, speed, THETA * step[lane])
+                    after, by_speed, kept = taken_up(shapes[k], before, speed, step[lane])
+                    _put(work, z, lane, after)
+                    _put(work, z + 1, lane, acts)
+                    _put3(work, z + 2, lane, (share, by_speed, kept))
+
+
+@compiled
+def _slide(work, n, at, by_memory, columns, terms):
+    """Write z where roll-outs begin, and how it changes with the speed v there.
+
+    It is that of long sliding, but for joints that take longer than ``_SLID`` to go their way.
+    """
+    v, memory = at[1], at[13]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for k in range(first[i], first[i + 1]):
+            if codes[k] != BRISTLES:
+                continue
+            slot, P = int(shapes[k, 3]), len(columns)
+            for lane in range(LANES):
+                speed = _get(work, v + i, lane)
+                extra = shapes[k, 2] * math.exp(-((speed / shapes[k, 1]) ** 2))
+                slow = shapes[k, 0] / _SLID
+                root = math.sqrt(speed * speed + slow * slow)
+                _put(work, memory + 5 * slot, lane, speed / root * (1.0 + extra))
+                by_speed = slow * slow / root**3 * (1.0 + extra)
+                by_speed -= 2.0 * speed * speed / (root * shapes[k, 1] ** 2) * extra
+                for p in range(P):
+                    if columns[p, 0] == SPEED and columns[p, 1] == i:
+                        _put(work, by_memory + slot * P + p, lane, by_speed)
+
+
+@compiled
+def _recall(work, n, at, sweeps, terms, p, P, is_after):
+    """Add to one column what memories make of their past; after the step, advance theirs."""
+    loss, memory = at[11], at[13]
+    own, change, by_memory = sweeps[3], sweeps[4], sweeps[6]
+    codes, shapes, values, first = terms
+    for i in range(n):
+        for k in range(first[i], first[i + 1]):
+            if codes[k] != BRISTLES:
+                continue
+            slot = int(shapes[k, 3])
+            z, Z = memory + 5 * slot, by_memory + slot * P + p
+            for lane in range(LANES):
+                x = _get(work, Z, lane)
+                if is_after:
+                    x *= _get(work, z + 4, lane)
+                    _put(work, Z, lane, x + _get(work, z + 3, lane) * _get(work, change + i, lane))
+                else:
+                    x *= values[k] * _get(work, z + 2, lane) / _get(work, loss + i, lane)
+                    _put(work, own + i, lane, _get(work, own + i, lane) + x)
+
+
+@compiled
+def _by_loop(kind, is_on, reach, slip, late, asked):
+    """Return how the torque of a loop changes with a gain, its delay or its limit."""
+    if kind == KP:
+        return is_on * reach
+    if kind == KD:
+        return is_on * slip
+    if kind == LATE:
+        return is_on * late
+    return (1.0 - is_on) * math.copysign(1.0, asked) if kind == LIMIT else 0.0
+
+
+@compiled
+def _hold(work, n, at, sweeps, columns, drives, command, is_tick):
+    """Write torques, and their sensitivities, of the lanes whose controllers have a tick."""
+    q, v, held = at[0], at[1], at[12]
+    S, by_hold, P = sweeps[2], sweeps[5], len(columns)
+    for i in range(n):
+        kp, kd, limit = drives[i, 1], drives[i, 2], drives[i, 3]
+        for lane in range(LANES):
+            if not is_tick[lane]:
+                continue
+            reach = command[i, 0, lane] - _get(work, q + i, lane)
+            slip = command[i, 2, lane] - _get(work, v + i, lane)
+            asked = kp * reach + kd * slip + command[i, 3, lane]
+            late = kp * command[i, 1, lane] + kd * command[i, 4, lane] + command[i, 5, lane]
+            is_on = 1.0 if abs(asked) < limit else 0.0
+            _put(work, held + i, lane, asked if is_on else math.copysign(limit, asked))
+            for p in range(P):
+                x = kp * _get(work, S + i * P + p, lane) + kd * _get(
+                    work, S + (n + i) * P + p, lane
+                )
+                own = 0.0
+                if columns[p, 1] == i:
+                    own = _by_loop(columns[p, 0], is_on, reach, slip, late, asked)
+                _put(work, by_hold + i * P + p, lane, own - is_on * x)
 
 
 @compiled
@@ -606,7 +785,7 @@ def _combine(work, n, at, sweeps, drives, step):
 def _advance_column(work, n, at, sweeps, step, p, P):
     """Advance one sensitivity of position and speed over a step."""
     H = at[7]
-    T_q, T_v, S, own, change = sweeps
+    T_q, T_v, S, own, change = sweeps[:5]
     for i in range(n):
         for lane in range(LANES):
             _put(work, change + i, lane, -_get(work, own + i, lane))
@@ -625,45 +804,9 @@ def _advance_column(work, n, at, sweeps, step, p, P):
 
 
 @compiled
-def roll_out(
-    parents, joints, zeros, bodies, is_below, gravity, drives, codes, shapes, values, first,
-    columns, directions, command, steps, every, start, out_q, out_v, out_S, work,
-):  # fmt: skip
-    """Roll out a block of lanes; return the first step that had no solution, -1 if all had.
-
-    Args:
-        parents: Parent of each joint, shape (n,), int; -1: the world.
-        joints: Constants of each joint, as of ``regressor.compiled``, shape (n, 41).
-        zeros: Angle of the URDF where an encoder reads 0, shape (n,) [rad or m].
-        bodies: Ten inertial parameters of each joint's body, shape (n, 10).
-        is_below: Whether joint k carries body i, itself included, shape (n, n), bool, [i, k].
-        gravity: Shape (3,) [m/s^2].
-        drives: Armature, kp, kd and largest torque of each joint, shape (n, 4).
-        codes: Kind of each term of friction, shape (T,), int.
-        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4).
-        values: Its parameter, shape (T,).
-        first: Where the terms of a joint begin, shape (n + 1,), int.
-        columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
-        directions: Changes of a body's parameters, shape (D, 10).
-        command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
-            and torque by the delay, on average over each step, shape (K, n, 6, LANES).
-        steps: Length of each step, shape (K, LANES) [s].
-        every: Steps from a sample to the next.
-        start: Positions and speeds, shape (2, n, LANES).
-        out_q: Positions of the samples, shape (N, n, LANES); written.
-        out_v: Speeds, likewise; written.
-        out_S: Sensitivities of position, shape (N, n, P, LANES); written.
-        work: Work space of ``work_size``.
-    """
-    n, P = len(parents), len(columns)
-    q = (n + 1) * _BODY
-    v, u, middle, h, a = q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n
-    G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
-    load, loss, M = change + n, change + 2 * n, change + 3 * n
-    H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
-    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss)
-    sweeps, terms = (T_q, T_v, S, own, change), (codes, shapes, values, first)
-    work[:] = 0.0
+def _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S):
+    """Write where roll-outs begin, and how that changes with itself."""
+    q, v, u, S, P = at[0], at[1], at[2], sweeps[2], len(columns)
     for lane in range(LANES):
         for k in range(3):
             _put(work, _A + k, lane, -gravity[k])
@@ -677,8 +820,64 @@ def roll_out(
                 _put(work, S + row * P + p, lane, 1.0)
                 if columns[p, 0] == START:
                     out_S[0, columns[p, 1], p, lane] = 1.0
+    if at[13] >= 0:
+        _slide(work, n, at, sweeps[6], columns, terms)
+
+
+@compiled
+def roll_out(
+    parents, joints, zeros, bodies, is_below, gravity, drives, codes, shapes, values, first,
+    columns, directions, command, steps, ticks, every, start, out_q, out_v, out_S, work,
+):  # fmt: skip
+    """Roll out a block of lanes; return the first step that had no solution, -1 if all had.
+
+    Args:
+        parents: Parent of each joint, shape (n,), int; -1: the world.
+        joints: Constants of each joint, as of ``regressor.compiled``, shape (n, 41).
+        zeros: Angle of the URDF where an encoder reads 0, shape (n,) [rad or m].
+        bodies: Ten inertial parameters of each joint's body, shape (n, 10).
+        is_below: Whether joint k carries body i, itself included, shape (n, n), bool, [i, k].
+        gravity: Shape (3,) [m/s^2].
+        drives: Armature, kp, kd and largest torque of each joint, shape (n, 4).
+        codes: Kind of each term of friction, shape (T,), int.
+        shapes: What shapes it, two numbers and the range of positions seen, shape (T, 4); way,
+            speed and excess of a term that is taken up, and its number among those.
+        values: Its parameter, shape (T,).
+        first: Where the terms of a joint begin, shape (n + 1,), int.
+        columns: Kind, joint and index of each sensitivity, shape (P, 3), int.
+        directions: Changes of a body's parameters, shape (D, 10).
+        command: Position, its derivative by the delay, speed, torque, and the derivatives of speed
+            and torque by the delay, on average over each step, or those of its tick, shape
+            (K, n, 6, LANES).
+        steps: Length of each step, shape (K, LANES) [s].
+        ticks: Where the controllers have a tick as the step begins, shape (K, LANES), bool, all at
+            the first; of no entries if they have no clock.
+        every: Steps from a sample to the next.
+        start: Positions and speeds, shape (2, n, LANES).
+        out_q: Positions of the samples, shape (N, n, LANES); written.
+        out_v: Speeds, likewise; written.
+        out_S: Sensitivities of position, shape (N, n, P, LANES); written.
+        work: Work space of ``work_size``.
+    """
+    n, P = len(parents), len(columns)
+    q = (n + 1) * _BODY
+    v, u, middle, h, a = q + n, q + 2 * n, q + 3 * n, q + 4 * n, q + 5 * n
+    G, by_q, gains, own, change = a + n, a + 2 * n, a + 3 * n, a + 4 * n, a + 5 * n
+    load, loss, M = change + n, change + 2 * n, change + 3 * n
+    H, T_q, T_v, S = M + n * n, M + 2 * n * n, M + 3 * n * n, M + 4 * n * n
+    by_hold, held = S + 2 * n * P, S + 3 * n * P if len(ticks) else -1
+    memories = (codes == BRISTLES).sum()
+    grip = S + (3 * P + 1) * n
+    memory, by_memory = grip + 2 * n if memories else -1, grip + 2 * n + 5 * memories
+    at = (q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip)
+    sweeps = (T_q, T_v, S, own, change, by_hold, by_memory)
+    terms = (codes, shapes, values, first)
+    work[:] = 0.0
+    _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S)
     for k in range(len(steps)):
         step = steps[k]
+        if held >= 0 and ticks[k].any():
+            _hold(work, n, at, sweeps, columns, drives, command[k], ticks[k])
         for i in range(n):
             for lane in range(LANES):
                 ahead = THETA * step[lane] * _get(work, v + i, lane)
@@ -689,6 +888,8 @@ def roll_out(
         _mass_matrix(work, parents, joints, bodies, M)
         if not _newton(work, n, at, drives, terms, step, command[k]):
             return k
+        if memory >= 0:
+            _remember(work, n, at, terms, step)
         if P:
             for i in range(n):
                 for lane in range(LANES):
@@ -701,11 +902,7 @@ def roll_out(
                 work, n, at, sweeps, columns, drives, terms, step, command[k], parents, joints,
                 directions,
             )  # fmt: skip
-        for i in range(n):
-            for lane in range(LANES):
-                speed, before = _get(work, u + i, lane), _get(work, v + i, lane)
-                _put(work, q + i, lane, _get(work, q + i, lane) + step[lane] * speed)
-                _put(work, v + i, lane, before + (speed - before) / THETA)
+        _advance(work, n, at, step)
         if (k + 1) % every == 0:
             sample = (k + 1) // every
             for i in range(n):
@@ -743,3 +940,41 @@ def average_command(stamps, values, times, delay, mean, change):
         mean[k] = total / (end - begin)
         change[k] = (before - values[i]) / (end - begin)
         begin = end
+
+
+@compiled
+def divide_rows(stamps, ticks, times, is_tick):
+    """Write where steps begin and end, as many from each row to the next, none across a tick.
+
+    Ticks divide a row; the longest steps are halved, then cut in three and so on, until there are
+    as many as in other rows.
+
+    Args:
+        stamps: Of the rows, shape (N,) [s].
+        ticks: Those after the first row, ascending; one at a row is its stamp [s].
+        times: Shape ((N - 1) every + 1,); written.
+        is_tick: Whether a step begins at a tick, or is the first, shape ((N - 1) every,); written.
+    """
+    every, i = len(is_tick) // (len(stamps) - 1), 0
+    edges, shares = np.empty(every + 1), np.empty(every, np.int64)
+    is_tick[:], is_tick[0] = False, True
+    for k in range(len(stamps) - 1):
+        edges[0], count = stamps[k], 1
+        while i < len(ticks) and ticks[i] < stamps[k + 1]:
+            if ticks[i] > stamps[k]:
+                edges[count] = ticks[i]
+                count += 1
+            else:
+                is_tick[k * every] = True
+            i += 1
+        edges[count] = stamps[k + 1]
+        shares[:count] = 1
+        for _ in range(every - count):
+            shares[np.argmax(np.diff(edges[: count + 1]) / shares[:count])] += 1
+        at = k * every
+        for j in range(count):
+            is_tick[at] = is_tick[at] or j > 0
+            for part in range(shares[j]):
+                times[at] = edges[j] + (edges[j + 1] - edges[j]) * part / shares[j]
+                at += 1
+    times[-1] = stamps[-1]

@@ -28,12 +28,15 @@ from robotid.robot.drives import (
     DriveTerm,
     Harmonic,
     LoadFriction,
+    LuGre,
     Offset,
     PositionCoulomb,
+    Presliding,
     Stribeck,
     Tanh,
     Viscous,
 )
+from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
 __all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows", "open_loops"]
@@ -45,9 +48,11 @@ _GAP = 3.0  # median steps: across a longer one nothing is rolled out
 _AROUND = 0.03  # [s] about the first sample, whose slope is the speed a roll-out starts with
 _FEWEST = 2  # samples on each side for it
 _SHORT = 0.5  # of a window: a rest of that size joins the window before it
+_SAME = 1e-3  # of a tick, by which it may be off a row that is sent at it
+_FASTEST = 1e6  # [rad/s or m/s] of a joint whose held loop runs away
 _CODES: dict[type[DriveTerm], int] = {
     Viscous: 0, Coulomb: 1, Offset: 2, PositionCoulomb: 3, Stribeck: 4, Asymmetric: 5, Cubic: 6,
-    Tanh: 7, Harmonic: 8, LoadFriction: 9,
+    Tanh: 7, Harmonic: 8, LoadFriction: 9, Presliding: 10, LuGre: 10,
 }  # fmt: skip
 
 
@@ -56,7 +61,10 @@ class Loops:
     """What bodies and drives are, and how the drives close their loops.
 
     torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref, at most ``limit``, the commands ``delay``
-    late; position 0 of a joint's encoder is position ``zero`` of the URDF.
+    late; position 0 of a joint's encoder is position ``zero`` of the URDF. With a ``rate``, all are
+    those of the controller's last tick, and the torque stays until its next. Ticks are counted from
+    the first row of a log; a command counts by its share of a row from the tick on, so that a delay
+    of part of a row lies between those of whole ones.
 
     Attributes:
         bodies: Ten inertial parameters of each body, shape (n, 10), in the order of the layout.
@@ -68,6 +76,7 @@ class Loops:
         zero: Shape (n,) [rad or m].
         terms: Friction and offset of each joint.
         values: Their parameters, joint by joint, shape (T,).
+        rate: Ticks of the controller per second [Hz]; None: it has no clock.
     """
 
     bodies: Array
@@ -79,6 +88,7 @@ class Loops:
     zero: Array
     terms: tuple[tuple[DriveTerm, ...], ...]
     values: Array
+    rate: float | None = None
 
     def place(self, joint: int, term: DriveTerm) -> int:
         """Return where the parameter of a joint's term stands in ``values``.
@@ -335,10 +345,12 @@ class LoopedRobot:
         coded = [_coded(term) for term in terms]
         codes = np.array([code for code, *_ in coded], dtype=np.int64)
         shapes = np.array([shape for _, *shape in coded]).reshape(-1, 4)
+        remembers = codes == lanes.BRISTLES
+        shapes[remembers, 3] = np.arange(remembers.sum())
         drives = np.column_stack(
             [x[own] for x in (loops.armature, loops.kp, loops.kd, loops.limit)]
         )
-        command, steps, every, start = self._commands(part, windows, loops)
+        command, steps, ticks, every, start = self._commands(part, windows, loops)
         samples = len(steps) // every + 1
         q, v = np.zeros((2, samples, n, lanes.LANES))
         S = np.zeros((samples, n, len(columns), lanes.LANES))
@@ -346,58 +358,119 @@ class LoopedRobot:
         failed = lanes.roll_out(
             part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],
             part.is_below, self._gravity, drives, codes, shapes, loops.values[places],
-            first, columns, along, command, steps, every, start, q, v, S,
-            np.zeros(lanes.work_size(n, len(columns))),
+            first, columns, along, command, steps, ticks, every, start, q, v, S,
+            np.zeros(lanes.work_size(n, len(columns), int(remembers.sum()))),
         )  # fmt: skip
-        if failed >= 0 or not np.isfinite(q).all():
-            names = listed(self.model.joints[j] for j in own)
+        if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(
-                f"the roll-out of {names} has no solution: friction below 0, or gains too high for "
-                f"steps of {self.step:g} s",
-                f"step {failed} of {len(steps)}",
+                self._why_not(own, loops, windows[0].start[0]),
+                f"step {failed % len(steps) + 1} of {len(steps)}",
             )
         return columns_of, q, v, S
 
+    def _why_not(self, joints: Array, loops: Loops, q: Array) -> str:
+        """Return why a part with these joints, which begins at q, has no roll-out."""
+        names = listed(self.model.joints[j] for j in joints)
+        if loops.rate is None:
+            return (
+                f"the roll-out of {names} has no solution: friction below 0, or gains too high for "
+                f"steps of {self.step:g} s"
+            )
+        pi = self.model.standard_parameters()
+        pi[: self.model.layout.n_inertial] = loops.bodies.reshape(-1)
+        bodies = self.model.with_parameters(pi)
+        (M,) = rigid_mass_matrices(bodies, bodies.configurations((q + loops.zero)[None]))
+        M = (M + np.diag(loops.armature))[np.ix_(joints, joints)]
+        kp, kd = loops.kp[joints], loops.kd[joints]
+        least = 0.5 * np.linalg.eigvals(np.linalg.solve(M, np.diag(kd))).real.max()
+        least = max([least, *(0.5 * kp[kd > 0] / kd[kd > 0])])
+        return (
+            f"the roll-out of {names} runs away: a controller of {loops.rate:g} Hz holds its "
+            f"torques too long. Gains kp {listed(f'{x:.3g}' for x in kp)} and kd "
+            f"{listed(f'{x:.3g}' for x in kd)} need some {least:.3g} Hz with these inertias; state "
+            "the rate at which the drives close their loops in [controller], or leave it out"
+        )
+
     def _commands(
         self, part: _Part, windows: Sequence[Window], loops: Loops
-    ) -> tuple[Array, Array, int, Array]:
-        """Return commands by step and lane, lengths of steps, steps a sample, and the start."""
+    ) -> tuple[Array, Array, Array, int, Array]:
+        """Return commands and lengths by step and lane, ticks, steps a sample, and the start."""
         lanes = _lanes()
-        every = max(
-            1, *(math.ceil(float(np.median(np.diff(w.log.t))) / self.step - 1e-9) for w in windows)
-        )
         samples = max(window.stop - window.begin for window in windows)
+        grids = [_Grid.of(window, samples, loops.rate) for window in windows]
+        every = max(grid.least_steps(self.step, loops.rate) for grid in grids)
         size, n = (samples - 1) * every, len(part.joints)
         command = np.zeros((size, n, 6, lanes.LANES))
         steps, start = np.empty((size, lanes.LANES)), np.empty((2, n, lanes.LANES))
-        mean, change = np.empty(size), np.empty(size)
+        ticks = np.zeros((0 if loops.rate is None else size, lanes.LANES), dtype=bool)
         for lane in range(lanes.LANES):
             if lane >= len(windows):  # lanes that nobody asked for do what the first one does
                 command[..., lane], steps[:, lane] = command[..., 0], steps[:, 0]
-                start[..., lane] = start[..., 0]
+                start[..., lane], ticks[:, lane] = start[..., 0], ticks[:, 0]
                 continue
-            window = windows[lane]
-            log, times = window.log, _times(window, samples, every)
-            steps[:, lane], start[..., lane] = np.diff(times), window.start[:, part.joints]
+            log, (times, is_tick) = windows[lane].log, grids[lane].divided(every)
+            steps[:, lane] = np.diff(times)
+            start[..., lane] = windows[lane].start[:, part.joints]
+            told, of_step = times, np.arange(size)
+            if loops.rate is not None:
+                ticks[:, lane], of_step = is_tick, 2 * (np.cumsum(is_tick) - 1)
+                told = grids[lane].heard(times[:-1][is_tick])
+            mean, change = np.empty((2, len(told) - 1))
             for values, k, by_delay in ((log.q_ref, 0, 1), (log.v_ref, 2, 4), (log.tau_ref, 3, 5)):
                 if values is None:
                     continue
                 for i, j in enumerate(part.joints):
-                    told = np.ascontiguousarray(values[:, j])
-                    lanes.average_command(log.t, told, times, loops.delay[j], mean, change)
-                    command[:, i, k, lane], command[:, i, by_delay, lane] = mean, change
-        return command, steps, every, start
+                    x = np.ascontiguousarray(values[:, j])
+                    lanes.average_command(log.t, x, told, loops.delay[j], mean, change)
+                    command[:, i, k, lane] = mean[of_step]
+                    command[:, i, by_delay, lane] = change[of_step]
+        return command, steps, ticks, every, start
 
 
-def _times(window: Window, samples: int, every: int) -> Array:
-    """Return where steps begin and end: those of the log, and after it as long as its median."""
-    t = window.log.t[window.begin : window.stop]
-    beyond = samples - len(t)
-    dt = float(np.median(np.diff(window.log.t)))
-    stamps = np.concatenate([t, t[-1] + dt * np.arange(1, beyond + 1)])
-    steps = np.arange((samples - 1) * every + 1) / every
-    times: Array = np.interp(steps, np.arange(samples), stamps)
-    return times
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """What the steps of a window divide."""
+
+    stamps: Array  # of its rows, and after them as many as other windows have, shape (N,) [s]
+    ticks: Array  # of the controller after the first row, to the first that no step reaches [s]
+    dt: float  # median of the log's rows [s]
+
+    @classmethod
+    def of(cls, window: Window, samples: int, rate: float | None) -> "_Grid":
+        """Return the grid of a window, continued at the log's median."""
+        t = window.log.t[window.begin : window.stop]
+        dt = float(np.median(np.diff(window.log.t)))
+        stamps = np.concatenate([t, t[-1] + dt * np.arange(1, samples - len(t) + 1)])
+        if rate is None:
+            return cls(stamps, np.zeros(0), dt)
+        count = rate * (stamps[[0, -1]] - window.log.t[0])
+        ticks = window.log.t[0] + np.arange(np.floor(count[0]), count[1] + 2) / rate
+        after = np.clip(np.searchsorted(stamps, ticks), 1, len(stamps) - 1)
+        for row in (after - 1, after):
+            ticks = np.where(np.abs(ticks - stamps[row]) < _SAME / rate, stamps[row], ticks)
+        return cls(stamps, ticks[ticks > stamps[0]], dt)
+
+    def heard(self, ticks: Array) -> Array:
+        """Return from when to when ticks take their commands: a row, but no longer than a tick."""
+        after = self.ticks[np.searchsorted(self.ticks, self.stamps[-1])]
+        ends = ticks + np.minimum(self.dt, np.diff(ticks, append=after))
+        return np.stack([ticks, ends], axis=1).reshape(-1)
+
+    def least_steps(self, step: float, rate: float | None) -> int:
+        """Return how many steps a row needs: as many make a tick, and end at each tick."""
+        tick = math.inf if rate is None else 1.0 / rate
+        longest = step if math.isinf(tick) else tick / math.ceil(tick / step - 1e-9)
+        usual = math.ceil(self.dt / longest - 1e-9)
+        inside = np.diff(np.searchsorted(self.ticks, self.stamps))
+        at_rows = np.isin(self.stamps[:-1], self.ticks)
+        return max(1, usual, int((inside - at_rows).max()) + 1)
+
+    def divided(self, every: int) -> tuple[Array, Array]:
+        """Return where steps begin and end, and which begin with a tick."""
+        size = (len(self.stamps) - 1) * every
+        times, is_tick = np.empty(size + 1), np.empty(size, dtype=bool)
+        _lanes().divide_rows(self.stamps, self.ticks, times, is_tick)
+        return times, is_tick
 
 
 def _parts(tree: Tree) -> list[_Part]:
@@ -421,13 +494,17 @@ def _parts(tree: Tree) -> list[_Part]:
 
 
 def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
-    """Return code, two numbers of its shape, and the range seen of a term."""
+    """Return code, two numbers of its shape, and the range seen of a term; three of a memory."""
     code = _CODES.get(type(term))
     if code is None:
         known = listed(kind.__name__ for kind in _CODES)
         raise SettingsError(
             f"the term {type(term).__name__} has no place in roll-outs; they have {known}"
         )
+    if isinstance(term, Presliding):
+        return code, term.displacement, 1.0, 0.0, 0.0
+    if isinstance(term, LuGre):
+        return code, term.displacement, term.speed, term.excess, 0.0
     shape = (0.0, 0.0)
     if isinstance(term, PositionCoulomb):
         shape = float(term.order), term.centre

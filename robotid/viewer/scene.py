@@ -2,8 +2,11 @@
 
 import base64
 import itertools
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +25,8 @@ _LINK, _JOINT, _BASE = "#9aa7b4", "#e07b1f", "#4a5560"
 _THICKNESS = 0.035  # radius of a link over the robot's reach
 _SHORT = 1e-4  # [m] joints closer than this are one point
 _UP = np.array([0.0, 1.0, 0.0])  # the viewer's axis of a cylinder
+#: Where a mesh is, its scale, and when it was written and how long it is; None if there is none.
+_File = tuple[Path | None, tuple[float, ...], tuple[int, int] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,15 +197,14 @@ class _Library:
         self.meshes: list[dict[str, Any]] = []
         self.parts: list[dict[str, Any]] = []
         self.boxes: list[Array] = []  # the two corners of each mesh, shape (2, 3)
-        solids: dict[tuple[str, tuple[float, ...]], list[Surface]] = {}  # by file and scale
         visuals = [v for v in read_shapes(model.tree.robot) if v.kind]
-        for visual in visuals:
-            key = (visual.file, visual.size)
-            if visual.kind == "mesh" and key not in solids:
-                solids[key] = self._read(model, visual)
+        # each mesh once at each scale, with the file as it is now
+        files = {(v.file, v.size): _file(model, v) for v in visuals if v.kind == "mesh"}
         numbers: dict[tuple[str, tuple[float, ...]], list[tuple[int, Surface]]] = {}
-        for key, surfaces in zip(solids, thin([*solids.values()], _TRIANGLES), strict=True):
-            shown = [surface for surface in surfaces if len(surface.faces)]
+        for key, surfaces in zip(files, _thinned(tuple(files.values())), strict=True):
+            if surfaces is None:
+                self.missing.append(key[0])
+            shown = [surface for surface in surfaces or () if len(surface.faces)]
             numbers[key] = [*enumerate(shown, len(self.meshes))]
             for surface in shown:
                 self.boxes.append(np.array([surface.vertices.min(0), surface.vertices.max(0)]))
@@ -209,15 +213,26 @@ class _Library:
             which = numbers.get((visual.file, visual.size), [])
             self.parts += _visual_parts(model, visual, which)
 
-    def _read(self, model: RobotModel, visual: Shape) -> list[Surface]:
-        path = find_mesh(visual.file, model.tree.path)
+
+def _file(model: RobotModel, visual: Shape) -> _File:
+    path = find_mesh(visual.file, model.tree.path)
+    stamp = None if path is None else os.stat(path)
+    return path, visual.size, stamp and (stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=4)  # thinning takes seconds, and a robot has many pages
+def _thinned(files: tuple[_File, ...]) -> tuple[list[Surface] | None, ...]:
+    """Return the surfaces of each file in its scale, few enough for a page; None: not readable."""
+    found: list[list[Surface] | None] = []
+    for path, scale, _ in files:
         try:
-            found = () if path is None else read_surfaces(path)
+            read = () if path is None else read_surfaces(path)
         except ValueError:
-            found = ()
-        if not found:
-            self.missing.append(visual.file)
-        return [replace(s, vertices=s.vertices * np.array(visual.size)) for s in found]
+            read = ()
+        scaled = [replace(s, vertices=s.vertices * np.array(scale)) for s in read]
+        found.append(scaled or None)
+    thinned = thin([surfaces or [] for surfaces in found], _TRIANGLES)
+    return tuple(t if f else None for t, f in zip(thinned, found, strict=True))
 
 
 def _packed_mesh(surface: Surface, box: Array) -> dict[str, Any]:

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.mujoco_plant import multisine, plant, recorded
+from helpers.mujoco_plant import held, multisine, plant, recorded
 
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
@@ -20,7 +20,7 @@ SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=1e-3)
 def stated(robot, **changes):
     drives = robot.drives
     gains = {"kp": {d.joint: d.kp for d in drives}, "kd": {d.joint: d.kd for d in drives}}
-    return LoopSettings(**(gains | changes))
+    return LoopSettings(**({"delays": "group"} | gains | changes))
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +47,30 @@ def test_the_drives_of_a_leg_are_recovered_within_their_errors(leg, found):
         assert abs(value - truth[name]) < 3.3 * error, name
         if not name.endswith("offset"):  # which is 0
             assert error < 0.15 * truth[name], name
+
+
+def test_drives_behind_a_slow_clock_are_recovered_once_it_is_stated(rng):
+    """At 100 Hz the hold is worth some 5 ms, which damping has to give else."""
+    robot = plant("planar", rng, delay=0.0, coulomb=0.0)
+    q_ref = multisine(np.arange(1500) / 500.0, robot.middle, 0.5 * robot.reach, rng, highest=8.0)
+    q = held(robot, q_ref, 500.0, 100.0) + 1e-4 * rng.standard_normal(q_ref.shape)
+    log = Log(np.arange(1500) / 500.0, q, 0 * q, robot.model.joints, q_ref=q_ref, has_torque=False)
+    worst = {}
+    for rate in (100.0, None):
+        loop = stated(robot, rate=rate)
+        found = identify_commands(
+            robot.model, [log], [], loop, replace(SETTINGS, step=2e-3), chooses=False
+        )
+        values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+        off = {
+            what: max(abs(values[f"{d.joint}.{what}"] / getattr(d, what) - 1) for d in robot.drives)
+            for what in ("armature", "viscous")
+        }
+        worst[rate] = (max(off.values()), found.errors[0].rmse.max())
+        late = max(value for name, value in values.items() if name.endswith("delay"))
+        assert rate is None or late < 2e-4
+    assert worst[100.0] == pytest.approx((0.0, 1e-4), abs=0.02), worst
+    assert worst[None][0] > 0.2
 
 
 def test_the_drives_of_an_arm_are_recovered():

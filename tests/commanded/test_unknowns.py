@@ -43,7 +43,7 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng):
     slopes = np.concatenate([r.slopes for r in found])  # of the outputs
     np.testing.assert_array_equal(found[0].columns, np.arange(len(theta)))
     for k, name in enumerate(simulator.names):
-        h = 3e-8 / max(np.abs(slopes[..., k]).max(), 1e-4)
+        h = 1e-8 / max(np.abs(slopes[..., k]).max(), 1e-4)
         ends = []
         for s in (1, -1):
             moved = theta.copy()

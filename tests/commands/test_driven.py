@@ -102,7 +102,7 @@ def test_its_report_is_made_anew_and_its_replay_shows_torques(folder, job, tmp_p
     assert main(["report", str(folder)]) == 0
     log, page = job.parent / "second.csv", tmp_path / "replay.html"
     urdf = folder / "planar_2r.identified.urdf"
-    assert main(["replay", str(urdf), str(log), str(folder), "--out", str(page)]) == 0
+    assert main(["replay", str(urdf), str(log), str(folder), "--html", str(page)]) == 0
     assert page.is_file()
 
 

@@ -172,6 +172,28 @@ def test_the_drives_of_a_result_are_read(result):
         assert drive == replace(wanted, effort_limit=21.0 if drive.joint == LEG[0] else np.inf)
 
 
+def test_a_result_with_a_clock_follows_by_it_and_its_export_says_so(result, tmp_path, capsys):
+    folder, leg = result
+    text = json.loads((folder / "result.json").read_text())
+    held = tmp_path / "held"
+    held.mkdir()
+    for name in ("robot.urdf", "robot.drive.json"):
+        (held / name).write_bytes((folder / name).read_bytes())
+    text["simulation"]["controller"]["rate"] = 100.0
+    (held / "result.json").write_text(json.dumps(text))
+    log, _ = recorded(leg, np.random.default_rng(5), duration=0.5, noise=0.0)
+    at_once, by_clock = (load_result(at).follow_commands(log) for at in (folder, held))
+    model, pi = load_result(held).identified
+    loops = loops_of(model, pi, load_result(held).commanded, 100.0)
+    (out,) = LoopedRobot(model).roll_out(loops, cut_windows(log, np.inf, 0.0))
+    np.testing.assert_array_equal(by_clock, out.q)
+    assert np.abs(by_clock - at_once).max() > 3e-4
+    for at, says in ((held, True), (folder, False)):
+        code, out, _ = export(at, "mjcf", tmp_path / "a.xml", capsys)
+        assert code == 0
+        assert ("reads its joints 100 times a second and holds its torque" in out) is says
+
+
 def test_impossible_drives_are_refused(result, tmp_path):
     content = json.loads((result[0] / "result.json").read_text())
     for name in ("robot.urdf", "robot.drive.json"):

@@ -43,12 +43,14 @@ class Plant:
         model: The robot as its URDF says, whose bodies are the truth.
         drives: Its drives.
         middle, reach: Of the commands, shape (n,) [rad].
+        bodies: Their inertial parameters, shape (10 n,); those of the URDF if None.
     """
 
     model: RobotModel
     drives: tuple[CommandedDrive, ...]
     middle: np.ndarray
     reach: np.ndarray
+    bodies: np.ndarray | None = None
 
     @property
     def truth(self) -> dict[str, float]:
@@ -126,6 +128,8 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
     """
     pi = plant.model.standard_parameters()
     names = plant.model.layout.names
+    if plant.bodies is not None:
+        pi[: plant.model.layout.n_inertial] = plant.bodies
     for drive in plant.drives:
         for term in ("armature", "viscous", "coulomb", "offset"):
             pi[names.index(f"{drive.joint}.{term}")] = getattr(drive, term)
@@ -146,6 +150,34 @@ def loaded(plant, rate, step=_STEP, *, as_exported=False):
         robot.dof_armature[robot.jnt_dofadr[robot.actuator_trnid[:, 0]]] -= 0.5 * exact * brakes
         assert (robot.dof_armature > 0).all(), "smaller steps are wanted"
     return robot
+
+
+def held(plant, q_ref, rate, clock, settles=_SETTLES):
+    """Return positions under a controller that holds its torque between ticks, shape (N, n).
+
+    Motors get what it makes of MuJoCo's own position and speed; Runge-Kutta's steps between.
+
+    Args:
+        plant: The robot, whose drives have no delay.
+        q_ref: Commands, shape (N, n) [rad].
+        rate: Commands per second [Hz].
+        clock: Ticks per second, the first with the first command [Hz].
+        settles: How long the first command is held before [s].
+    """
+    robot = loaded(plant, rate, as_exported=True)
+    robot.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    robot.actuator_gainprm[:, 0], robot.actuator_biasprm[:, :3] = 1.0, 0.0
+    kp, kd, most = np.transpose([[d.kp, d.kd, d.effort_limit] for d in plant.drives])
+    step, data, q = robot.opt.timestep, mujoco.MjData(robot), []
+    row, tick, data.qpos[:] = round(1 / rate / step), round(1 / clock / step), q_ref[0]
+    for k in range(-round(settles / step), (len(q_ref) - 1) * row + 1):
+        if k >= 0 and k % row == 0:
+            q.append(data.qpos.copy())
+        if k % tick == 0:
+            torque = kp * (q_ref[max(k, 0) // row] - data.qpos) - kd * data.qvel
+            data.ctrl[:] = np.clip(torque, -most, most)
+        mujoco.mj_step(robot, data)
+    return np.array(q)
 
 
 def followed(robot, q_ref, rate, settles=_SETTLES):

@@ -6,7 +6,9 @@ import trimesh
 from robotid.robot.examples import example_urdfs
 from robotid.robot.meshes import find_mesh, read_shapes, read_surfaces
 from robotid.robot.model import RobotModel
+from robotid.robot.thinning import thin
 from robotid.robot.urdf_text import parse_urdf
+from robotid.viewer import scene
 from robotid.viewer.scene import robot_scene
 
 URDF = """<robot name="r">
@@ -114,26 +116,39 @@ def test_a_mesh_without_triangles_counts_as_not_found_and_the_body_gets_a_skelet
     (package / "meshes" / "cube.stl").write_text("nothing")
     urdf = package / "urdf" / "r.urdf"
     urdf.write_text(URDF.replace('<cylinder radius="0.1" length="0.4"/>', ""))
-    scene = robot_scene(RobotModel.from_urdf(urdf))
-    assert scene.notes[0].startswith("2 meshes not found or not readable")
-    assert scene.content["meshes"] == []
-    assert "#e07b1f" in [p["colour"] for p in scene.content["parts"] if p["node"] == 1]
+    shown = robot_scene(RobotModel.from_urdf(urdf))
+    assert shown.notes[0].startswith("2 meshes not found or not readable")
+    assert shown.content["meshes"] == []
+    assert "#e07b1f" in [p["colour"] for p in shown.content["parts"] if p["node"] == 1]
 
 
 def test_a_scene_holds_each_mesh_once_and_names_what_is_missing(package):
     model = RobotModel.from_urdf(package / "urdf" / "r.urdf")
-    scene = robot_scene(model)
-    assert len(scene.content["meshes"]) == 1
-    parts = scene.content["parts"]
+    shown = robot_scene(model)
+    assert len(shown.content["meshes"]) == 1
+    parts = shown.content["parts"]
     assert [(p["node"], p["shape"]) for p in parts] == [
         (0, "box"), (1, "mesh"), (1, "mesh"), (1, "cylinder"),
     ]  # fmt: skip
     assert parts[0]["colour"] == "#80331a"
     assert parts[1]["colour"] == "#00ff00"
     assert len({p["size"][0] for p in parts[1:3]}) == 1
-    (note,) = scene.notes
+    (note,) = shown.notes
     assert note.startswith("1 meshes not found or not readable")
     assert "lost.stl" in note
+
+
+def test_a_mesh_is_thinned_once_until_its_file_is_another(package, monkeypatch):
+    model = RobotModel.from_urdf(package / "urdf" / "r.urdf")
+    runs = []
+    monkeypatch.setattr(scene, "thin", lambda *given: runs.append(1) or thin(*given))
+    first, again = (robot_scene(model).content["meshes"] for _ in range(2))
+    assert first == again
+    trimesh.creation.box((1, 1, 5)).export(package / "meshes" / "cube.stl")
+    other = robot_scene(model).content["meshes"]
+    heights = [m["step"][2] * 65_535 for meshes in (first, other) for m in meshes]
+    np.testing.assert_allclose(heights, [0.5, 2.5])  # at half its size
+    assert len(runs) == 2
 
 
 def test_parts_sit_where_pinocchio_puts_the_visuals(package):

@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.mujoco_plant import loaded, plant, rolled_out
+
+from robotid.commanded.fit import fit_loops
+from robotid.commanded.identify import identify_commands
+from robotid.commanded.settings import LoopSettings
+from robotid.doctor.command_channels import largest_speeds
+from robotid.identification.settings import SimulationSettings
+from robotid.logs.data import Log
+
+RATE, HELD, RAMP, STEPS = 250.0, 200, 20, 10  # [Hz], rows, of a leg that goes from pose to pose
+LIMIT, VISCOUS, KP = 9.0, 4.5, 200.0  # [N m], [N m s/rad], [N m/rad] of the calf
+DELAY = 0.008  # [s] of all drives
+SETTINGS = SimulationSettings(window=2.0, lead=0.2, bodies=0.0, step=4e-3)
+
+
+def stepped(limit):
+    """Return a leg whose calf gives so much at most, and its log of steps."""
+    rng = np.random.default_rng(2)
+    robot = plant("leg", rng, delay=DELAY)
+    calf = replace(robot.drives[2], effort_limit=limit, viscous=VISCOUS, kp=KP)
+    robot = replace(robot, drives=(*robot.drives[:2], calf))
+    away = (-1.0) ** np.arange(STEPS)[:, None] * rng.uniform(0.4, 0.8, (STEPS, 3))
+    poses = robot.middle + robot.reach * away
+    t = np.arange(STEPS * HELD) / RATE
+    since = np.minimum(t * RATE % HELD / RAMP, 1.0)[:, None]
+    last, next_ = (np.repeat(x, HELD, axis=0) for x in (poses, np.roll(poses, -1, axis=0)))
+    q_ref = last + (next_ - last) * since
+    q = rolled_out(loaded(robot, RATE), q_ref, RATE)[0]
+    q = q + 1e-4 * rng.standard_normal(q.shape)
+    none = np.zeros_like(q)
+    return robot, Log(t, q, none, robot.model.joints, q_ref=q_ref, has_torque=False)
+
+
+@pytest.fixture(scope="module")
+def limited():
+    return stepped(LIMIT)
+
+
+def gains(robot, **changes):
+    drives = robot.drives
+    kp, kd = ({d.joint: getattr(d, key) for d in drives} for key in ("kp", "kd"))
+    return LoopSettings(**({"kp": kp, "kd": kd} | changes))
+
+
+def test_a_drive_at_its_limit_has_it_found(limited):
+    robot, log = limited
+    calf = robot.model.joints[2]
+    assert largest_speeds(log).keys() == {calf}
+    coulomb = robot.drives[2].coulomb
+    assert largest_speeds(log)[calf] == pytest.approx((LIMIT - coulomb) / VISCOUS, rel=0.15)
+    found = identify_commands(robot.model, [log], [], gains(robot), SETTINGS, chooses=False)
+    estimate = found.fitted.estimate
+    values = dict(zip(estimate.names, estimate.theta, strict=True))
+    assert [name for name in values if name.endswith("limit")] == [f"{calf}.limit"]
+    assert values[f"{calf}.limit"] == pytest.approx(LIMIT, rel=0.03)
+    assert values[f"{calf}.viscous"] == pytest.approx(VISCOUS, rel=0.03)
+    assert values[f"{calf}.coulomb"] == pytest.approx(coulomb, rel=0.3)
+    np.testing.assert_array_equal(found.fitted.loops.limit[:2], np.inf)
+    assert [name for name in values if name.endswith("delay")] == ["robot.delay"]
+    assert values["robot.delay"] == pytest.approx(DELAY, abs=2e-4)
+    np.testing.assert_array_equal(found.fitted.loops.delay, values["robot.delay"])
+    [said] = [f for f in found.findings if f.code == "limit"]
+    assert said.where == calf
+    assert said.evidence["limit"] == values[f"{calf}.limit"]
+
+
+def test_a_limit_that_is_stated_is_taken(limited):
+    robot, log = limited
+    loop = gains(robot, delays="group", limit={robot.model.joints[2]: 20.0})
+    fitted = fit_loops(robot.model, [log], loop, SETTINGS, chooses=False)
+    np.testing.assert_array_equal(fitted.loops.limit, [np.inf, np.inf, 20.0])
+    assert not [name for name in fitted.estimate.names if name.endswith("limit")]
+    delays = [name for name in fitted.estimate.names if name.endswith("delay")]
+    assert delays == [f"{joint}.delay" for joint in robot.model.joints]
+
+
+def test_drives_below_their_limits_have_none():
+    assert largest_speeds(stepped(np.inf)[1]) == {}
