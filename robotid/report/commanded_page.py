@@ -31,6 +31,8 @@ _OTHERS = {
     "command_rmse": ("command", "quiet"),
     "steady_rmse": ("same speed", "quiet"),
 }
+#: What the error of a joint is a share of, as a column says it.
+_SHARES = {"command_rmse": "% of command's", "steady_rmse": "% of same speed"}
 _ROWS = 24_000  # of all charts together: about half a MB
 _LONGEST = 3000  # rows of one chart
 _OPEN = 3  # joints whose charts are open at first
@@ -175,8 +177,9 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     joints = entry["per_joint"].values()
     ours = _mean([each["rmse"] for each in joints])
     size = number(ours and ours / _SMALL, ".3g").html
+    over = f" over {DRIFTS:g} s" if _is_driven(content) else ""
     facts = {
-        f"Open-loop position error, {_ROLES[role]}": (
+        f"Open-loop position error{over}, {_ROLES[role]}": (
             f"<strong>{size} {_unit(entry)}</strong>, geometric mean of {len(joints)} "
             f"joint{'s' if len(joints) > 1 else ''}"
         )
@@ -322,7 +325,7 @@ def _error_table(role: str, entry: Mapping[str, Any]) -> str:
     joints, horizons = entry["per_joint"], entry.get("horizons", {})
     others = [key for key in _OTHERS if any(each.get(key) is not None for each in joints.values())]
     plain = "steady_rmse" if "steady_rmse" in others else "command_rmse"
-    headers = ["joint", "RMSE", f"% of {_OTHERS[plain][0]}'s", *(_OTHERS[key][0] for key in others)]
+    headers = ["joint", "RMSE", _SHARES[plain], *(_OTHERS[key][0] for key in others)]
     headers += [f"over {float(h):g} s" for h in horizons]
 
     def cells(first: Cell, own: Mapping[str, Any], short: Sequence[float | None]) -> list[Cell]:
