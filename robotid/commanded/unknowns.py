@@ -250,7 +250,9 @@ class LoopSimulator:
                     slopes[row, k] = 1.0
         return pi, slopes
 
-    def residuals(self, theta: Array, *, with_slopes: bool) -> list[Residual]:
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> list[Residual]:
         """Return what is measured less what comes out, window by window; see ``Simulator``.
 
         Of ``error`` "direct", derivatives are those of inverse dynamics along the roll-out.
@@ -258,6 +260,7 @@ class LoopSimulator:
         Args:
             theta: Values of the unknowns, shape (c,).
             with_slopes: Whether derivatives are wanted.
+            with_starts: Whether those by the starts of windows are, without the others.
 
         Raises:
             NotConvergedError: If a step has no solution.
@@ -267,8 +270,8 @@ class LoopSimulator:
             identification of robot dynamics, IEEE TCST 21(2): DIDIM.
         """
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
-        columns, owners = self._columns(loops)
-        rolls = with_slopes and self.error != "direct"
+        columns, owners = self._columns(loops) if with_slopes else ([], np.array([], dtype=int))
+        rolls = (with_slopes or with_starts) and self.error != "direct"
         outs = self.robot.roll_out(
             loops,
             self.windows,

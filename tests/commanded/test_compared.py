@@ -110,6 +110,11 @@ def test_a_controller_that_is_not_known_has_no_inverse_dynamics(leg, loop, named
         fitted(leg, loop, error="direct")
 
 
+def test_a_torque_that_drives_is_not_compared_with_itself(leg):
+    with pytest.raises(SettingsError, match=r"has kind = 'torque', where the logged one drives"):
+        fitted(leg, LoopSettings(kind="torque"), error="input")
+
+
 def test_torques_that_a_clock_holds_are_refused(leg):
     loop = replace(LOOP, rate=500.0)
     with pytest.raises(SettingsError, match=r"follow at once, but \[controller\] has rate = 500,"):
