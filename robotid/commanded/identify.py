@@ -237,16 +237,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             f"the fit has not settled after {estimate.n_iter} steps: its parameters may still "
             "move; state what you know of the loop in [controller], or use shorter windows",
         )
-    if (left := estimate.details["left"]) > _SOFT:
-        yield Finding(
-            "soft_loop",
-            "warning",
-            "fit",
-            f"a step of error = 'direct' leaves {100 * left:.0f} % of what it should correct, "
-            "because it neglects how the motion changes; errors are large in a loop as soft as "
-            "this. Set error = 'input'",
-            {"left": left},
-        )
+    yield from _soft_loop(estimate.details["left"])
     if not found.has_gains and not found.fitted.simulator.knows_torques:
         yield Finding(
             "scale",
@@ -317,6 +308,20 @@ def _limits_found(found: Commanded) -> Iterator[Finding]:
                 "[controller]",
                 {"limit": float(value), "std_error": float(error)},
             )
+
+
+def _soft_loop(left: float) -> Iterator[Finding]:
+    """Yield that the direct method's steps leave much of what they should correct, if they do."""
+    if left > _SOFT:
+        yield Finding(
+            "soft_loop",
+            "warning",
+            "fit",
+            f"a step of error = 'direct' leaves {100 * left:.0f} % of what it should correct, "
+            "because it neglects how the motion changes; errors are large in a loop as soft as "
+            "this. Set error = 'input'",
+            {"left": left},
+        )
 
 
 def _friction_found(tried: Tried) -> Finding:
