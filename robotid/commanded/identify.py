@@ -7,19 +7,22 @@ from functools import cached_property
 import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.driven import driven_log
 from robotid.commanded.errors import OpenLoop, run_open_loop
 from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_terms
 from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.term_choice import Tried
+from robotid.commanded.zeros import CLEAR, parallel_axes
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import Verdict, alarming
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import Loops
+from robotid.simulation.loops import Loops, open_loops
 
 __all__ = ["Commanded", "identify_commands", "with_gravity"]
 
@@ -111,6 +114,7 @@ def identify_commands(
     loop: LoopSettings,
     settings: SimulationSettings,
     *,
+    signals: SignalSettings | None = None,
     chooses: bool = True,
     examined: Sequence[Finding] = (),
     ignore: Sequence[str] = (),
@@ -120,10 +124,12 @@ def identify_commands(
 
     Args:
         model: The robot.
-        logs: Logs to fit, of its joints in its order, with commands.
+        logs: Logs to fit, of its joints in its order, with commands, or with torques if these
+            drive the robot.
         kept: Logs kept apart.
         loop: What is known of the loops.
         settings: The estimator's.
+        signals: How torques become rows, and how late they are.
         chooses: Whether further friction is tried.
         examined: What the doctor found in the logs.
         ignore: Codes of its errors that you know better.
@@ -137,25 +143,28 @@ def identify_commands(
     """
     if not logs:
         raise DataError("no log was given; at least one is needed to identify anything")
+    if loop.kind == "torque":
+        told = signals or SignalSettings()
+        logs, kept = ([driven_log(model, log, told) for log in part] for part in (logs, kept))
     for log in (*logs, *kept):
         if log.q_ref is None:
             raise DataError(
                 f"{log.name} has no commands, which the estimator 'simulation' follows; record "
-                "columns qref_ of each joint, or identify from torques with another estimator"
+                "columns qref_ of each joint, or have its torque drive the robot: [controller] "
+                "kind = 'torque'"
             )
     if loop.gravity_compensation:
         logs, kept = ([with_gravity(model, log) for log in part] for part in (logs, kept))
-    fitted = fit_loops(model, logs, loop, settings, chooses=chooses, progress=progress)
+    fitted = fit_loops(
+        model, logs, loop, settings, signals=signals, chooses=chooses, progress=progress
+    )
     report_stage(progress, "testing", STAGES)
-    stated = stated_loops(model, loop)
-    has_gains = loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns)
-    urdf = _urdf(model, stated) if has_gains else None
     sign = fitted.encoders.sign
     runs = [
         [
             run_open_loop(
                 fitted.simulator.robot, fitted.loops, log.turned(sign),
-                urdf=urdf, plain=fitted.plain.loops,
+                **_others(model, loop, fitted),
             )
             for log in part
         ]
@@ -174,10 +183,20 @@ def identify_commands(
     return replace(found, findings=by_severity([*examined, *_findings(found)]))
 
 
-def _urdf(model: RobotModel, stated: Loops) -> Loops:
-    """Return the URDF with the stated gains: no friction, and a rotor that weighs nothing."""
-    n = len(model.joints)
-    return replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
+def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
+    """Return plainer models, as ``run_open_loop`` takes them.
+
+    With the stated gains the URDF has no friction, and rotors that weigh nothing.
+    """
+    if fitted.linear is not None:
+        driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
+        return {"urdf": open_loops(model, driven), "rows": open_loops(model, found)}
+    others = {} if fitted.plain is None else {"plain": fitted.plain.loops}
+    if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns):
+        n, stated = len(model.joints), stated_loops(model, loop)
+        bare = replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
+        others["urdf"] = bare
+    return others
 
 
 def with_gravity(model: RobotModel, log: Log) -> Log:
@@ -301,18 +320,69 @@ def _friction_found(tried: Tried) -> Finding:
 
 
 def _encoder_findings(found: Commanded) -> Iterator[Finding]:
-    """Yield which encoders have another zero or sense than the URDF, and what speaks for it."""
-    encoders = found.fitted.encoders
+    """Yield zero and sense of each encoder beside the URDF's, and what speaks for them."""
+    encoders, open_ = found.fitted.encoders, []
+    if found.loop.zeros != "find":
+        return
     for j, joint in enumerate(found.model.joints):
+        zero, margin = float(found.fitted.loops.zero[j]), float(encoders.margin[j])
+        evidence = {
+            "zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j]),
+            "explained": float(encoders.explained[j]), "margin": margin,
+            "next_zero": float(encoders.next_zero[j]), "next_sign": float(encoders.next_sign[j]),
+        }  # fmt: skip
+        other = ", counted the other way," if encoders.next_sign[j] != encoders.sign[j] else ""
+        beside = (
+            f"the next best, {encoders.next_zero[j]:+.2g} rad{other} leaves {100 * margin:.0f} % "
+            "more of the squared error of the loops"
+        )
         if encoders.gain[j] > 0:
             sense = "counts the other way, and " if encoders.sign[j] < 0 else ""
-            zero = float(found.fitted.loops.zero[j])
             yield Finding(
                 "encoder",
                 "warning",
                 joint,
                 f"{joint}: its encoder {sense}reads 0 where the URDF is at {zero:+.3g} rad; by "
                 f"gravity this explains {100 * encoders.gain[j]:.0f} % of what holds the loop off "
-                "its command. Calibrate it, or state the zero in the URDF",
-                {"zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j])},
+                f"its command; {beside}. Calibrate it, or state the zero in the URDF",
+                evidence,
             )
+        elif margin > CLEAR:
+            yield Finding(
+                "encoder_kept",
+                "note",
+                joint,
+                f"{joint}: its encoder has zero and sense of the URDF, by gravity, which explains "
+                f"{100 * encoders.explained[j]:.0f} % of what slowly holds it off its command; "
+                f"{beside}",
+                evidence,
+            )
+        else:
+            open_.append(joint)
+    yield from _untold_encoders(found, open_)
+
+
+def _untold_encoders(found: Commanded, open_: Sequence[str]) -> Iterator[Finding]:
+    """Yield which zeros and senses gravity leaves open: those of joints, and those of chains."""
+    if open_:
+        margins = [found.fitted.encoders.margin[found.model.joints.index(j)] for j in open_]
+        margin = max(0.0, *margins)
+        names = listed(open_, _NAMED)
+        yield Finding(
+            "encoder_open",
+            "note",
+            names,
+            f"gravity does not tell zero and sense of {names}: they move little, or bear so "
+            f"little that others leave {100 * margin:.0f} % more of the squared error of the loops "
+            "at most. They are taken to be the URDF's; compare them at a known pose",
+            {"margin": float(margin)},
+        )
+    for chain in parallel_axes(found.model):
+        names = listed(chain, _NAMED)
+        yield Finding(
+            "mirror_image",
+            "note",
+            names,
+            f"{names} turn about parallel axes: gravity hardly tells them from their mirror image, "
+            "all of them counted the other way. Look which way one of them turns",
+        )

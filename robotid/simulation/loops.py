@@ -40,7 +40,7 @@ from robotid.robot.drives import (
 from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows"]
+__all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows", "open_loops"]
 
 #: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
@@ -100,6 +100,31 @@ class Loops:
             term: One of its terms.
         """
         return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
+
+
+def open_loops(model: RobotModel, pi: Array) -> Loops:
+    """Return bodies and drives of standard parameters, their loops open: no gain, no delay.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+    """
+    layout, n = model.layout, len(model.joints)
+    terms: list[list[DriveTerm]] = [[] for _ in range(n)]
+    values: list[list[float]] = [[] for _ in range(n)]
+    armature, none = np.zeros(n), np.zeros(n)
+    drives = zip(layout.drive_parameters, pi[layout.n_inertial :].tolist(), strict=True)
+    for (d, term), value in drives:
+        if term.is_inertia:
+            armature[d] = value
+        else:
+            terms[d].append(term)
+            values[d].append(value)
+    return Loops(
+        bodies=pi[: layout.n_inertial].reshape(-1, 10), armature=armature, kp=none, kd=none,
+        limit=np.full(n, np.inf), delay=none, zero=none, terms=tuple(map(tuple, terms)),
+        values=np.concatenate([np.zeros(0), *values]),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
