@@ -379,9 +379,7 @@ def _begin(
     model: RobotModel, stated: Loops, plain: SecondOrder, usual: _Usual, finds_limit: Array
 ) -> Loops:
     """Return the loops that the fit begins with."""
-    # from no friction at all there is no slope that tells where joints stick
-    sticks = np.maximum(plain.friction("coulomb") * usual.scale, _LEAST * usual.torque)
-    friction = {"viscous": plain.friction("viscous") * usual.scale, "coulomb": sticks}
+    friction = {name: plain.friction(name) * usual.scale for name in ("viscous", "coulomb")}
     none = np.zeros(len(usual.scale))
     terms = tuple(
         tuple(

@@ -13,6 +13,7 @@ from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_
 from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.term_choice import Tried
+from robotid.commanded.zeros import CLEAR, parallel_axes
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
@@ -319,18 +320,69 @@ def _friction_found(tried: Tried) -> Finding:
 
 
 def _encoder_findings(found: Commanded) -> Iterator[Finding]:
-    """Yield which encoders have another zero or sense than the URDF, and what speaks for it."""
-    encoders = found.fitted.encoders
+    """Yield zero and sense of each encoder beside the URDF's, and what speaks for them."""
+    encoders, open_ = found.fitted.encoders, []
+    if found.loop.zeros != "find":
+        return
     for j, joint in enumerate(found.model.joints):
+        zero, margin = float(found.fitted.loops.zero[j]), float(encoders.margin[j])
+        evidence = {
+            "zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j]),
+            "explained": float(encoders.explained[j]), "margin": margin,
+            "next_zero": float(encoders.next_zero[j]), "next_sign": float(encoders.next_sign[j]),
+        }  # fmt: skip
+        other = ", counted the other way," if encoders.next_sign[j] != encoders.sign[j] else ""
+        beside = (
+            f"the next best, {encoders.next_zero[j]:+.2g} rad{other} leaves {100 * margin:.0f} % "
+            "more of the squared error of the loops"
+        )
         if encoders.gain[j] > 0:
             sense = "counts the other way, and " if encoders.sign[j] < 0 else ""
-            zero = float(found.fitted.loops.zero[j])
             yield Finding(
                 "encoder",
                 "warning",
                 joint,
                 f"{joint}: its encoder {sense}reads 0 where the URDF is at {zero:+.3g} rad; by "
                 f"gravity this explains {100 * encoders.gain[j]:.0f} % of what holds the loop off "
-                "its command. Calibrate it, or state the zero in the URDF",
-                {"zero": zero, "sign": float(encoders.sign[j]), "gain": float(encoders.gain[j])},
+                f"its command; {beside}. Calibrate it, or state the zero in the URDF",
+                evidence,
             )
+        elif margin > CLEAR:
+            yield Finding(
+                "encoder_kept",
+                "note",
+                joint,
+                f"{joint}: its encoder has zero and sense of the URDF, by gravity, which explains "
+                f"{100 * encoders.explained[j]:.0f} % of what slowly holds it off its command; "
+                f"{beside}",
+                evidence,
+            )
+        else:
+            open_.append(joint)
+    yield from _untold_encoders(found, open_)
+
+
+def _untold_encoders(found: Commanded, open_: Sequence[str]) -> Iterator[Finding]:
+    """Yield which zeros and senses gravity leaves open: those of joints, and those of chains."""
+    if open_:
+        margins = [found.fitted.encoders.margin[found.model.joints.index(j)] for j in open_]
+        margin = max(0.0, *margins)
+        names = listed(open_, _NAMED)
+        yield Finding(
+            "encoder_open",
+            "note",
+            names,
+            f"gravity does not tell zero and sense of {names}: they move little, or bear so "
+            f"little that others leave {100 * margin:.0f} % more of the squared error of the loops "
+            "at most. They are taken to be the URDF's; compare them at a known pose",
+            {"margin": float(margin)},
+        )
+    for chain in parallel_axes(found.model):
+        names = listed(chain, _NAMED)
+        yield Finding(
+            "mirror_image",
+            "note",
+            names,
+            f"{names} turn about parallel axes: gravity hardly tells them from their mirror image, "
+            "all of them counted the other way. Look which way one of them turns",
+        )

@@ -2,8 +2,9 @@
 
 A servo's position loop is held off its command by the torque of its load, q_ref - q = tau / kp +
 friction. So the error of the loops, regressed on the URDF's torques, tells at which angles and in
-which sense the URDF's joints stand where the encoders read what they do. Joints with parallel
-axes cannot be told from their mirror image: gravity holds both off alike.
+which sense the URDF's joints stand where the encoders read what they do. What is slow tells it: in
+fast motion lags outweigh gravity, and friction, on either side in turn, has a mean of none.
+Joints with parallel axes cannot be told from their mirror image: gravity holds both off alike.
 """
 
 from collections.abc import Sequence
@@ -13,16 +14,26 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.logs.data import Log
+from robotid.regressor.compiled import flatten
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
 
-__all__ = ["Encoders", "find_encoders", "same_encoders"]
+__all__ = ["CLEAR", "Encoders", "find_encoders", "parallel_axes", "same_encoders"]
 
-_ANGLES = np.deg2rad(np.arange(-180.0, 180.0, 15.0))  # zeros that are tried
+#: Squared error that another zero or sense must leave, over the best's, less 1: the URDF's for the
+#: best to be taken, the next best for it to be known.
+CLEAR = 0.2
+
+#: Senses and zeros that are tried.
+_TRIALS = np.array([(s, z) for s in (1.0, -1.0) for z in np.deg2rad(np.arange(-180, 180, 15))])
 _SAMPLES = 400  # of all logs together
 _SWEEPS = 4  # over the joints, until none moves any more
-_CUTOFF = 4.0  # [Hz] of the motion that is looked at
-_GAIN = 0.15  # of the squared error: what a joint must gain to leave the URDF's zero or sense
+_SLOW, _FAST = 0.4, 4.0  # [Hz] of the motion that is looked at, and of its friction's sense
+_PERIODS = 30  # of the slowest motion that all logs together should have
+_RANGE = 0.4  # [rad] of slow motion that shows how a torque turns; over less it is a straight line
+_SAME = 1.0 - 1e-6  # cosine of axes that are parallel
+_NEXT = np.deg2rad(15.5)  # of the best, within which a zero is no other
+_STILL = 0.02  # [rad/s or m/s] over which friction turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +44,19 @@ class Encoders:
         sign: 1, or -1 of an encoder that counts the other way.
         zero: Position of the URDF where the encoder reads 0 [rad or m].
         gain: Share of the loops' squared error that leaving the URDF's zero and sense explains.
+        explained: Share of the joint's own squared error that gravity explains.
+        margin: Squared error of the next best zero or sense, beyond the best's neighbours, over
+            that of the best, less 1; 0 of a joint that slides, or hardly moves.
+        next_sign, next_zero: That next best.
     """
 
     sign: Array
     zero: Array
     gain: Array
+    explained: Array
+    margin: Array
+    next_sign: Array
+    next_zero: Array
 
 
 def same_encoders(model: RobotModel) -> Encoders:
@@ -47,7 +66,29 @@ def same_encoders(model: RobotModel) -> Encoders:
         model: The robot.
     """
     n = len(model.joints)
-    return Encoders(np.ones(n), np.zeros(n), np.zeros(n))
+    none = np.zeros(n)
+    return Encoders(
+        np.ones(n), none, none, explained=none, margin=none, next_sign=np.ones(n), next_zero=none
+    )
+
+
+def parallel_axes(model: RobotModel) -> list[tuple[str, ...]]:
+    """Return the joints of each chain that turn about parallel axes, one after the other.
+
+    Args:
+        model: The robot.
+    """
+    tree = flatten(model)
+    joined: dict[int, list[int]] = {}
+    for body in range(1, len(tree.parents)):
+        above, placement = int(tree.parents[body]), tree.joints[body]
+        turn = placement[36:39]
+        in_parent = (placement[:9] + placement[9:18]).reshape(3, 3).T @ turn  # it stays there
+        parallel = above > 0 and abs(float(in_parent @ tree.joints[above][36:39])) > _SAME
+        joined[body] = joined[above] if parallel else []
+        joined[body].append(int(tree.leaders[body]))
+    chains = {id(own): tuple(model.joints[j] for j in own) for own in joined.values()}
+    return [own for own in chains.values() if len(own) > 1]
 
 
 def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
@@ -57,66 +98,105 @@ def find_encoders(model: RobotModel, logs: Sequence[Log]) -> Encoders:
         model: The robot.
         logs: Logs with commands, of its joints in its order.
     """
-    samples = [_smooth(log, max(_SAMPLES // len(logs), 50)) for log in logs]
-    q, v, a, error = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-    turns = np.array([joint.type != "prismatic" for joint in model.limits])
+    length = sum(float(log.t[-1] - log.t[0]) for log in logs)
+    cutoff = min(max(_SLOW, _PERIODS / length), _FAST)
+    samples = [_smooth(log, max(_SAMPLES // len(logs), 50), cutoff) for log in logs]
+    motion = _Motion(*(np.concatenate(parts) for parts in zip(*samples, strict=True)))
     n = len(model.joints)
+    turns = np.flatnonzero(
+        np.array([joint.type != "prismatic" for joint in model.limits])
+        & (np.ptp(motion.q, axis=0) > _RANGE)
+    )
+    free = [*turns]
+    while True:
+        sign, zero, gain, cost, costs = _descend(model, motion, turns, free)
+        margin, next_sign, next_zero = np.zeros(n), sign.copy(), zero.copy()
+        for j in turns:
+            away = (_TRIALS[:, 0] != sign[j]) | (np.cos(_TRIALS[:, 1] - zero[j]) < np.cos(_NEXT))
+            k = int(np.argmin(np.where(away, costs[j], np.inf)))
+            margin[j] = np.expm1((costs[j, k] - cost) / len(motion.q))
+            next_sign[j], next_zero[j] = _TRIALS[k]
+        open_ = [j for j in free if gain[j] > 0 and margin[j] < CLEAR]
+        if not open_:
+            break
+        free = [j for j in free if j not in open_]  # what others do as well stays the URDF's
+    left, without = motion.left(model, sign, zero)
+    return Encoders(sign, zero, gain, 1.0 - left / without, margin, next_sign, next_zero)
+
+
+def _descend(
+    model: RobotModel, motion: "_Motion", turns: Array, free: Sequence[int]
+) -> tuple[Array, Array, Array, float, Array]:
+    """Return sign, zero and gain of the best zeros of joints that are free, and the costs.
+
+    The last two are the cost, and that of each trial of each joint that turns.
+    """
+    N, n = motion.q.shape
     sign, zero, gain = np.ones(n), np.zeros(n), np.zeros(n)
-    cost = _cost(model, q, v, a, error, sign, zero)
+    cost, costs = motion.cost(model, sign, zero), np.full((n, len(_TRIALS)), np.inf)
     for _ in range(_SWEEPS):
         moved = False
-        for j in np.flatnonzero(turns):
-            trials = [(s, z) for s in (1.0, -1.0) for z in _ANGLES]
-            best, found = cost, (sign[j], zero[j])
-            for s, z in trials:
+        for j in turns:
+            for k, (s, z) in enumerate(_TRIALS):
                 trial_sign, trial_zero = sign.copy(), zero.copy()
                 trial_sign[j], trial_zero[j] = s, z
-                value = _cost(model, q, v, a, error, trial_sign, trial_zero)
-                if value < best and value < cost + np.log1p(-_GAIN) * len(q):
-                    best, found = value, (s, z)
-            if best < cost:
-                gain[j] += 1.0 - np.exp((best - cost) / len(q))
-                (sign[j], zero[j]), cost, moved = found, best, True
+                costs[j, k] = motion.cost(model, trial_sign, trial_zero)
+            k = int(np.argmin(costs[j]))
+            if j in free and costs[j, k] < cost - np.log1p(CLEAR) * N:
+                gain[j] += 1.0 - np.exp((costs[j, k] - cost) / N)
+                (sign[j], zero[j]), cost, moved = _TRIALS[k], float(costs[j, k]), True
         if not moved:
             break
-    return Encoders(sign, zero, gain)
+    return sign, zero, gain, cost, costs
 
 
-def _smooth(log: Log, count: int) -> tuple[Array, Array, Array, Array]:
-    """Return position, speed, acceleration and error of the loop at some samples of a log."""
+def _smooth(log: Log, count: int, cutoff: float) -> tuple[Array, ...]:
+    """Return the slow motion at some samples of a log: the arrays of ``_Motion``."""
     import scipy.signal  # takes most of a second
 
     dt = float(np.median(np.diff(log.t)))
-    sos = scipy.signal.butter(2, min(_CUTOFF, 0.2 / dt), fs=1.0 / dt, output="sos")
-    q = scipy.signal.sosfiltfilt(sos, log.q, axis=0)
-    error = scipy.signal.sosfiltfilt(sos, log.q_ref - log.q, axis=0)
-    v = np.gradient(q, dt, axis=0)
-    a = np.gradient(v, dt, axis=0)
-    rows = np.linspace(0, len(q) - 1, count).astype(int)
-    return q[rows], v[rows], a[rows], error[rows]
+    fast, slow = (
+        scipy.signal.butter(2, min(f, 0.2 / dt), fs=1.0 / dt, output="sos") for f in (_FAST, cutoff)
+    )
+    v = np.gradient(scipy.signal.sosfiltfilt(fast, log.q, axis=0), dt, axis=0)
+    smooth = [
+        scipy.signal.sosfiltfilt(slow, x, axis=0)
+        for x in (log.q, v, np.gradient(v, dt, axis=0), log.q_ref - log.q, np.tanh(v / _STILL))
+    ]
+    rows = np.linspace(0, len(log.t) - 1, count).astype(int)
+    return tuple(x[rows] for x in smooth)
 
 
-def _cost(
-    model: RobotModel, q: Array, v: Array, a: Array, error: Array, sign: Array, zero: Array
-) -> float:
-    """Return N times the log of what torques, friction and a constant leave of the loops' errors.
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Slow motion at N instants; arrays of shape (N, n)."""
 
-    A joint whose loop would give way to the load does not count the load.
-    """
-    at, rate, change = (sign * x for x in (q, v, a))
-    torque = predict_instants(model, model.standard_parameters(), at + zero, rate, change)
-    total = 0.0
-    for j in range(q.shape[1]):
-        e = sign[j] * error[:, j]
-        plain = np.column_stack(
-            [np.ones_like(e), rate[:, j], np.tanh(rate[:, j] / 0.02), change[:, j]]
-        )
-        columns = np.column_stack([torque[:, j], plain])
-        x, left = _fit(columns, e)
-        if x[0] < 0:
-            _, left = _fit(plain, e)
-        total += len(e) * float(np.log(max(left, 1e-300)))
-    return total
+    q: Array
+    v: Array
+    a: Array
+    error: Array  # of the loops
+    sense: Array  # of friction
+
+    def cost(self, model: RobotModel, sign: Array, zero: Array) -> float:
+        """Return N times the log of what torques, friction and a constant leave of the errors."""
+        left = np.maximum(self.left(model, sign, zero)[0], 1e-300)
+        return len(self.q) * float(np.log(left).sum())
+
+    def left(self, model: RobotModel, sign: Array, zero: Array) -> tuple[Array, Array]:
+        """Return the squares left of each joint's errors, with its torque and without, (n,).
+
+        A joint whose loop would give way to the load does not count the load.
+        """
+        q, v, a = (sign * x for x in (self.q, self.v, self.a))
+        torque = predict_instants(model, model.standard_parameters(), q + zero, v, a)
+        left, without = np.empty((2, len(sign)))
+        for j, own in enumerate(sign):
+            plain = np.column_stack([np.ones(len(q)), self.v[:, j], self.sense[:, j], self.a[:, j]])
+            _, without[j] = _fit(plain, self.error[:, j])
+            x, left[j] = _fit(np.column_stack([own * torque[:, j], plain]), self.error[:, j])
+            if x[0] < 0:
+                left[j] = without[j]
+        return left, without
 
 
 def _fit(columns: Array, e: Array) -> tuple[Array, float]:

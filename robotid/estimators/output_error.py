@@ -21,6 +21,7 @@ from robotid.regressor.factors import Factors, triangle_of
 
 __all__ = ["OutputError", "Residual", "Simulator", "linearised"]
 
+_CAUTIOUS = 1e-3  # damping of a step, with which what nothing tells stays where it is
 _STEPS = 25  # of the damped Gauss-Newton method in a round
 _ROUNDS = 5  # of whitening and noise levels ...
 _SETTLED = 2e-2  # ... until they change by less than that
@@ -213,7 +214,7 @@ class OutputError:
             theta: Parameters that fit best with the starts as they are, shape (c,).
         """
         H, g = self._normal(simulator, self.weights(simulator, theta), theta, frees=True)
-        return _bounded_step(H, g, theta, simulator.lowest, 0.0)
+        return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
 
     def _normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
@@ -231,7 +232,7 @@ class OutputError:
         self, simulator: Simulator, weights: _Weights, theta: Array, close: float
     ) -> tuple[Array, int, bool]:
         """Minimise with given weights; return where it ends, its steps, and whether it settled."""
-        damping, cost = 1e-3, self._cost(simulator, weights, theta)
+        damping, cost = _CAUTIOUS, self._cost(simulator, weights, theta)
         if not np.isfinite(cost):
             raise NotConvergedError(
                 "the loop cannot be simulated with the parameters that the fit begins with; state "

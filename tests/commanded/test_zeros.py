@@ -6,8 +6,10 @@ from helpers.mujoco_plant import plant, recorded
 
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
-from robotid.commanded.zeros import find_encoders
+from robotid.commanded.zeros import CLEAR, find_encoders, parallel_axes
 from robotid.identification.settings import SimulationSettings
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
 
 AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
 SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
@@ -33,6 +35,13 @@ def test_encoders_with_the_zeros_of_the_urdf_keep_them(leg):
     np.testing.assert_array_equal(found.zero, 0.0)
     np.testing.assert_array_equal(found.sign, 1.0)
     np.testing.assert_array_equal(found.gain, 0.0)
+    assert (found.margin[:2] > CLEAR).all()
+    assert 0.0 <= found.margin[2] < CLEAR, "the calf bears little"
+    assert (found.explained[:2] > 0.3).all()
+    # ... and none where the motion is too small to tell
+    middle = leg[1].q.mean(axis=0)
+    small = replace(leg[1], q=middle + 0.2 * (leg[1].q - middle))
+    np.testing.assert_array_equal(find_encoders(leg[0].model, [small]).margin, 0.0)
 
 
 def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
@@ -51,6 +60,21 @@ def test_a_zero_is_found_to_the_grid_and_then_by_the_fit(moved):
     [said] = [f for f in found.findings if f.code == "encoder"]
     assert said.where == "FL_thigh_joint"
     assert said.evidence["zero"] == pytest.approx(AWAY, abs=0.03)
+    assert f"leaves {100 * said.evidence['margin']:.0f} % more" in said.message
+    assert said.evidence["next_zero"] == 0.0, "that of the URDF"
+    [kept] = [f for f in found.findings if f.code == "encoder_kept"]
+    assert kept.where == "FL_hip_joint"
+    assert f"explains {100 * kept.evidence['explained']:.0f} %" in kept.message
+    [open_] = [f for f in found.findings if f.code == "encoder_open"]
+    assert open_.where == "FL_calf_joint"
+    [mirror] = [f for f in found.findings if f.code == "mirror_image"]
+    assert mirror.where == "FL_thigh_joint, FL_calf_joint"
+
+
+def test_parallel_axes_are_found_chain_by_chain(leg):
+    assert parallel_axes(leg[0].model) == [("FL_thigh_joint", "FL_calf_joint")]
+    arm = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"))
+    assert parallel_axes(arm) == [("shoulder_lift_joint", "elbow_joint", "wrist_1_joint")]
 
 
 def test_an_encoder_that_counts_the_other_way_is_turned(leg):
