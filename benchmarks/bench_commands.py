@@ -1,12 +1,16 @@
 """Drives from commands and positions: errors of open loops, intervals, and time.
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
-        [--go2] [--so101] [--rollouts] [--coverage RUNS [--with-torque]]
+        [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque]]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
 rest from the same position and speed. --so101: fitted to three motions of six servos, beside the
-plain baseline of the recording's description. --coverage: MuJoCo rolls out a robot with known
+plain baseline of the recording's description. --arms: recordings without commands, whose torque
+drives the robot: torque rows alone, roll-outs alone, both, each with viscous and Coulomb friction
+and offset; and the last with what friction other windows confirm. The simulated arm is MuJoCo's,
+16 kHz, written at 100 Hz, its torque with noise of 1 % of its size, encoders of 0.05 mrad.
+--coverage: MuJoCo rolls out a robot with known
 drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
 with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. Times are of the processor,
 all threads together, where they do not say otherwise: other loads of the machine add little.
@@ -31,18 +35,24 @@ import mujoco
 from helpers import mujoco_plant
 from mujoco import rollout
 
+from robotid.commanded.driven import driven_log
+from robotid.commanded.errors import run_open_loop
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.unknowns import LoopSimulator, body_unknowns
 from robotid.commands.job import read_job
 from robotid.export.commanded import CommandedDrive, loops_of
+from robotid.identification.evaluation import evaluate_logs
+from robotid.identification.pipeline import identify
 from robotid.identification.settings import SimulationSettings
+from robotid.identification.survey import hold_log
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
 from robotid.robot.drives import AUTO
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, Window
+from robotid.simulation.loops import LoopedRobot, Window, open_loops
 
 FINE = 5e-5  # [s] step of the plant
 STEP = 5e-4  # [s] of our roll-outs beside it
@@ -63,6 +73,7 @@ SYSID_PARAMETERS = (
     ("bias", 0.0, -0.3, 0.3),
 )  # fmt: skip
 
+ARMS = ("ur10e", "kinova_gen3")  # of tests/jobs
 SO101_FITTED = ("chirp_sweep", "multisine", "large_amplitude")
 SO101_PLAIN = {  # [mrad], of the recording's description
     "friction_gravity": (4.4, 8.6, 13.0, 3.9, 3.4, 1.6),
@@ -81,6 +92,7 @@ def main():
     parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
     parser.add_argument("--go2", action="store_true", help="a quadruped, beside mujoco.sysid")
     parser.add_argument("--so101", action="store_true", help="an arm of six servos")
+    parser.add_argument("--arms", action="store_true", help="arms that their torque drives")
     parser.add_argument("--rollouts", action="store_true", help="speed, beside MuJoCo")
     parser.add_argument(
         "--coverage", type=int, metavar="RUNS", help="intervals beside a known truth"
@@ -97,6 +109,7 @@ def main():
     parts = {
         "go2": options.go2 and (lambda: go2(options.sysid_steps)),
         "so101": options.so101 and so101,
+        "arms": options.arms and arms,
         "rollouts": options.rollouts and (lambda: rollouts(0.3 if options.quick else 3.0)),
         "coverage": options.coverage
         and (lambda: coverage(options.robots, options.coverage, with_torque=options.with_torque)),
@@ -319,6 +332,77 @@ def so101():
     print(f"\n{took[0]:.0f} s of the wall, {took[1]:.0f} s of processor; "
           f"{found.fitted.estimate.message}.\n", flush=True)  # fmt: skip
     return {"errors_mrad": rows, "ratio": whole, "by_joint": by_joint, "seconds": list(took)}
+
+
+def arms():
+    """Print what rows of torque, roll-outs and both make of logs kept apart; return the figures."""
+    print("| robot | fitted to | torque missed, N m | 0.5 s position missed, mrad "
+          "| torque, ratio | position, ratio | processor, s |")  # fmt: skip
+    print("|---" * 7 + "|")
+    found = {}
+    for name in ARMS:
+        job = read_job(Path(__file__).parents[1] / "tests" / "jobs" / f"{name}.toml")
+        model = job.model()
+        logs, kept = (
+            [job.read(entry, model) for entry in entries]
+            for entries in (job.identification, job.validation)
+        )
+        found[name] = arm_rows(name, model, logs, kept, job.signals)
+    rng = np.random.default_rng(17)
+    plant = mujoco_plant.plant("arm", rng, delay=0.0)
+    logs = [
+        mujoco_plant.torque_log(plant, rng, duration=d, rate=100.0, noise=5e-5, relative=0.01)
+        for d in (30.0, 10.0)
+    ]
+    signals = SignalSettings(cutoff=10.0)
+    found["simulated"] = arm_rows(
+        "simulated UR5", plant.model, logs[:1], logs[1:], signals, drive_pi(plant)
+    )
+    print("\nRatio: geometric mean over the joints of the error over that of torque rows alone.\n")
+    return found
+
+
+def arm_rows(name, model, logs, kept, signals, truth=None):
+    """Print the rows of one arm; return the figures."""
+    loop, rows, begun = LoopSettings(kind="torque"), {}, time.process_time()
+    linear = identify(model, logs, signals=signals, friction="none", doctor=False)
+    took = time.process_time() - begun
+    ways = {"roll-outs alone": (False, False), "both": (True, False),
+            "both, friction chosen": (True, True)}  # fmt: skip
+    for way, (torques, chooses) in ways.items():
+        begun = time.process_time()
+        settings = SimulationSettings(torques=torques)
+        found = identify_commands(
+            model, logs, kept, loop, settings, signals=signals, chooses=chooses
+        )
+        spent = time.process_time() - begun
+        if not rows:
+            rows["torque rows alone"] = (
+                missed_torque(model, linear.standard, kept, signals), found.kept[0].rows, took
+            )  # fmt: skip
+        missed = missed_torque(found.model, found.standard, kept, signals)
+        rows[way] = (missed, found.kept[0].rmse, spent)
+    if truth is not None:
+        log = driven_log(model, kept[0], signals)
+        run = run_open_loop(LoopedRobot(model), open_loops(model, truth), log)
+        rows["the truth"] = (missed_torque(model, truth, kept, signals), run.rmse, 0.0)
+    plain = rows["torque rows alone"]
+    for way, (torque, position, spent) in rows.items():
+        print(f"| {name} | {way} | {' '.join(f'{x:.2f}' for x in torque)} | "
+              f"{' '.join(f'{1e3 * x:.1f}' for x in position)} | "
+              f"{geometric_mean(torque / plain[0]):.2f} | "
+              f"{geometric_mean(position / plain[1]):.2f} | {spent:.0f} |", flush=True)  # fmt: skip
+    return {
+        way: {"torque": list(own[0]), "position": list(own[1]), "seconds": own[2]}
+        for way, own in rows.items()
+    }
+
+
+def missed_torque(model, pi, logs, signals):
+    """Return the root mean square of the torque that parameters miss in logs, joint by joint."""
+    kept = [hold_log(model, log, signals) for log in logs]
+    _, [found] = evaluate_logs((), kept, {"own": pi}, model.standard_parameters())
+    return np.array([found.metrics["own"].per_joint[joint].rmse for joint in model.joints])
 
 
 def rollouts(seconds):

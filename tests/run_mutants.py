@@ -75,15 +75,25 @@ def try_fault(fault: dict[str, Any]) -> bool:
         for part in COPIED:
             source, target = ROOT / part, tree / part
             if source.is_dir():
-                shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(source, target)
             else:
                 shutil.copy(source, target)
         faulty = tree / fault["file"]
         faulty.write_text(faulty.read_text().replace(fault["text"], fault["faulty"]))
+        forget(tree, faulty)
         result = outcome(tree, fault["tests"])
     seconds = time.monotonic() - start
     print(f"{result:7} {seconds:4.0f} s  {fault['file']}: {fault['faulty']!r}", flush=True)
     return result == "caught"
+
+
+def forget(tree: Path, faulty: Path) -> None:
+    """Remove what was compiled with the text that a fault replaces."""
+    compiled = [*faulty.parent.glob(f"__pycache__/{faulty.stem}.*")]
+    if faulty.stem.endswith("lanes"):  # Numba's; one of these files is compiled into the others
+        compiled += [*tree.rglob("*.nbi"), *tree.rglob("*.nbc")]
+    for path in compiled:
+        path.unlink(missing_ok=True)
 
 
 def outcome(tree: Path, tests: list[str]) -> str:

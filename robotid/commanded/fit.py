@@ -6,28 +6,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.driven import identified_rows, torque_rows
+from robotid.commanded.errors import DRIFTS
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
-from robotid.commanded.unknowns import LoopSimulator, TorqueRows, Unknown, body_unknowns
+from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
 from robotid.commanded.zeros import Encoders, find_encoders, same_encoders
 from robotid.doctor.command_channels import largest_speeds
 from robotid.estimators.estimator import Estimate
 from robotid.estimators.output_error import OutputError
-from robotid.identification.pipeline import identify
+from robotid.identification.pipeline import Identification
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
 from robotid.robot.drives import DriveTerm, Viscous
 from robotid.robot.mass_matrix import joint_mass_matrices
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows
+from robotid.simulation.loops import LoopedRobot, Loops, Window, cut_windows, open_loops
 from robotid.simulation.settings import PerJoint, by_joint
 
 __all__ = ["STAGES", "Fitted", "fit_loops", "stated_loops", "with_terms"]
 
 #: What the fit of a job does, from files to files.
 STAGES = (
-    "reading logs", "trying plain loops", "fitting loops", "trying friction", "testing", "writing"
+    "reading logs", "fitting torques", "trying plain loops", "fitting loops", "trying friction",
+    "testing", "writing",
 )  # fmt: skip
 
 
@@ -42,6 +46,8 @@ _LIMITED = 0.8  # of the largest torque that was asked for, that a limit begins 
 _WHITE = 2.0  # whitening ends at so many times the rate at which a loop follows
 _FEW = 12  # windows that are fitted first, of many
 _STARTS = 3  # fits with better starts of the windows
+_WINDOW, _LEAD = 2.5, 0.6  # [s] of what follows commands, if not stated
+_BOTH = 2.0  # one torque's noise is in its rows and in what it drives: each counts by half
 _PASSES = 2  # of choosing terms and fitting again
 
 
@@ -52,18 +58,18 @@ class Fitted:
     Attributes:
         simulator: The robot with its unknowns, and the windows.
         estimate: The unknowns' values.
-        plain: The plain model, joint by joint.
+        plain: The plain model, joint by joint; None where the logged torque drives the robot.
         encoders: How encoders stand to the URDF's joints.
         tried: Which terms were tried, and what they gained.
-        groups: The group of each joint.
+        linear: What the rows of torque tell by themselves, where the torque drives the robot.
     """
 
     simulator: LoopSimulator
     estimate: Estimate
-    plain: SecondOrder
+    plain: SecondOrder | None
     encoders: Encoders
     tried: tuple[Tried, ...]
-    groups: tuple[str, ...]
+    linear: Identification | None = None
 
     @property
     def loops(self) -> Loops:
@@ -77,6 +83,7 @@ def fit_loops(
     loop: LoopSettings,
     settings: SimulationSettings,
     *,
+    signals: SignalSettings | None = None,
     chooses: bool = True,
     progress: ProgressCallback = ignore_progress,
 ) -> Fitted:
@@ -87,6 +94,7 @@ def fit_loops(
         logs: The logs, of its joints in its order, with commands.
         loop: What is known of the loops.
         settings: Windows, spread of bodies, whitening.
+        signals: How the torques of logs become rows.
         chooses: Whether further friction terms are tried.
         progress: Told of the stages.
 
@@ -95,10 +103,76 @@ def fit_loops(
         NotConvergedError: If nothing that is tried can be rolled out.
         SettingsError: If a setting does not fit the robot.
     """
+    if loop.kind == "torque":
+        begun = _begun_by_torque(model, logs, loop, settings, signals, progress)
+    else:
+        begun = _begun_by_commands(model, logs, loop, settings, signals, progress)
+    simulator, estimator = begun.simulator, begun.estimator
+    step = max(1, len(simulator.windows) // _FEW)
+    few = replace(simulator, windows=simulator.windows[::step])
+    theta = replace(estimator, rounds=1).fit(few, begun.theta).theta
+    for _ in range(_STARTS):
+        simulator = simulator.begun_better(theta)
+        estimate = estimator.fit(simulator, theta)
+        theta = estimator.joint_step(simulator, estimate.theta)
+        if begun.linear is not None and simulator.torque is not None:
+            estimator = replace(estimator, inflation=_BOTH * estimate.details["inflation"])
+    tried: list[Tried] = []
+    for _ in range(_PASSES if chooses else 0):
+        report_stage(progress, "trying friction", STAGES)
+        offered = [
+            set_
+            for set_ in candidates(simulator, begun.torque)
+            if set_[0].name not in simulator.names
+        ]
+        wide, theta = _with(simulator, estimate.theta, offered)
+        found = choose(wide, theta, offered, replace(estimator, inflation=1.0))
+        tried = [*(t for t in tried if t.is_chosen), *found]
+        taken = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
+        if not taken:
+            break
+        report_stage(progress, "fitting loops", STAGES)
+        simulator, theta = _with(simulator, estimate.theta, taken)
+        if simulator.torque is not None:
+            own = with_terms(model, simulator.base)
+            rows = torque_rows(identified_rows(own, logs, signals), begun.share)
+            simulator = replace(simulator, torque=rows)
+        estimate = estimator.fit(simulator, theta)
+    return Fitted(simulator, estimate, begun.plain, begun.encoders, tuple(tried), begun.linear)
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """What a fit begins with."""
+
+    simulator: LoopSimulator
+    theta: Array  # of its unknowns
+    estimator: OutputError
+    torque: Array  # usual ones, shape (n,) [N m or N]
+    encoders: Encoders
+    plain: SecondOrder | None = None
+    linear: Identification | None = None
+
+    @property
+    def share(self) -> float:
+        """How often each row of torque is counted, in rows and roll-outs."""
+        return 1.0 if self.linear is None else _BOTH
+
+
+def _begun_by_commands(
+    model: RobotModel,
+    logs: Sequence[Log],
+    loop: LoopSettings,
+    settings: SimulationSettings,
+    signals: SignalSettings | None,
+    progress: ProgressCallback,
+) -> _Begun:
+    """Return loops on commands, begun with a plain loop of each joint."""
     robot = LoopedRobot(model, step=settings.step)
     encoders = find_encoders(model, logs) if loop.zeros == "find" else same_encoders(model)
     logs = [log.turned(encoders.sign) for log in logs]
-    windows = tuple(w for log in logs for w in cut_windows(log, settings.window, settings.lead))
+    length, lead = settings.window or _WINDOW, _LEAD if settings.lead is None else settings.lead
+    windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     stated = replace(stated_loops(model, loop), zero=encoders.zero)
     report_stage(progress, "trying plain loops", STAGES)
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
@@ -123,34 +197,43 @@ def fit_loops(
     simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
     report_stage(progress, "fitting loops", STAGES)
     if weighs:
-        simulator = replace(simulator, torque=_torque_rows(model, base, logs))
-    few = replace(simulator, windows=windows[:: max(1, len(windows) // _FEW)])
-    begun = replace(estimator, rounds=1).fit(few, simulator.prior)
-    theta = begun.theta
-    for _ in range(_STARTS):
-        simulator = simulator.begun_better(theta)
-        estimate = estimator.fit(simulator, theta)
-        theta = estimator.joint_step(simulator, estimate.theta)
-    tried: list[Tried] = []
-    for _ in range(_PASSES if chooses else 0):
-        report_stage(progress, "trying friction", STAGES)
-        offered = [
-            set_
-            for set_ in candidates(simulator, usual.torque)
-            if set_[0].name not in simulator.names
-        ]
-        wide, theta = _with(simulator, estimate.theta, offered)
-        found = choose(wide, theta, offered, estimator)
-        tried = [*(t for t in tried if t.is_chosen), *found]
-        taken = [set_ for set_, t in zip(offered, found, strict=True) if t.is_chosen]
-        if not taken:
-            break
-        report_stage(progress, "fitting loops", STAGES)
-        simulator, theta = _with(simulator, estimate.theta, taken)
-        if weighs:
-            simulator = replace(simulator, torque=_torque_rows(model, simulator.base, logs))
-        estimate = estimator.fit(simulator, theta)
-    return Fitted(simulator, estimate, plain, encoders, tuple(tried), tuple(groups))
+        rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
+        simulator = replace(simulator, torque=rows)
+    return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, plain)
+
+
+def _begun_by_torque(
+    model: RobotModel,
+    logs: Sequence[Log],
+    loop: LoopSettings,
+    settings: SimulationSettings,
+    signals: SignalSettings | None,
+    progress: ProgressCallback,
+) -> _Begun:
+    """Return a robot that the logged torque drives, begun with what its rows tell by themselves.
+
+    Where these rows weigh, bodies change about what they tell; else about the URDF's, or stay.
+    """
+    report_stage(progress, "fitting torques", STAGES)
+    found = identified_rows(model, logs, signals)
+    linear = open_loops(model, found.standard)
+    is_urdf = not (settings.torques and settings.bodies)
+    base = replace(linear, bodies=stated_loops(model, loop).bodies) if is_urdf else linear
+    robot = LoopedRobot(model, step=settings.step)
+    length, lead = settings.window or DRIFTS, settings.lead or 0.0
+    windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
+    usual = _usual_of_torques(model, found.standard, base.armature, windows)
+    groups = groups_of(loop, model.joints, range(len(model.joints)))
+    none = np.zeros(len(groups), dtype=bool)
+    unknowns = _unknowns(model, loop, groups, base, usual, tells_kd=False, finds_limit=none)
+    unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
+    simulator = LoopSimulator(robot, windows, base, tuple(unknowns))
+    report_stage(progress, "fitting loops", STAGES)
+    if settings.torques:
+        simulator = replace(simulator, torque=torque_rows(found, _BOTH))
+    estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
+    encoders = same_encoders(model)
+    return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, linear=found)
 
 
 def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) -> Array:
@@ -188,17 +271,6 @@ def stated_loops(model: RobotModel, loop: LoopSettings) -> Loops:
         values=np.zeros(0),
         rate=loop.rate,
     )
-
-
-def _torque_rows(model: RobotModel, base: Loops, logs: Sequence[Log]) -> TorqueRows:
-    """Return what the torques of logs come down to, for the terms of loops.
-
-    Their weight is that of rows as independent as the scatter of stretches shows them to be.
-    """
-    own = with_terms(model, base)
-    found = identify(own, logs, friction="none", doctor=False)
-    weight = found.wls.sigma * np.sqrt(max(found.errors.inflation, 1.0))
-    return TorqueRows(own, found.factors.weighted(weight), found.mapping.K)
 
 
 def _zeros(model: RobotModel, encoders: Encoders) -> list[Unknown]:
@@ -266,20 +338,41 @@ def _usual(
     """
     model = robot.model
     q = np.concatenate([w.log.q[w.counted] for w in windows])
-    steps = np.concatenate([np.diff(w.log.q[w.counted], axis=0) for w in windows])
-    dt = float(np.median(np.diff(windows[0].log.t)))
-    poses = q[:: max(1, len(q) // _POSES)]
-    M = joint_mass_matrices(model, model.standard_parameters(), poses)
-    bodies = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
+    bodies = _inertia(model, model.standard_parameters(), windows)
     measure = np.maximum(bodies, _LIGHTEST * bodies.max()) / _SHARE
     scale = np.where(has_gain, 1.0, measure / plain.inertia)
-    speed = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
     inertia = np.maximum(plain.inertia * scale, bodies)  # friction may hide it from a plain loop
     error = np.concatenate([w.log.q_ref[w.counted] for w in windows]) - q  # type: ignore[index]
     asked = _LIMITED * plain.loops.kp * np.abs(error).max(axis=0)
     taken = plain.friction("viscous") * top + plain.friction("coulomb")
     largest = scale * np.where(top > 0.0, np.minimum(taken, asked), asked)
-    return _Usual(inertia, bodies, plain.torque * scale, largest, speed, scale)
+    return _Usual(inertia, bodies, plain.torque * scale, largest, _speed(windows), scale)
+
+
+def _usual_of_torques(
+    model: RobotModel, pi: Array, armature: Array, windows: Sequence[Window]
+) -> _Usual:
+    """Return usual sizes where torques are logged and no loop is closed."""
+    tau = np.concatenate([w.log.tau[w.counted] for w in windows])
+    torque = np.maximum(np.sqrt(np.mean(tau**2, axis=0)), 1e-6)
+    inertia, one = _inertia(model, pi, windows), np.ones(len(armature))
+    return _Usual(inertia, inertia - armature, torque, np.inf * one, _speed(windows), one)
+
+
+def _inertia(model: RobotModel, pi: Array, windows: Sequence[Window]) -> Array:
+    """Return the usual inertia that each joint moves, shape (n,)."""
+    q = np.concatenate([w.log.q[w.counted] for w in windows])
+    M = joint_mass_matrices(model, pi, q[:: max(1, len(q) // _POSES)])
+    usual: Array = np.median(np.diagonal(M, axis1=1, axis2=2), axis=0)
+    return usual
+
+
+def _speed(windows: Sequence[Window]) -> Array:
+    """Return the usual speed of each joint, shape (n,)."""
+    steps = np.concatenate([np.diff(w.log.q[w.counted], axis=0) for w in windows])
+    dt = float(np.median(np.diff(windows[0].log.t)))
+    speed: Array = np.maximum(np.sqrt(np.mean(steps**2, axis=0)) / dt, 1e-6)
+    return speed
 
 
 def _begin(
@@ -322,6 +415,7 @@ def _unknowns(
     members: dict[str, list[int]] = {}
     for j, group in enumerate(groups):
         members.setdefault(group, []).append(j)
+    is_closed = np.full(len(groups), loop.kind != "torque")
     # a limit is a setting of each drive, a delay mostly the bus's and the controller's
     sharing: dict[str, dict[str, list[int]]] = {
         "limit": {joint: [j] for j, joint in enumerate(model.joints)}
@@ -330,10 +424,10 @@ def _unknowns(
         sharing["delay"] = {"robot": [*range(len(groups))]}
     open_ = {
         "armature": np.full(len(groups), "armature" in model.layout.terms),
-        "kp": ~_is_stated(loop.kp, model),
+        "kp": ~_is_stated(loop.kp, model) & is_closed,
         "kd": ~_is_stated(loop.kd, model) & tells_kd,
         "limit": finds_limit,
-        "delay": ~_is_stated(loop.delay, model),
+        "delay": ~_is_stated(loop.delay, model) & is_closed,
     }
     spread = {
         "armature": usual.inertia,

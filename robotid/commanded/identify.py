@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.driven import driven_log
 from robotid.commanded.errors import OpenLoop, run_open_loop
 from robotid.commanded.fit import STAGES, Fitted, fit_loops, stated_loops, with_terms
 from robotid.commanded.open_loop_verdict import judge_open_loops
@@ -18,9 +19,10 @@ from robotid.findings import Finding, by_severity, listed
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import Verdict, alarming
 from robotid.logs.data import Log
+from robotid.logs.settings import SignalSettings
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import Loops
+from robotid.simulation.loops import Loops, open_loops
 
 __all__ = ["Commanded", "identify_commands", "with_gravity"]
 
@@ -112,6 +114,7 @@ def identify_commands(
     loop: LoopSettings,
     settings: SimulationSettings,
     *,
+    signals: SignalSettings | None = None,
     chooses: bool = True,
     examined: Sequence[Finding] = (),
     ignore: Sequence[str] = (),
@@ -121,10 +124,12 @@ def identify_commands(
 
     Args:
         model: The robot.
-        logs: Logs to fit, of its joints in its order, with commands.
+        logs: Logs to fit, of its joints in its order, with commands, or with torques if these
+            drive the robot.
         kept: Logs kept apart.
         loop: What is known of the loops.
         settings: The estimator's.
+        signals: How torques become rows, and how late they are.
         chooses: Whether further friction is tried.
         examined: What the doctor found in the logs.
         ignore: Codes of its errors that you know better.
@@ -138,25 +143,28 @@ def identify_commands(
     """
     if not logs:
         raise DataError("no log was given; at least one is needed to identify anything")
+    if loop.kind == "torque":
+        told = signals or SignalSettings()
+        logs, kept = ([driven_log(model, log, told) for log in part] for part in (logs, kept))
     for log in (*logs, *kept):
         if log.q_ref is None:
             raise DataError(
                 f"{log.name} has no commands, which the estimator 'simulation' follows; record "
-                "columns qref_ of each joint, or identify from torques with another estimator"
+                "columns qref_ of each joint, or have its torque drive the robot: [controller] "
+                "kind = 'torque'"
             )
     if loop.gravity_compensation:
         logs, kept = ([with_gravity(model, log) for log in part] for part in (logs, kept))
-    fitted = fit_loops(model, logs, loop, settings, chooses=chooses, progress=progress)
+    fitted = fit_loops(
+        model, logs, loop, settings, signals=signals, chooses=chooses, progress=progress
+    )
     report_stage(progress, "testing", STAGES)
-    stated = stated_loops(model, loop)
-    has_gains = loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns)
-    urdf = _urdf(model, stated) if has_gains else None
     sign = fitted.encoders.sign
     runs = [
         [
             run_open_loop(
                 fitted.simulator.robot, fitted.loops, log.turned(sign),
-                urdf=urdf, plain=fitted.plain.loops,
+                **_others(model, loop, fitted),
             )
             for log in part
         ]
@@ -175,10 +183,20 @@ def identify_commands(
     return replace(found, findings=by_severity([*examined, *_findings(found)]))
 
 
-def _urdf(model: RobotModel, stated: Loops) -> Loops:
-    """Return the URDF with the stated gains: no friction, and a rotor that weighs nothing."""
-    n = len(model.joints)
-    return replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
+def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
+    """Return plainer models, as ``run_open_loop`` takes them.
+
+    With the stated gains the URDF has no friction, and rotors that weigh nothing.
+    """
+    if fitted.linear is not None:
+        driven, found = fitted.linear.urdf_with_drives, fitted.linear.standard
+        return {"urdf": open_loops(model, driven), "rows": open_loops(model, found)}
+    others = {} if fitted.plain is None else {"plain": fitted.plain.loops}
+    if loop.kp is not None and not any(u.what == "kp" for u in fitted.simulator.unknowns):
+        n, stated = len(model.joints), stated_loops(model, loop)
+        bare = replace(stated, terms=((),) * n, values=np.zeros(0), armature=np.full(n, 1e-9))
+        others["urdf"] = bare
+    return others
 
 
 def with_gravity(model: RobotModel, log: Log) -> Log:

@@ -12,6 +12,7 @@ __all__ = ["GOOD", "POOR", "judge_open_loops"]
 
 #: Share of its motion that the open loop of a joint misses on logs kept apart: well, not usable.
 GOOD, POOR = 0.05, 0.3
+_URDF = {False: "the URDF with the stated gains", True: "the URDF with fitted drives"}
 _BEATEN = 1.05  # a plainer model that misses this many times less is better
 
 
@@ -68,7 +69,9 @@ def judge_open_loops(
 
 def _is_told(run: OpenLoop, j: int) -> bool:
     """Return whether a log tells a joint to move: at rest, its errors are no share of a motion."""
-    return run.log.q_ref is not None and bool(np.ptp(run.log.q_ref[:, j]) > 0)
+    if run.steady is not None or run.log.q_ref is None:
+        return True  # by torques
+    return bool(np.ptp(run.log.q_ref[:, j]) > 0)
 
 
 def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) -> JointVerdict:
@@ -80,7 +83,9 @@ def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) ->
         for name, others in (
             ("the command itself", [run.command for run in runs]),
             ("the plain model of second order", [run.second_order for run in runs]),
-            ("the URDF with the stated gains", [run.urdf for run in runs]),
+            (_URDF[runs[0].steady is not None], [run.urdf for run in runs]),
+            ("what the torques tell by themselves", [run.rows for run in runs]),
+            ("going on at the speed of the start", [run.steady for run in runs]),
         )
         if all(other is not None for other in others)
         and _mean(run.rmse[j] for run in runs)

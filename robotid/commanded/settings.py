@@ -1,7 +1,7 @@
 """The loop of the drives as a job states it: what is known of it, and what is to be found."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 from robotid._settings import POSITIVE, Settings, setting
@@ -12,14 +12,24 @@ from robotid.simulation.settings import GAIN, LEVEL, PerJoint
 
 __all__ = ["LoopSettings", "groups_of"]
 
+#: What a loop has that a logged torque has not.
+_OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
+
 
 @dataclass(frozen=True)
 class LoopSettings(Settings):
-    """The controller of logs with commands, torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref."""
+    """The controller of logs with commands, torque = kp (q_ref - q) + kd (v_ref - v) + tau_ref.
+
+    With kind "torque" no loop is closed: the logged torque itself drives the robot.
+    """
 
     _table: ClassVar[str] = "controller"
 
-    kind: str = setting("pd", "how the loop is closed", among=("pd",))
+    kind: str = setting(
+        "pd", "how the loop is closed: by gains, on the commands of the log; or 'torque', not at "
+        "all: the torque of the log drives the robot, which then needs no commands",
+        among=("pd", "torque"),
+    )  # fmt: skip
     kp: PerJoint | None = setting(
         None, "gain of the position [N m/rad or N/m], for all joints or by joint; found if not "
         "stated, measured by the bodies' gravity and inertia", **GAIN,
@@ -59,6 +69,19 @@ class LoopSettings(Settings):
         "urdf", "zero and sign of the encoders: as the URDF has them, or found, from gravity",
         among=("urdf", "find"),
     )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind != "torque":
+            return
+        for each in fields(self):
+            if each.name in _OF_LOOPS and getattr(self, each.name) != each.default:
+                how = " A late torque: [signals] torque_delay." if each.name == "delay" else ""
+                raise SettingsError(
+                    f"[controller] {each.name} is {getattr(self, each.name)!r}, but with kind = "
+                    "'torque' the torque of the log drives the robot and no loop is closed; "
+                    f"leave {each.name} out, or set kind = 'pd'.{how}"
+                )
 
 
 def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any]) -> list[str]:

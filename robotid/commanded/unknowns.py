@@ -238,18 +238,28 @@ class LoopSimulator:
                     slopes[row, k] = 1.0
         return pi, slopes
 
-    def residuals(self, theta: Array, *, with_slopes: bool) -> list[Residual]:
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> list[Residual]:
         """Return what is measured less what comes out, window by window; see ``Simulator``.
 
         Args:
             theta: Values of the unknowns, shape (c,).
             with_slopes: Whether derivatives are wanted.
+            with_starts: Whether those by the starts of windows are, without the others.
 
         Raises:
             NotConvergedError: If a step has no solution.
         """
         everything = np.arange(len(self.base.kp))
         none = np.array([], dtype=int)
+        if with_starts and not with_slopes:
+            outs = self.robot.roll_out(self.loops(theta), self.windows, self._starts())
+            return [
+                Residual(_error(out)[:, joints], None, joints, none, slopes)
+                for out in outs
+                for joints, _, slopes in out.slopes
+            ]
         if not with_slopes:
             return [Residual(_error(out), None, everything, none) for out in self.roll_out(theta)]
         loops, (_, directions) = self.loops(theta), self._bodies(theta)

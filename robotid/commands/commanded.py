@@ -5,6 +5,7 @@ from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
 from robotid._typing import ProgressCallback, ignore_progress, report_stage
+from robotid.commanded.driven import driven_log
 from robotid.commanded.fit import STAGES
 from robotid.commanded.identify import Commanded, identify_commands, with_gravity
 from robotid.commands.job import Job, LogEntry
@@ -16,6 +17,7 @@ from robotid.identification.advice import Origin
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import check_ignored
 from robotid.logs.data import Log
+from robotid.logs.read import Needs
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.robot.drives import AUTO
 
@@ -50,13 +52,14 @@ def run_commanded(
     sidecar = str(Path(name).with_suffix(".drive.json"))
     check_folder(target, ["result.json", "report.html", name, sidecar])
     logs, kept = (
-        [job.read(entry, model, needs="commands") for entry in entries]
+        [job.read(entry, model, needs=_needed(job)) for entry in entries]
         for entries in (job.identification, job.validation)
     )
     check_ignored(job.ignore)
     found = identify_commands(
-        model, logs, kept, job.controller, job.estimator, chooses=AUTO in job.terms,
-        examined=diagnose(model, logs, kept, job.signals), ignore=job.ignore, progress=told,
+        model, logs, kept, job.controller, job.estimator, signals=job.signals,
+        chooses=AUTO in job.terms, examined=diagnose(model, logs, kept, job.signals),
+        ignore=job.ignore, progress=told,
     )  # fmt: skip
     report_stage(told, "writing", STAGES)
     outputs = {"urdf": name, "sidecar": sidecar} | ({"report": "report.html"} if job.report else {})
@@ -80,6 +83,8 @@ def run_commanded(
 def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     """Return a log of commands as its robot hears them, the controller's own torque included.
 
+    Where its torque drives the robot, that is what it hears.
+
     Args:
         job: The job of the result.
         entry: Which log.
@@ -88,8 +93,15 @@ def log_of_commands(job: Job, entry: LogEntry, result: Result) -> Log:
     Raises:
         DataError: If the file cannot be used, or has no commands.
     """
-    log = job.read(entry, result.robot, needs="commands")
+    log = job.read(entry, result.robot, needs=_needed(job))
+    if job.controller.kind == "torque":
+        return driven_log(result.robot, log, job.signals)
     return with_gravity(job.model(), log) if job.controller.gravity_compensation else log
+
+
+def _needed(job: Job) -> Needs:
+    """Return what a log of the job must have beside positions."""
+    return "torque" if job.controller.kind == "torque" else "commands"
 
 
 def followed(found: Commanded) -> list[Followed]:
@@ -103,7 +115,6 @@ def followed(found: Commanded) -> list[Followed]:
         for run in runs:
             t = run.log.t
             name = f"{run.log.name}, {t[0]:.4g} to {t[-1]:.4g} s"
-            q_ref = run.log.q_ref
-            if q_ref is not None:
-                shown.append(Followed(name, is_kept, t, q_ref, run.log.q, run.q))
+            q_ref = None if run.command is None else run.log.q_ref
+            shown.append(Followed(name, is_kept, t, q_ref, run.log.q, run.q))
     return shown

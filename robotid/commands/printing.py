@@ -185,11 +185,18 @@ def _print_commanded(result: dict[str, Any], *, is_verbose: bool) -> None:
 
 def _print_open_loop(run: Mapping[str, Any], before: str = "") -> None:
     """Print how far open loops run from a log, beside plainer models."""
+    from robotid.commanded.errors import DRIFTS  # imports numpy
+
     kinds = {"rmse": "open loop", "second_order_rmse": "2nd order", "urdf_rmse": "URDF",
-             "command_rmse": "command"}  # fmt: skip
+             "rows_rmse": "torques alone", "command_rmse": "command",
+             "steady_rmse": "same speed"}  # fmt: skip
     joints = run["per_joint"]
-    kinds = {k: v for k, v in kinds.items() if any(own[k] is not None for own in joints.values())}
-    say(f"\n{before}{_window(Path(run['log']).name or 'log', run)}, position missed", "  ")
+    kinds = {
+        k: v for k, v in kinds.items() if any(own.get(k) is not None for own in joints.values())
+    }
+    is_driven = any("steady_rmse" in own for own in joints.values())
+    over = f" over {DRIFTS:g} s" if is_driven else ""
+    say(f"\n{before}{_window(Path(run['log']).name or 'log', run)}, position missed{over}", "  ")
     rows = []
     for joint, own in joints.items():
         shown = ("-" if own[key] is None else f"{1e3 * own[key]:.2f}" for key in kinds)

@@ -88,7 +88,7 @@ def read_findings(paths: Sequence[str | Path]) -> Findings:
             label = name if name not in results else f"{name} {len(results) + 1}"
             loaded = load_result(file)
             results[label] = loaded.content
-            if "simulation" in loaded.content:
+            if loaded.commanded:
                 commanded[label] = loaded
     if len(tracks) > 1:
         raise DataError(f"{len(tracks)} tracks were given; a replay shows one")

@@ -5,10 +5,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from robotid._files import check_file, file_sha256
 from robotid._typing import ProgressCallback, report_stage
+from robotid.commanded.errors import run_open_loop
 from robotid.commands.commanded import log_of_commands
 from robotid.commands.identify import identify_job
 from robotid.commands.job import Job, job_from_settings
@@ -19,6 +18,7 @@ from robotid.identification.advice import Origin
 from robotid.identification.pipeline import Identification
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.report.document import write_report
+from robotid.simulation.loops import LoopedRobot, open_loops
 from robotid.versions import versions
 from robotid.workers.plan import WorkPlan
 
@@ -99,7 +99,12 @@ def followed_logs(result: Result, job: Job) -> list[Followed]:
         for entry in entries:
             log = log_of_commands(job, entry, result)
             name = f"{entry.path.name}, {log.t[0]:.4g} to {log.t[-1]:.4g} s"
-            q_ref, q_sim = np.asarray(log.q_ref), result.follow_commands(log)
+            if result.commanded:
+                q_ref, q_sim = log.q_ref, result.follow_commands(log)
+            else:
+                model, pi = result.identified
+                run = run_open_loop(LoopedRobot(model), open_loops(model, pi), log)
+                q_ref, q_sim = None, run.q
             found.append(Followed(name, is_kept, log.t, q_ref, log.q, q_sim))
     return found
 

@@ -37,7 +37,7 @@ from robotid.identification.survey import SurveyedLog
 from robotid.identification.verdict import Doubt, Verdict, alarming, doubts_of, judge
 from robotid.logs.data import Log
 from robotid.robot.model import RobotModel
-from robotid.simulation.loops import LoopedRobot
+from robotid.simulation.loops import LoopedRobot, open_loops
 
 __all__ = ["validate_result"]
 
@@ -90,6 +90,7 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     model, pi = loaded.identified
     drives, signs = loaded.commanded, loaded.content["simulation"]["signs"]
     sign = np.array([signs[joint] for joint in model.joints])
+    loops = loops_of(model, pi, drives) if drives else open_loops(model, pi)
     robot, runs, logs = LoopedRobot(model), [], []
     loops = loops_of(model, pi, drives, loaded.rate)
     for entry in entries:

@@ -7,7 +7,7 @@ beside what drifts.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -73,12 +73,15 @@ class Simulator(Protocol):
     @property
     def lowest(self) -> Array: ...
 
-    def residuals(self, theta: Array, *, with_slopes: bool) -> Sequence[Residual]:
+    def residuals(
+        self, theta: Array, *, with_slopes: bool, with_starts: bool = False
+    ) -> Sequence[Residual]:
         """Return what is measured less what is simulated, window by window.
 
         Args:
             theta: Parameters, shape (c,).
             with_slopes: Whether derivatives are wanted.
+            with_starts: Whether those by the starts of windows are, without the others.
 
         Raises:
             NotConvergedError: If it cannot be simulated with these parameters.
@@ -123,6 +126,10 @@ class OutputError:
             the loop's own, whitening takes away what the loop shows. 0.95 if None.
         steps: Most steps in a round.
         rounds: Most rounds.
+        inflation: By how much larger the variance of residuals counts, which whitening does not
+            make independent: beside further rows it says how both weigh.
+        frees: Whether the starts of windows move with the parameters, to first order, in each step:
+            wanted where nothing in a window makes up for a wrong start.
         progress: Told of the steps.
 
     References:
@@ -133,6 +140,8 @@ class OutputError:
     most: Array | None = None
     steps: int = _STEPS
     rounds: int = _ROUNDS
+    inflation: float = 1.0
+    frees: bool = False
     progress: ProgressCallback = field(default=ignore_progress)
 
     def fit(self, simulator: Simulator, start: Array) -> Estimate:
@@ -166,7 +175,9 @@ class OutputError:
             simulator: What rolls out.
             theta: Parameters, shape (c,).
         """
-        found = simulator.residuals(theta, with_slopes=False)
+        found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
+        if self.frees:
+            found = [replace(r, e=_freed(r)) for r in found]
         n = 1 + max(int(r.joints.max()) for r in found)
         rho, sigma = np.zeros(n), np.ones(n)
         most = np.full(n, _MOST_RHO) if self.most is None else self.most
@@ -177,16 +188,20 @@ class OutputError:
                 rho[j] = np.clip(along / max(_squares(x[:-1] for x in own), 1e-300), 0, most[j])
             size = sum(len(x) - 1 for x in own)
             level = np.sqrt(_squares(x[1:] - rho[j] * x[:-1] for x in own) / max(size, 1))
-            sigma[j] = max(level, 1e-12)
+            sigma[j] = max(level, 1e-12) * np.sqrt(self.inflation)
         return _Weights(rho, sigma)
 
     def _cost(self, simulator: Simulator, weights: _Weights, theta: Array) -> float:
         """Return the cost; infinite where it cannot be simulated."""
         try:
-            found = simulator.residuals(theta, with_slopes=False)
+            found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
         except NotConvergedError:
             return np.inf  # a step that leads there is too long
-        cost = _squares(weights.whiten(r.e, r.joints) for r in found)
+        cost = 0.0
+        for r in found:
+            b = weights.whiten(r.e, r.joints).reshape(-1)
+            U = _by_start(r, weights) if self.frees else np.zeros((len(b), 0))
+            cost += float(b @ b) - float(np.sum((U.T @ b) ** 2))
         cost += float(np.sum(((theta - simulator.prior) / simulator.prior_std) ** 2))
         cost += float(np.sum(simulator.rows(theta)[1] ** 2))
         return cost if np.isfinite(cost) else np.inf
@@ -226,7 +241,7 @@ class OutputError:
             )
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
-            H, g = self._normal(simulator, weights, theta)
+            H, g = self._normal(simulator, weights, theta, frees=self.frees)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.lowest, damping)
                 new = self._cost(simulator, weights, trial)
@@ -282,7 +297,7 @@ class OutputError:
             theta=theta,
             covariance=covariance,
             names=simulator.names,
-            sigma=weights.sigma,
+            sigma=weights.sigma / np.sqrt(self.inflation),
             rank=len(theta) - len(undetermined),
             condition=float(np.sqrt(values[-1] / max(values[0], 1e-300))),
             undetermined=undetermined,
@@ -292,7 +307,7 @@ class OutputError:
             prior_std=simulator.prior_std,
             details={
                 "correlation": weights.rho,
-                "inflation": inflation,
+                "inflation": inflation * self.inflation,
                 "freedom": freedom,
                 "at_bound": tuple(
                     name
@@ -326,12 +341,31 @@ def linearised(
         b = weights.whiten(r.e, r.joints)
         A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
         b = b.reshape(-1)
-        if frees and r.by_start is not None:
-            G = weights.whiten(r.by_start, r.joints).reshape(b.size, -1)
-            U, sizes, _ = np.linalg.svd(G, full_matrices=False)
-            U = U[:, sizes > _NO_TRACE]
+        if frees:
+            U = _by_start(r, weights)
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
         yield A, b, r.columns
+
+
+def _by_start(r: Residual, weights: _Weights) -> Array:
+    """Return an orthonormal basis of what the start of a window could do to its whitened rows."""
+    if r.by_start is None:
+        return np.zeros((r.e[1:].size, 0))
+    G = weights.whiten(r.by_start, r.joints).reshape(r.e[1:].size, -1)
+    U, sizes, _ = np.linalg.svd(G, full_matrices=False)
+    basis: Array = U[:, sizes > _NO_TRACE]
+    return basis
+
+
+def _freed(r: Residual) -> Array:
+    """Return what a better start would leave of a residual, joints weighing by their size."""
+    if r.by_start is None:
+        return r.e
+    size = np.maximum(np.sqrt(np.mean(r.e**2, axis=0)), 1e-12)
+    G = (r.by_start / size[:, None]).reshape(r.e.size, -1)
+    moved = G @ np.linalg.lstsq(G, (r.e / size).reshape(-1), rcond=None)[0]
+    freed: Array = r.e - size * moved.reshape(r.e.shape)
+    return freed
 
 
 def _given(r: Residual) -> Array:

@@ -1,7 +1,7 @@
 """Drives that follow position commands, as an identification from commands found them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from robotid.logs.data import Log
 from robotid.robot.drives import DriveMotion, DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
-from robotid.simulation.loops import LoopedRobot, Loops, cut_windows
+from robotid.simulation.loops import LoopedRobot, Loops, cut_windows, open_loops
 
 __all__ = [
     "CommandedDrive",
@@ -121,25 +121,12 @@ def loops_of(
         drives: Its drives; armature, friction and offset are those of pi.
         rate: Ticks per second of a controller with a clock [Hz]; None: it has none.
     """
-    layout, n = model.layout, model.layout.n_inertial
-    terms: list[list[DriveTerm]] = [[] for _ in drives]
-    values: list[list[float]] = [[] for _ in drives]
-    for (d, term), value in zip(layout.drive_parameters, pi[n:].tolist(), strict=True):
-        if not term.is_inertia:
-            terms[d].append(term)
-            values[d].append(value)
-    figures = {
-        key: np.array([getattr(drive, key) for drive in drives])
-        for key in ("armature", "kp", "kd", "delay", "zero")
-    }
-    return Loops(
-        bodies=pi[:n].reshape(-1, 10),
-        limit=np.array([drive.effort_limit for drive in drives]),
-        terms=tuple(map(tuple, terms)),
-        values=np.concatenate(values),
-        rate=rate,
-        **figures,
+    kp, kd, delay, zero, limit = (
+        np.array([getattr(drive, key) for drive in drives])
+        for key in ("kp", "kd", "delay", "zero", "effort_limit")
     )
+    found = open_loops(model, pi)
+    return replace(found, kp=kp, kd=kd, delay=delay, zero=zero, limit=limit, rate=rate)
 
 
 def follow_commands(

@@ -313,6 +313,8 @@ def _commanded_input(run: OpenLoop, role: str) -> dict[str, Any]:
 
 def _loop_parameters(found: Commanded) -> list[dict[str, Any]]:
     """Return gains, delay, limit and zero of each joint, those that were stated without error."""
+    if found.loop.kind == "torque":
+        return []
     loops, simulator = found.fitted.loops, found.fitted.simulator
     errors = {
         (unknown.what, j): float(error)
@@ -359,6 +361,9 @@ def _commanded_joint(found: Commanded, runs: Sequence[OpenLoop], j: int) -> dict
 def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
     """Return the errors of open loops on one log, joint by joint and by horizon.
 
+    What goes on at its speed, and what the torques tell by themselves, stand there where the logged
+    torque drives the robot.
+
     Args:
         model: The robot.
         run: The open loops beside the log.
@@ -366,6 +371,8 @@ def open_loop_entry(model: RobotModel, run: OpenLoop) -> dict[str, Any]:
     others = {
         "command_rmse": run.command, "urdf_rmse": run.urdf, "second_order_rmse": run.second_order
     }  # fmt: skip
+    if run.steady is not None:
+        others |= {"rows_rmse": run.rows, "steady_rmse": run.steady}
     return {
         "log": run.log.path,
         "start": float(run.log.t[0]),

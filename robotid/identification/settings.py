@@ -348,10 +348,14 @@ class SimulationSettings(EstimatorSettings):
         "closed loops rolled out on the commands of logs and fitted to their positions; "
         "[controller] says what is known of the loops",
     )
-    window: float = setting(2.5, "length of the windows that are rolled out [s]", within=_FINITE)
-    lead: float = setting(
-        0.6, "how long before each window its roll-out begins [s]", within=_NOT_NEGATIVE
-    )
+    window: float | None = setting(
+        None, "length of the windows that are rolled out [s]; if not stated 2.5, or 0.5 where the "
+        "logged torque drives the robot", within=_FINITE,
+    )  # fmt: skip
+    lead: float | None = setting(
+        None, "how long before each window its roll-out begins [s]; if not stated 0.6, or 0 where "
+        "the logged torque drives the robot", within=_NOT_NEGATIVE,
+    )  # fmt: skip
     step: float = setting(2e-3, "longest step of the integration [s]", within=_FINITE)
     bodies: float = setting(
         0.1,

@@ -11,6 +11,7 @@ import numpy as np
 
 from robotid._files import write_text
 from robotid._typing import Array
+from robotid.commanded.errors import DRIFTS
 from robotid.exceptions import DataError
 from robotid.export.ranges import stated_ranges
 from robotid.findings import Finding, grouped, listed
@@ -25,9 +26,13 @@ __all__ = ["Followed", "write_commanded_report"]
 #: What predicts a position beside the identified robot: key of its error, name, tone.
 _OTHERS = {
     "second_order_rmse": ("second order", "tone-3"),
+    "rows_rmse": ("torques alone", "tone-3"),
     "urdf_rmse": ("URDF", "urdf"),
     "command_rmse": ("command", "quiet"),
+    "steady_rmse": ("same speed", "quiet"),
 }
+#: What the error of a joint is a share of, as a column says it.
+_SHARES = {"command_rmse": "% of command's", "steady_rmse": "% of same speed"}
 _ROWS = 24_000  # of all charts together: about half a MB
 _LONGEST = 3000  # rows of one chart
 _OPEN = 3  # joints whose charts are open at first
@@ -47,20 +52,24 @@ class Followed:
         name: Its file and window, for captions.
         is_kept: Whether it was kept apart from the fit.
         t: Times, shape (N,) [s].
-        q_ref: Commanded positions, shape (N, n) [rad or m].
+        q_ref: Commanded positions, shape (N, n) [rad or m]; None where the logged torque drives
+            the robot.
         q: Measured ones, likewise.
-        q_sim: Simulated ones, likewise: an open loop from the first sample on.
+        q_sim: Simulated ones, likewise: an open loop from the first sample on, or from where it
+            was put back to what was measured.
     """
 
     name: str
     is_kept: bool
     t: Array
-    q_ref: Array
+    q_ref: Array | None
     q: Array
     q_sim: Array
 
     def __post_init__(self) -> None:
         for key in ("q_ref", "q", "q_sim"):
+            if key == "q_ref" and self.q_ref is None:
+                continue
             shape = getattr(self, key).shape
             if shape != self.q.shape or len(shape) != 2 or shape[0] != len(self.t):
                 raise DataError(
@@ -108,7 +117,14 @@ def write_commanded_report(
     }
     header = _verdict(content) + _facts(content, files or {}) + _first_charts(content)
     header += _next(content, origin or Origin())
-    return write_text(page(f"{content['robot']}: drives from commands", header, sections), target)
+    source = "roll-outs of its torques" if _is_driven(content) else "commands"
+    title = f"{content['robot']}: drives from {source}"
+    return write_text(page(title, header, sections), target)
+
+
+def _is_driven(content: Mapping[str, Any]) -> bool:
+    """Return whether the logged torque drove the robot, which no loop was closed on."""
+    return bool(content["simulation"]["controller"]["kind"] == "torque")
 
 
 def _entries(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
@@ -161,8 +177,9 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
     joints = entry["per_joint"].values()
     ours = _mean([each["rmse"] for each in joints])
     size = number(ours and ours / _SMALL, ".3g").html
+    over = f" over {DRIFTS:g} s" if _is_driven(content) else ""
     facts = {
-        f"Open-loop position error, {_ROLES[role]}": (
+        f"Open-loop position error{over}, {_ROLES[role]}": (
             f"<strong>{size} {_unit(entry)}</strong>, geometric mean of {len(joints)} "
             f"joint{'s' if len(joints) > 1 else ''}"
         )
@@ -194,7 +211,8 @@ def _first_charts(content: Mapping[str, Any]) -> str:
     series = tuple(
         Series(label, np.array([_scaled(each.get(key)) for each in joints.values()]), tone, "bars")
         for key, (label, tone) in kinds.items()
-        if key != "command_rmse" and any(each.get(key) is not None for each in joints.values())
+        if key not in ("command_rmse", "steady_rmse")
+        and any(each.get(key) is not None for each in joints.values())
     )
     bars = Chart(
         "open-loop position error of each joint", np.arange(len(joints), dtype=float), series,
@@ -226,6 +244,18 @@ def _next(content: Mapping[str, Any], origin: Origin) -> str:
             "export", result, "--format", "ranges", "--out", f"{robot}_ranges.yaml",
         ),
     }  # fmt: skip
+    if _is_driven(content):  # which has no gains
+        uses = {
+            "See measured and predicted torque.": ("replay", urdf, log, result),
+            "Simulate it in MuJoCo.": (
+                "export",
+                result,
+                "--format",
+                "mjcf",
+                "--out",
+                f"{robot}.xml",
+            ),
+        }
     steps = "".join(
         f'<li><p>{escape(words)}</p><div class="copy"><pre class="command">{escape(block)}</pre>'
         "</div></li>\n"
@@ -251,7 +281,8 @@ def _horizon_chart(entry: Mapping[str, Any], said: str) -> str:
     """Return the chart of errors over how long the open loop has run, of the worst joints."""
     horizons = {float(key): errors for key, errors in entry.get("horizons", {}).items()}
     joints = entry["per_joint"]
-    horizons[entry["end"] - entry["start"]] = {name: x["rmse"] for name, x in joints.items()}
+    if "steady_rmse" not in next(iter(joints.values())):  # which is put back again and again
+        horizons[entry["end"] - entry["start"]] = {name: x["rmse"] for name, x in joints.items()}
     x = np.array(sorted(horizons))
     errors = {name: [horizons[h].get(name) for h in x.tolist()] for name in joints}
     means = [_mean([own[k] for own in errors.values()]) for k in range(len(x))]
@@ -265,31 +296,42 @@ def _horizon_chart(entry: Mapping[str, Any], said: str) -> str:
         "time since the open loop began [s]", f"RMSE [{_unit(entry)}]", logarithmic="xy",
         height=220,
     )  # fmt: skip
-    worst = f"the worst {_NAMED} joints, " if len(errors) > _NAMED else ""
-    return chart_html(chart, f"Error over horizon, {worst}the whole stretch last: {said}")
+    words = [f"the worst {_NAMED} joints"] if len(errors) > _NAMED else []
+    words += ["the whole stretch last"] if len(x) > len(entry.get("horizons", {})) else []
+    return chart_html(chart, f"{', '.join(['Error over horizon', *words])}: {said}")
 
 
 def _errors(content: Mapping[str, Any]) -> str:
-    return (
-        "<p>The identified robot starts where the log starts and then hears the commands alone. "
+    words = (
+        "The identified robot starts where the log starts and then hears the commands alone. "
         "RMSE of its position over the whole stretch, and over horizons after which it is put "
         "back to what was measured. Baselines: the command taken for the position, the URDF with "
         "the stated gains and neither friction nor delay, and a model of second order for each "
-        "joint by itself.</p>\n"
-        + "".join(_error_table(role, entry) for role, entry in _entries(content))
+        "joint by itself."
+    )
+    if _is_driven(content):
+        words = (
+            "The logged torque alone drives the identified robot, which is put back to what was "
+            f"measured every {DRIFTS:g} s, or after another horizon. Baselines: what the torques "
+            "tell by themselves, the URDF with drives fitted to them, and going on at the speed of "
+            "the start."
+        )
+    return f"<p>{words}</p>\n" + "".join(
+        _error_table(role, entry) for role, entry in _entries(content)
     )
 
 
 def _error_table(role: str, entry: Mapping[str, Any]) -> str:
     joints, horizons = entry["per_joint"], entry.get("horizons", {})
     others = [key for key in _OTHERS if any(each.get(key) is not None for each in joints.values())]
-    headers = ["joint", "RMSE", "% of command's", *(_OTHERS[key][0] for key in others)]
+    plain = "steady_rmse" if "steady_rmse" in others else "command_rmse"
+    headers = ["joint", "RMSE", _SHARES[plain], *(_OTHERS[key][0] for key in others)]
     headers += [f"over {float(h):g} s" for h in horizons]
 
     def cells(first: Cell, own: Mapping[str, Any], short: Sequence[float | None]) -> list[Cell]:
         share = None
-        if own.get("rmse") and own.get("command_rmse"):
-            share = 100 * own["rmse"] / own["command_rmse"]
+        if own.get("rmse") and own.get(plain):
+            share = 100 * own["rmse"] / own[plain]
         values = [own.get("rmse"), *(own.get(key) for key in others), *short]
         ours, *rest = (number(x if x is None else x / _SMALL, "#.3g") for x in values)
         return [first, ours, number(share, ".1f"), *rest]
@@ -315,9 +357,14 @@ def _positions(
     points = min(_LONGEST, max(200, _ROWS // (2 * len(joints) * len(followed))))
     units = {name: each["unit"] for _, entry in _entries(content)
              for name, each in entry["per_joint"].items()}  # fmt: skip
+    words = (
+        f"Measured and simulated position, the simulation put back every {DRIFTS:g} s"
+        if _is_driven(content)
+        else "Commanded, measured and simulated position, the simulation in open loop from the "
+        "first sample"
+    )
     parts = [
-        "<p>Commanded, measured and simulated position, the simulation in open loop from the first "
-        "sample; below, what is left. Drag to zoom; double-click or Escape shows all.</p>\n"
+        f"<p>{words}; below, what is left. Drag to zoom; double-click or Escape shows all.</p>\n"
     ]
     for joint in [*worst, *(name for name in joints if name not in worst)]:
         j = joints.index(joint)
@@ -332,23 +379,21 @@ def _positions(
 
 def _charts(log: Followed, j: int, joint: str, unit: str, *, link: str, points: int) -> str:
     """Return positions of a joint in a log, and how far they are from what was measured."""
-    q_ref, q, q_sim = log.q_ref[:, j], log.q[:, j], log.q_sim[:, j]
-    positions = (
-        Series("commanded", q_ref, "tone-5"),
-        Series("measured", q, "text"),
-        Series("simulated", q_sim, "predicted"),
-    )
-    left = (
-        Series("measured − commanded", (q - q_ref) / _SMALL, "tone-5", is_hidden=True),
-        Series("measured − simulated", (q - q_sim) / _SMALL, "residual"),
-    )
+    q, q_sim = log.q[:, j], log.q_sim[:, j]
+    positions = [Series("measured", q, "text"), Series("simulated", q_sim, "predicted")]
+    left = [Series("measured − simulated", (q - q_sim) / _SMALL, "residual")]
+    if log.q_ref is not None:
+        q_ref = log.q_ref[:, j]
+        positions.insert(0, Series("commanded", q_ref, "tone-5"))
+        far = (q - q_ref) / _SMALL
+        left.insert(0, Series("measured − commanded", far, "tone-5", is_hidden=True))
     rmse = float(np.sqrt(np.nanmean((q - q_sim) ** 2))) / _SMALL
     kind = "kept apart" if log.is_kept else "fitted"
     above = Chart(
-        f"position of {joint}", log.t, positions, "time [s]", f"position [{unit}]", link=link
+        f"position of {joint}", log.t, tuple(positions), "time [s]", f"position [{unit}]", link=link
     )
     below = Chart(
-        f"position error of {joint}", log.t, left, "time [s]", f"error [m{unit}]",
+        f"position error of {joint}", log.t, tuple(left), "time [s]", f"error [m{unit}]",
         link=link, height=110,
     )  # fmt: skip
     caption = f"{escape(log.name)}, {kind}: RMSE {rmse:.3g} m{unit}"
@@ -386,10 +431,15 @@ def _drives(content: Mapping[str, Any]) -> str:
             )  # fmt: skip
     heads = ["parameter", "value", "standard error", "low", "high", "from", "unit"]
     every = table("All drive parameters with their 95 % intervals", heads, lines, is_data=True)
-    return (
-        "<p>τ = kp (q<sub>ref</sub>(t − delay) − q) + kd (v<sub>ref</sub> − v) moves the joint "
+    words = (
+        "τ = kp (q<sub>ref</sub>(t − delay) − q) + kd (v<sub>ref</sub> − v) moves the joint "
         "against armature, friction and offset; where an encoder reads 0, the joint is at zero "
-        "in the URDF. Value ± standard error; what has none was stated or is held.</p>\n"
+        "in the URDF."
+    )
+    if _is_driven(content):
+        words = "The logged torque moves the joint against armature, friction and offset."
+    return (
+        f"<p>{words} Value ± standard error; what has none was stated or is held.</p>\n"
         + table("Drives, joint by joint", headers, rows, is_data=True)
         + folded("intervals", "All drive parameters with their intervals", every)
     )
@@ -433,6 +483,8 @@ def _undetermined(content: Mapping[str, Any]) -> str:
         parts.append("<p>The logs determine all that was to be found.</p>\n")
     for entry in structure.get("not_told_apart", []):
         parts.append(f"<p>{escape(_told(entry))}</p>\n")
+    if _is_driven(content):
+        return "".join(parts)
     parts.append(
         "<p>Positions and commands tell torques up to one factor: with gains, inertias, frictions "
         "and masses all larger by it, the motion is the same. What was stated or is held sets it: "

@@ -223,7 +223,7 @@ def _best_places(V: Array, Q: Array, ends: Array) -> tuple[Array, Array]:
     length = np.linalg.norm(other - one, axis=1)
     place = _lowest(q, (one + other) / 2, length)
     x = np.column_stack([place, np.ones(len(place))])
-    cost = ((q @ x[:, :, None])[:, :, 0] * x).sum(axis=1)
+    cost = np.einsum("ei,eij,ej->e", x, q, x)
     # on a plane all cost nothing: short edges first, and not all those side by side
     spread = 1.0 + (0.618034 * np.arange(len(ends))) % 1.0
     size = q[:, 0, 0] + q[:, 1, 1] + q[:, 2, 2]
@@ -232,14 +232,26 @@ def _best_places(V: Array, Q: Array, ends: Array) -> tuple[Array, Array]:
 
 def _lowest(Q: Array, near: Array, far: Array) -> Array:
     """Return the places of the least quadrics, shape (E, 3), those not too far from others."""
-    A, b = Q[:, :3, :3], Q[:, :3, 3]
-    size = A[:, 0, 0] + A[:, 1, 1] + A[:, 2, 2] + 1e-30
-    slope = (A @ near[:, :, None])[:, :, 0] + b
-    firm = A + 1e-6 * size[:, None, None] * np.eye(3)  # along a plane they stay where they are
-    step = -np.linalg.solve(firm, slope[:, :, None])[:, :, 0]
-    long = np.linalg.norm(step, axis=1) / np.maximum(far, 1e-30)
-    places: Array = near + step / np.maximum(long, 1.0)[:, None]
+    (a, b, c, g), (_, d, e, h), (_, _, f, k), _ = np.ascontiguousarray(Q.transpose(1, 2, 0))
+    x, y, z = np.ascontiguousarray(near.T)
+    ridge = 1e-6 * (a + d + f + 1e-30)  # along a plane they stay where they are
+    slope = a * x + b * y + c * z + g, b * x + d * y + e * z + h, c * x + e * y + f * z + k
+    step = _solved((a + ridge, b, c, d + ridge, e, f + ridge), slope)
+    long = np.sqrt(sum(s * s for s in step)) / np.maximum(far, 1e-30)
+    places: Array = near - np.column_stack(step) / np.maximum(long, 1.0)[:, None]
     return places
+
+
+def _solved(A: Sequence[Array], s: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """Return A^-1 s for many A = L D L^T, positive definite, as xx xy xz yy yz zz."""
+    a, b, c, d, e, f = A
+    p, q = b / a, c / a
+    d, e, f = d - p * b, e - q * b, f - q * c
+    r = e / d
+    y, z = s[1] - p * s[0], s[2] - q * s[0]
+    z = (z - r * y) / (f - r * e)
+    y = y / d - r * z
+    return s[0] / a - p * y - q * z, y, z
 
 
 def _folds(V: Array, F: Array, ends: Array, place: Array) -> Array:
@@ -248,7 +260,8 @@ def _folds(V: Array, F: Array, ends: Array, place: Array) -> Array:
     moved[ends.ravel()] = np.repeat(place, 2, axis=0)
     edge[ends.ravel()] = np.repeat(np.arange(len(ends)), 2)
     which[ends[:, 1]] = ends[:, 0]
-    left = F[(which[F] != np.roll(which[F], 1, axis=1)).all(axis=1)]
+    left = F[(edge[F] >= 0).any(axis=1)]  # what moves
+    left = left[(which[left] != np.roll(which[left], 1, axis=1)).all(axis=1)]
     before, after = (
         np.cross(P[left[:, 1]] - P[left[:, 0]], P[left[:, 2]] - P[left[:, 0]]) for P in (V, moved)
     )

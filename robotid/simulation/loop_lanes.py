@@ -13,8 +13,8 @@ friction and offset, r and w the commands as they are on average over the step; 
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
 
-Friction that a joint takes up over a way, x z, has z as a further state: over a step, at speed u,
-its equation is linear, and solved exactly. Force acts with the z of the instant t + theta dt.
+Friction that a joint takes up over a way, x z, has z as a further state: over a step, at the speed
+u, its equation is linear and solved exactly. What acts is the z of the instant t + theta dt.
 
 A controller with a clock reads q, v and its commands at its ticks, and holds the torque that it
 makes of them until the next. No step crosses a tick. The held torque has sensitivities of its own,
@@ -409,6 +409,9 @@ def term(code, shape, q, u):
         y, y_q = math.cos(x0 * q - x1), -x0 * math.sin(x0 * q - x1)
     elif code == BRISTLES:  # of their own state
         y = 0.0
+    elif code == 11:  # a power x0 of the speed
+        y = s * root**x0
+        y_u = s_u * root**x0 + s * s * x0 * root ** (x0 - 1.0)
     return y, y_u, y_q
 
 

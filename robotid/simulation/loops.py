@@ -31,6 +31,7 @@ from robotid.robot.drives import (
     LuGre,
     Offset,
     PositionCoulomb,
+    Power,
     Presliding,
     Stribeck,
     Tanh,
@@ -39,7 +40,7 @@ from robotid.robot.drives import (
 from robotid.robot.mass_matrix import rigid_mass_matrices
 from robotid.robot.model import RobotModel
 
-__all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows"]
+__all__ = ["LoopedRobot", "Loops", "RollOut", "Window", "cut_windows", "open_loops"]
 
 #: Kind, joint and index of what a roll-out is differentiated by; see ``loop_lanes``.
 Column: TypeAlias = tuple[int, int, int]
@@ -53,6 +54,7 @@ _FASTEST = 1e6  # [rad/s or m/s] of a joint whose held loop runs away
 _CODES: dict[type[DriveTerm], int] = {
     Viscous: 0, Coulomb: 1, Offset: 2, PositionCoulomb: 3, Stribeck: 4, Asymmetric: 5, Cubic: 6,
     Tanh: 7, Harmonic: 8, LoadFriction: 9, Presliding: 10, LuGre: 10,
+    Power: 11,
 }  # fmt: skip
 
 
@@ -98,6 +100,31 @@ class Loops:
             term: One of its terms.
         """
         return sum(map(len, self.terms[:joint])) + self.terms[joint].index(term)
+
+
+def open_loops(model: RobotModel, pi: Array) -> Loops:
+    """Return bodies and drives of standard parameters, their loops open: no gain, no delay.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+    """
+    layout, n = model.layout, len(model.joints)
+    terms: list[list[DriveTerm]] = [[] for _ in range(n)]
+    values: list[list[float]] = [[] for _ in range(n)]
+    armature, none = np.zeros(n), np.zeros(n)
+    drives = zip(layout.drive_parameters, pi[layout.n_inertial :].tolist(), strict=True)
+    for (d, term), value in drives:
+        if term.is_inertia:
+            armature[d] = value
+        else:
+            terms[d].append(term)
+            values[d].append(value)
+    return Loops(
+        bodies=pi[: layout.n_inertial].reshape(-1, 10), armature=armature, kp=none, kd=none,
+        limit=np.full(n, np.inf), delay=none, zero=none, terms=tuple(map(tuple, terms)),
+        values=np.concatenate([np.zeros(0), *values]),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -485,6 +512,8 @@ def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
         shape = float(term.order), term.centre
     elif isinstance(term, Stribeck | Tanh):
         shape = term.speed, 0.0
+    elif isinstance(term, Power):
+        shape = term.exponent, 0.0
     elif isinstance(term, Harmonic):
         shape = term.order, math.pi / 2 if term.is_sine else 0.0
     return code, *shape, *term.seen

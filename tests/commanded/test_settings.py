@@ -31,3 +31,26 @@ def test_a_joint_of_two_groups_is_refused():
     loop = LoopSettings(groups={"front": ["tail"], "back": ["tail"]})
     with pytest.raises(SettingsError, match=r"joint 'tail' is in the groups front and back"):
         groups_of(loop, JOINTS, [1] * 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("kp", 20.0), ("kd", {"tail": 1.0}), ("limit", "find"), ("delay", 0.01),
+        ("gravity_compensation", True), ("zeros", "find"),
+    ],
+)  # fmt: skip
+def test_a_logged_torque_closes_no_loop(name, value):
+    with pytest.raises(SettingsError, match=rf"\[controller\] {name} is .*no loop is closed"):
+        LoopSettings(kind="torque", **{name: value})
+    assert LoopSettings(kind="pd", **{name: value}).kind == "pd"
+
+
+def test_a_late_torque_is_moved_back_by_the_signals():
+    with pytest.raises(SettingsError, match=r"\[signals\] torque_delay"):
+        LoopSettings(kind="torque", delay=0.01)
+
+
+def test_joints_may_share_a_drive_that_a_torque_moves():
+    loop = LoopSettings(kind="torque", groups={"hips": ["FL_hip_joint", "FR_hip_joint"]})
+    assert groups_of(loop, JOINTS, range(5))[0] == "hips"

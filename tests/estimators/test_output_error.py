@@ -35,7 +35,7 @@ class Lagging:
         A, b = self.further[:, :-1], self.further[:, -1]
         return A, b - A @ theta
 
-    def residuals(self, theta, *, with_slopes):
+    def residuals(self, theta, *, with_slopes, with_starts=False):
         e = self.measured - self.simulated(theta)
         slopes = None
         if with_slopes:
@@ -189,6 +189,43 @@ def test_what_a_start_could_do_is_taken_out_of_rows(rng):
     u = G / size
     np.testing.assert_allclose(A, plain - np.outer(u, u @ plain), atol=1e-9 * np.abs(plain).max())
     np.testing.assert_allclose(b, e - u * (u @ e), atol=1e-9 * np.abs(e).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Started(Lagging):
+    """The same, where a window's start adds what fades away."""
+
+    def residuals(self, theta, *, with_slopes, with_starts=False):
+        found = super().residuals(theta, with_slopes=with_slopes)
+        fades = 0.97 ** np.arange(self.told.shape[1])[:, None, None]
+        return [replace(r, by_start=fades) if with_slopes or with_starts else r for r in found]
+
+
+def test_what_a_window_starts_with_changes_nothing_where_starts_are_free(rng):
+    lag = lagging(rng)
+    fades = 0.97 ** np.arange(lag.told.shape[1])
+    off = lag.measured + rng.standard_normal((len(lag.told), 1)) * fades
+    exact, moved = (
+        OutputError(frees=True).fit(Started(**{**vars(lag), "measured": x}), START)
+        for x in (lag.measured, off)
+    )
+    np.testing.assert_allclose(moved.theta, exact.theta, rtol=1e-6)
+    np.testing.assert_allclose(moved.sigma, exact.sigma, rtol=1e-6)
+    assert (np.abs(exact.theta - TRUTH) < 3.3 * exact.std_error).all()
+    held = OutputError().fit(Started(**{**vars(lag), "measured": off}), START)
+    assert np.abs(held.theta - exact.theta).max() > 1e-3
+
+
+def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):
+    lag = lagging(rng)
+    row = np.array([[30.0, 0.0, 0.0, 30.0 * 1.6]])  # says 1.6 of the gain, which is 1.5
+    less = OutputError(inflation=4.0).fit(replace(lag, further=row), START)
+    same = OutputError().fit(replace(lag, further=2.0 * row), START)
+    plain = OutputError().fit(replace(lag, further=row), START)
+    np.testing.assert_allclose(less.theta, same.theta, rtol=1e-6)
+    np.testing.assert_allclose(less.sigma, same.sigma, rtol=1e-6)
+    assert plain.theta[0] + 0.002 < less.theta[0] < 1.6
+    assert less.details["inflation"] == pytest.approx(same.details["inflation"], rel=1e-4)
 
 
 def test_what_is_linearised_is_whitened(rng):

@@ -212,3 +212,34 @@ def rolled_out(robot, q_ref, rate, settles=_SETTLES):
     qpos = states[0, :, 1 : 1 + robot.nq]  # after the time; a row after each step
     q = qpos[before - 1 :][: held * len(q_ref) : held, at]
     return q, forces[0, before::held]  # which a step tells of the state that it begins with
+
+
+def torque_log(
+    plant, rng, *, duration, rate=250.0, fine=16000.0, noise=0.0, torque=0.0, relative=0.0
+):
+    """Return the log of a plant's positions and of the torques that move it, without commands.
+
+    The loop runs so much faster than the log is written that its torque is smooth between rows.
+
+    Args:
+        plant: The robot, whose controller is not in the log.
+        rng: Source of the motion and of the noise.
+        duration: Length [s].
+        rate: Rows per second of the log [Hz].
+        fine: Commands per second of the loop [Hz].
+        noise: Standard deviation of the encoders [rad].
+        torque: Standard deviation of the logged torques [N m].
+        relative: The same over their usual size [-].
+    """
+    t = np.arange(round(duration * fine)) / fine
+    q_ref = multisine(t, plant.middle, plant.reach, rng)
+    robot = loaded(plant, fine, 1.0 / fine)
+    robot.dof_solref[:] = 2.0 / fine, 1.0  # friction as stiff as the steps allow
+    robot.dof_solimp[:] = 0.9999, 0.9999, 0.001, 0.5, 2.0
+    q, force = rolled_out(robot, q_ref, fine)
+    kept = slice(None, None, round(fine / rate))
+    q = q[kept] + noise * rng.standard_normal(q[kept].shape)
+    tau = force[kept] + [drive.offset for drive in plant.drives]
+    level = torque + relative * np.sqrt(np.mean(tau**2, axis=0))
+    tau = tau + level * rng.standard_normal(tau.shape)
+    return Log(t[kept], q, tau, plant.model.joints)
