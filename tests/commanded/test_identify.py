@@ -7,6 +7,7 @@ from helpers.single_joint import slider
 
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
+from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.identification.settings import SimulationSettings
@@ -139,6 +140,19 @@ def test_a_robot_that_moves_otherwise_in_the_kept_log_is_poor(leg):
     found = identify_commands(robot.model, [log], [other], stated(robot), SETTINGS, chooses=False)
     assert found.verdict.status == "poor"
     assert "the open loop misses" in found.verdict.reasons[0]
+
+
+def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
+    joints, [run] = leg[0].model.joints, found.kept
+    still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
+    stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
+    verdict = judge_open_loops(joints, [stands], is_kept=True)
+    assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
+    assert verdict.status == "usable"
+    assert verdict.reasons == (f"{joints[2]} is told to stand still: nothing tests it",)
+    assert judge_open_loops(joints, [stands, run], is_kept=True).status == "good"
+    nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
+    assert judge_open_loops(joints, [nobody], is_kept=True).status == "not evaluated"
 
 
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(leg):
