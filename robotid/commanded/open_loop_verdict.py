@@ -33,9 +33,18 @@ def judge_open_loops(
         is_settled: Whether the fit has settled.
         alarms: Faults of the logs that make the result wrong.
     """
-    by_joint = {joint: _judge_joint(joint, j, runs, is_kept) for j, joint in enumerate(joints)}
+    told = [[run for run in runs if _is_told(run, j)] for j in range(len(joints))]
+    by_joint = {
+        joint: _judge_joint(joint, j, own, is_kept)
+        if own
+        else JointVerdict("not evaluated", (f"{joint} is told to stand still: nothing tests it",))
+        for j, (joint, own) in enumerate(zip(joints, told, strict=True))
+    }
     rank = {"poor": 0, "not evaluated": 1, "usable": 2, "good": 3}
-    status = min((v.status for v in by_joint.values()), key=rank.__getitem__)
+    tested = [by_joint[joint].status for joint, own in zip(joints, told, strict=True) if own]
+    status = min(tested, key=rank.__getitem__, default="not evaluated")
+    if status == "good" and not all(told):
+        status = "usable"
     reasons = [
         reason
         for verdict in sorted(by_joint.values(), key=lambda v: rank[v.status])
@@ -48,7 +57,7 @@ def judge_open_loops(
     if not is_kept:
         reasons.insert(0, "no log was kept apart: nothing tests the open loop; add [[validation]]")
     if status == "good":
-        worst = max(_share(runs, j) for j in range(len(joints)))
+        worst = max(_share(own, j) for j, own in enumerate(told))
         reasons = [
             f"open loops miss at most {100 * worst:.2g} % of the motion of any joint on logs kept "
             "apart, and less than plainer models"
@@ -58,8 +67,15 @@ def judge_open_loops(
     return Verdict(status, tuple(reasons), by_joint, alarms=tuple(alarms))
 
 
+def _is_told(run: OpenLoop, j: int) -> bool:
+    """Return whether a log tells a joint to move: at rest, its errors are no share of a motion."""
+    if run.steady is not None or run.log.q_ref is None:
+        return True  # by torques
+    return bool(np.ptp(run.log.q_ref[:, j]) > 0)
+
+
 def _judge_joint(joint: str, j: int, runs: Sequence[OpenLoop], is_kept: bool) -> JointVerdict:
-    """Return the verdict on one joint, by all logs together."""
+    """Return the verdict on one joint, by all logs together that tell it to move."""
     share = _share(runs, j)
     said = f"{joint}: the open loop misses {100 * share:.2g} % of its motion"
     beaten = [

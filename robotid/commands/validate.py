@@ -90,9 +90,8 @@ def _validate_commands(loaded: Result, job: Job, entries: Sequence[LogEntry]) ->
     model, pi = loaded.identified
     drives, signs = loaded.commanded, loaded.content["simulation"]["signs"]
     sign = np.array([signs[joint] for joint in model.joints])
-    loops = loops_of(model, pi, drives) if drives else open_loops(model, pi)
+    loops = loops_of(model, pi, drives, loaded.rate) if drives else open_loops(model, pi)
     robot, runs, logs = LoopedRobot(model), [], []
-    loops = loops_of(model, pi, drives, loaded.rate)
     for entry in entries:
         logs.append(log_of_commands(job, entry, loaded))
         runs.append(run_open_loop(robot, loops, logs[-1].turned(sign)))

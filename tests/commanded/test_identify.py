@@ -3,14 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.mujoco_plant import held, multisine, plant, recorded
+from helpers.single_joint import slider
 
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
+from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
-from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Viscous
+from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
 from robotid.simulation.loops import LoopedRobot, cut_windows
 
 NOISE = 1e-3  # [rad]: with less, that MuJoCo's friction is a little soft shows beside the errors
@@ -140,6 +142,19 @@ def test_a_robot_that_moves_otherwise_in_the_kept_log_is_poor(leg):
     assert "the open loop misses" in found.verdict.reasons[0]
 
 
+def test_a_joint_that_is_told_to_stand_is_not_evaluated(leg, found):
+    joints, [run] = leg[0].model.joints, found.kept
+    still = replace(run.log, q_ref=np.where([True, True, False], run.log.q_ref, run.log.q_ref[0]))
+    stands = replace(run, log=still, spread=np.array([*run.spread[:2], 1e-4]))
+    verdict = judge_open_loops(joints, [stands], is_kept=True)
+    assert [verdict.joints[joint].status for joint in joints] == ["good", "good", "not evaluated"]
+    assert verdict.status == "usable"
+    assert verdict.reasons == (f"{joints[2]} is told to stand still: nothing tests it",)
+    assert judge_open_loops(joints, [stands, run], is_kept=True).status == "good"
+    nobody = replace(run, log=replace(still, q_ref=np.tile(still.q_ref[0], (len(still.t), 1))))
+    assert judge_open_loops(joints, [nobody], is_kept=True).status == "not evaluated"
+
+
 def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(leg):
     robot, log, kept = leg
     found = identify_commands(robot.model, [log], [kept], LoopSettings(), SETTINGS, chooses=False)
@@ -199,6 +214,26 @@ def test_friction_by_position_is_found_where_it_is_and_nowhere_else(leg):
     exact = 0.25 + 0.5 * (q - centre) + (q - centre) ** 2
     np.testing.assert_allclose(size, exact, rtol=0.05)
     assert f"{name}.{terms[0].name}" in found.model.layout.names
+
+
+def test_friction_with_a_stated_way_is_recovered(tmp_path, rng):
+    """A body on a rail that sticks, as ``[drives]`` of the job states it."""
+    way, t = Presliding(displacement=0.01), np.arange(2000) / 500.0
+    model = slider(tmp_path, terms=("armature", "viscous"), own_terms={"j": [way]})
+    q_ref = multisine(t, np.zeros(1), np.array([0.2]), rng)
+    loop = LoopSettings(kp=300.0, kd=8.0)
+    loops = replace(
+        stated_loops(model, loop), armature=np.array([0.5]), delay=np.array([0.004]),
+        terms=((Viscous(), way),), values=np.array([5.0, 8.0]),
+    )  # fmt: skip
+    told = Log(t, q_ref, 0 * q_ref, ("j",), q_ref=q_ref, has_torque=False)
+    [out] = LoopedRobot(model, step=5e-4).roll_out(loops, cut_windows(told, np.inf, 0.0))
+    log = replace(told, q=out.q + 1e-4 * rng.standard_normal(out.q.shape))
+    found = identify_commands(model, [log], [], loop, SETTINGS, chooses=False)
+    values = dict(zip(found.fitted.estimate.names, found.fitted.estimate.theta, strict=True))
+    for name, value in (("armature", 0.5), ("viscous", 5.0), ("presliding", 8.0)):
+        assert values[f"j.{name}"] == pytest.approx(value, rel=0.05)
+    assert "j.presliding" in found.model.layout.names
 
 
 def test_a_log_without_commands_is_refused(leg):
