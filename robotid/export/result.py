@@ -491,6 +491,8 @@ class Result:
     @cached_property
     def commanded(self) -> tuple[CommandedDrive, ...]:
         """The drives that follow position commands, joint by joint; none without gains."""
+        if "simulation" not in self.content:
+            return ()
         return commanded_drives(*self.identified, self.content, self.path.name)
 
     @property

@@ -109,7 +109,7 @@ def test_standard_errors_are_the_scatter_of_many_noises():
 class Neglecting(Lagging):
     """The same, whose derivatives of later samples are too small, the time's too large."""
 
-    def residuals(self, theta, *, with_slopes):
+    def residuals(self, theta, *, with_slopes, with_starts=False):
         found = super().residuals(theta, with_slopes=with_slopes)
         if not with_slopes:
             return found
@@ -162,7 +162,7 @@ def test_slopes_that_are_far_too_small_never_settle(rng):
     own = neglecting(lag)
 
     class Small(Neglecting):
-        def residuals(self, theta, *, with_slopes):
+        def residuals(self, theta, *, with_slopes, with_starts=False):
             found = super().residuals(theta, with_slopes=with_slopes)
             return [replace(r, slopes=0.2 * r.slopes) for r in found] if with_slopes else found
 
