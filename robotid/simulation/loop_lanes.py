@@ -409,9 +409,6 @@ def term(code, shape, q, u):
         y, y_q = math.cos(x0 * q - x1), -x0 * math.sin(x0 * q - x1)
     elif code == BRISTLES:  # of their own state
         y = 0.0
-    elif code == 11:  # a power x0 of the speed
-        y = s * root**x0
-        y_u = s_u * root**x0 + s * s * x0 * root ** (x0 - 1.0)
     return y, y_u, y_q
 
 

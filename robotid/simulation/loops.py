@@ -31,7 +31,6 @@ from robotid.robot.drives import (
     LuGre,
     Offset,
     PositionCoulomb,
-    Power,
     Presliding,
     Stribeck,
     Tanh,
@@ -54,7 +53,6 @@ _FASTEST = 1e6  # [rad/s or m/s] of a joint whose held loop runs away
 _CODES: dict[type[DriveTerm], int] = {
     Viscous: 0, Coulomb: 1, Offset: 2, PositionCoulomb: 3, Stribeck: 4, Asymmetric: 5, Cubic: 6,
     Tanh: 7, Harmonic: 8, LoadFriction: 9, Presliding: 10, LuGre: 10,
-    Power: 11,
 }  # fmt: skip
 
 
@@ -530,8 +528,6 @@ def _coded(term: DriveTerm) -> tuple[int, float, float, float, float]:
         shape = float(term.order), term.centre
     elif isinstance(term, Stribeck | Tanh):
         shape = term.speed, 0.0
-    elif isinstance(term, Power):
-        shape = term.exponent, 0.0
     elif isinstance(term, Harmonic):
         shape = term.order, math.pi / 2 if term.is_sine else 0.0
     return code, *shape, *term.seen

@@ -22,7 +22,6 @@ from robotid.robot.drives import (
     LuGre,
     Offset,
     PositionCoulomb,
-    Power,
     Presliding,
     Stribeck,
     Tanh,
@@ -40,9 +39,9 @@ PLAIN = (Viscous(), Coulomb(), Offset())
 TERMS = (
     *PLAIN, PositionCoulomb(order=1, centre=0.1), PositionCoulomb(order=2, centre=0.1),
     Stribeck(speed=0.2), Asymmetric(), Cubic(), Tanh(speed=0.3), Harmonic(order=3),
-    Harmonic(order=2, is_sine=True), Power(exponent=0.4), LoadFriction(),
+    Harmonic(order=2, is_sine=True), LoadFriction(),
 )  # fmt: skip
-VALUES = (0.1, 0.2, 0.05, 0.1, 0.15, 0.08, 0.03, 0.002, 0.1, 0.04, 0.03, 0.05, 0.1)
+VALUES = (0.1, 0.2, 0.05, 0.1, 0.15, 0.08, 0.03, 0.002, 0.1, 0.04, 0.03, 0.1)
 #: Terms with a memory, among others.
 LASTING = (
     Viscous(), Coulomb(), Presliding(displacement=0.01),
