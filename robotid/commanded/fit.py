@@ -110,14 +110,12 @@ def fit_loops(
         SettingsError: If a setting does not fit the robot.
     """
     _check_settings(model, logs, loop, settings)
-    if loop.kind == "torque":
-        begun = _begun_by_torque(model, logs, loop, settings, signals, progress)
-    else:
-        begun = _begun_by_commands(model, logs, loop, settings, signals, progress)
+    begin = _begun_by_torque if loop.kind == "torque" else _begun_by_commands
+    begun = begin(model, logs, loop, settings, signals, progress)
     simulator, estimator = begun.simulator, begun.estimator
     step = max(1, len(simulator.windows) // _FEW)
     few = replace(simulator, windows=simulator.windows[::step])
-    theta = replace(estimator, rounds=1).fit(few, begun.theta).theta
+    theta = replace(estimator, rounds=1).fit(few, simulator.prior).theta
     if settings.error != "output":
         simulator = _of_torques(simulator, few, theta, settings.error)
     for _ in range(_STARTS):
@@ -155,7 +153,6 @@ class _Begun:
     """What a fit begins with."""
 
     simulator: LoopSimulator
-    theta: Array  # of its unknowns
     estimator: OutputError
     torque: Array  # usual ones, shape (n,) [N m or N]
     encoders: Encoders
@@ -207,7 +204,7 @@ def _begun_by_commands(
     if weighs:
         rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
         simulator = replace(simulator, torque=rows)
-    return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, plain)
+    return _Begun(simulator, estimator, usual.torque, encoders, plain)
 
 
 def _begun_by_torque(
@@ -241,7 +238,7 @@ def _begun_by_torque(
         simulator = replace(simulator, torque=torque_rows(found, _BOTH))
     estimator = OutputError(whitens=settings.whiten, frees=True, progress=progress)
     encoders = same_encoders(model)
-    return _Begun(simulator, simulator.prior, estimator, usual.torque, encoders, linear=found)
+    return _Begun(simulator, estimator, usual.torque, encoders, linear=found)
 
 
 def _check_settings(
