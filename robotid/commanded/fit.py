@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
-from robotid.commanded.drive_torques import find_behind
+from robotid.commanded.drive_torques import find_gains, measured_motion
 from robotid.commanded.driven import identified_rows, torque_rows
 from robotid.commanded.errors import DRIFTS
 from robotid.commanded.second_order import SecondOrder, fit_second_order
@@ -113,13 +113,16 @@ def fit_loops(
     begin = _begun_by_torque if loop.kind == "torque" else _begun_by_commands
     begun = begin(model, logs, loop, settings, signals, progress)
     simulator, estimator = begun.simulator, begun.estimator
-    step = max(1, len(simulator.windows) // _FEW)
-    few = replace(simulator, windows=simulator.windows[::step])
+    few = replace(simulator, windows=_few(simulator.windows))
     theta = replace(estimator, rounds=1).fit(few, simulator.prior).theta
-    if settings.error != "output":
-        simulator = _of_torques(simulator, few, theta, settings.error)
-    for _ in range(_STARTS):
+    simulator = replace(simulator, error=settings.error)
+    for left in reversed(range(_STARTS)):
         simulator = simulator.begun_better(theta)
+        if simulator.behind is not None:
+            outs = simulator.roll_out(theta, _few(simulator.windows))
+            gains, is_last = (simulator.loops(theta), _open_gains(loop, model)), left == 0
+            behind, _ = find_gains(outs, *gains, knows_delay=True, is_whole=not is_last)
+            simulator = replace(simulator, behind=behind)
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
         theta = estimator.joint_step(simulator, estimate.theta)
         if begun.linear is not None and simulator.torque is not None:
@@ -180,15 +183,22 @@ def _begun_by_commands(
     length, lead = settings.window or _WINDOW, _LEAD if settings.lead is None else settings.lead
     windows = tuple(w for log in logs for w in cut_windows(log, length, lead))
     stated = replace(stated_loops(model, loop), zero=encoders.zero)
+    weighs = settings.torques and all(log.has_torque for log in logs)
+    has_gain, behind = _is_stated(loop.kp, model), None
+    if weighs and loop.rate is None:
+        is_open = _open_gains(loop, model)
+        moved = [measured_motion(window) for window in _few(windows)]
+        behind, told = find_gains(
+            moved, stated, is_open, knows_delay=loop.delay is not None, is_whole=True
+        )
+        has_gain, stated = has_gain | (told.kp != stated.kp), told
     report_stage(progress, "trying plain loops", STAGES)
     plain = fit_second_order(robot, windows, stated, finds_delay=loop.delay is None)
     groups = groups_of(loop, model.joints, _likeness(model))
-    has_gain = _is_stated(loop.kp, model)
     top = _largest_speeds(model, loop, logs)
     usual = _usual(robot, plain, windows, has_gain, top)
     finds_limit = (top > 0.0) | (loop.limit == "find")
     base = _begin(model, stated, plain, usual, finds_limit)
-    weighs = settings.torques and all(log.has_torque for log in logs)
     # positions alone tell the sum of kd and viscous friction
     tells_kd = weighs or all(log.v_ref is not None for log in logs)
     unknowns = _unknowns(
@@ -197,11 +207,13 @@ def _begun_by_commands(
     unknowns += _zeros(model, encoders) if loop.zeros == "find" else []
     unknowns += body_unknowns(robot, settings.bodies) if settings.bodies else []
     dt = max(float(np.median(np.diff(log.t))) for log in logs)
-    most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 2)  # of positions, of speeds
+    most = np.tile(np.exp(-_WHITE * dt / plain.time_constant), 3)  # positions, speeds, torques
     estimator = OutputError(_NAMES[settings.error], settings.whiten, most, progress=progress)
-    simulator = LoopSimulator(robot, windows, base, tuple(unknowns), velocities=settings.velocities)
+    simulator = LoopSimulator(
+        robot, windows, base, tuple(unknowns), velocities=settings.velocities, behind=behind
+    )
     report_stage(progress, "fitting loops", STAGES)
-    if weighs:
+    if weighs and behind is None:
         rows = torque_rows(identified_rows(with_terms(model, base), logs, signals))
         simulator = replace(simulator, torque=rows)
     return _Begun(simulator, estimator, usual.torque, encoders, plain)
@@ -281,18 +293,6 @@ def _check_settings(
             "state them of each joint in [controller] (delay = 0 if there is none), or set "
             "error = 'input'"
         )
-
-
-def _of_torques(
-    simulator: LoopSimulator, few: LoopSimulator, theta: Array, error: str
-) -> LoopSimulator:
-    """Return the simulator with torques compared along its roll-outs, as they begin in few."""
-    is_open = np.zeros((2, len(simulator.base.kp)), dtype=bool)
-    for unknown in simulator.unknowns:
-        if unknown.what in ("kp", "kd"):
-            is_open[("kp", "kd").index(unknown.what), list(unknown.joints)] = True
-    behind = find_behind(few.roll_out(theta), few.loops(theta), is_open)
-    return replace(simulator, error=error, behind=behind, torque=None)
 
 
 def _largest_speeds(model: RobotModel, loop: LoopSettings, logs: Sequence[Log]) -> Array:
@@ -507,6 +507,16 @@ def _is_stated(value: PerJoint | str | None, model: RobotModel) -> Array:
         for joint in model.joints
     ]
     return np.array(named)
+
+
+def _few(windows: Sequence[Window]) -> tuple[Window, ...]:
+    """Return some of many windows."""
+    return tuple(windows[:: max(1, len(windows) // _FEW)])
+
+
+def _open_gains(loop: LoopSettings, model: RobotModel) -> Array:
+    """Return for which joints gains of position and of speed are to be found, (2, n), bool."""
+    return ~np.stack([_is_stated(gain, model) for gain in (loop.kp, loop.kd)])
 
 
 def _with(

@@ -31,6 +31,7 @@ _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is
 _FROM_PRIOR = 0.9  # ... above this share, what was assumed of it
 _TOGETHER = 0.98  # correlation from which two parameters are told together only
 _SOFT = 0.5  # of what a step should correct: a loop that leaves more is soft
+_MISSED = 0.5  # of a logged torque, that a loop which gives it does not miss
 _NAMED = 8  # parameters that a sentence names
 
 
@@ -247,27 +248,8 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             "on the masses of the URDF and on gravity. What is sure are ratios, as kp over "
             "armature; state kp in [controller], or log a torque, to tell them apart",
         )
-    at_zero = [
-        name
-        for name in estimate.details["at_bound"]
-        if name.rpartition(".")[2] not in ("kp", "limit")
-    ]
-    if at_zero:
-        yield Finding(
-            "at_bound",
-            "note",
-            listed(at_zero, _NAMED),
-            f"{listed(at_zero, _NAMED)} came out as 0, the least that can be: the motion shows "
-            "none, or another parameter has taken it",
-        )
-    if any(name.endswith("delay") for name in at_zero):
-        yield Finding(
-            "no_delay",
-            "warning",
-            "delay",
-            "the delay came out as 0: commands and positions may not be of one clock, or the "
-            "motion is too slow to show it; command a faster one",
-        )
+    yield from _torques_missed(found)
+    yield from _at_bound(estimate.details["at_bound"])
     for told_names in found.told_together:
         told = listed(told_names, _NAMED)
         yield Finding(
@@ -288,6 +270,27 @@ def _findings(found: Commanded) -> Iterator[Finding]:
     yield from _limits_found(found)
     yield from _encoder_findings(found)
     yield from map(_friction_found, (t for t in found.fitted.tried if t.is_chosen))
+
+
+def _at_bound(names: Sequence[str]) -> Iterator[Finding]:
+    """Yield which parameters came out as 0."""
+    at_zero = [name for name in names if name.rpartition(".")[2] not in ("kp", "limit")]
+    if at_zero:
+        yield Finding(
+            "at_bound",
+            "note",
+            listed(at_zero, _NAMED),
+            f"{listed(at_zero, _NAMED)} came out as 0, the least that can be: the motion shows "
+            "none, or another parameter has taken it",
+        )
+    if any(name.endswith("delay") for name in at_zero):
+        yield Finding(
+            "no_delay",
+            "warning",
+            "delay",
+            "the delay came out as 0: commands and positions may not be of one clock, or the "
+            "motion is too slow to show it; command a faster one",
+        )
 
 
 def _limits_found(found: Commanded) -> Iterator[Finding]:
@@ -322,6 +325,25 @@ def _soft_loop(left: float) -> Iterator[Finding]:
             "this. Set error = 'input'",
             {"left": left},
         )
+
+
+def _torques_missed(found: Commanded) -> Iterator[Finding]:
+    """Yield which logged torques are not those of the loops, though they weigh."""
+    simulator = found.fitted.simulator
+    if simulator.behind is None:
+        return
+    missed = simulator.missed_torque(found.fitted.estimate.theta)
+    for joint, share in zip(found.model.joints, missed.tolist(), strict=True):
+        if share > _MISSED:
+            yield Finding(
+                "torque_missed",
+                "warning",
+                joint,
+                f"{joint}: its loop misses {100 * share:.0f} % of the logged torque (root mean "
+                "square), by which gains and friction are scaled; see whether the column is this "
+                "joint's, in N m behind the gear and of this controller, or set torques = false",
+                {"missed_pct": 100 * share},
+            )
 
 
 def _friction_found(tried: Tried) -> Finding:

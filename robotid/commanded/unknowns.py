@@ -108,12 +108,13 @@ class LoopSimulator:
         windows: Windows of its logs.
         base: All that is known; unknowns stand over it.
         unknowns: What is to be found.
-        torque: Rows of measured torques, if there are any.
+        torque: Rows of measured torques along what was measured, if they weigh.
         velocities: Whether measured velocities are compared beside the positions.
-        error: What is compared: "output", positions; "input", torques of the drives; "direct", the
-            same, whose derivatives neglect that the motion changes.
-        behind: How many rows the command that a torque follows is behind it, shape (n,), int; None
-            if no torques are compared.
+        error: What is compared: "output", positions, and torques of the drives if they are to be;
+            "input", these torques alone; "direct", the same, whose derivatives neglect that the
+            motion changes.
+        behind: How many rows the command that a torque follows is behind it, shape (n,), as of
+            ``drive_torques``; None if no torques of roll-outs are compared.
     """
 
     robot: LoopedRobot
@@ -219,6 +220,21 @@ class LoopSimulator:
         pi, slopes = self.standard(self.torque.model, theta)
         return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
 
+    def missed_torque(self, theta: Array) -> Array:
+        """Return how much of the logged torques roll-outs miss, root mean squares, shape (n,) [-].
+
+        Args:
+            theta: Values of the unknowns, shape (c,).
+
+        Raises:
+            NotConvergedError: If a step has no solution.
+        """
+        torques = replace(self, error="input").residuals(theta, with_slopes=False)
+        missed = np.concatenate([part.e for part in torques])
+        logged = np.concatenate([w.log.tau[w.counted] for w in self.windows])
+        share: Array = np.sqrt(np.mean(missed**2, axis=0) / np.mean(logged**2, axis=0))
+        return share
+
     def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:
         """Return a robot's standard parameters, shape (p,), and their derivatives, shape (p, c).
 
@@ -277,7 +293,7 @@ class LoopSimulator:
             self.windows,
             [*columns, *self._starts()] if rolls else (),
             directions,
-            with_speeds=self.velocities or self.error != "output",
+            with_speeds=self.velocities or self.behind is not None,
         )
         if rolls:
             return [part for out in outs for part in self._parts(out, loops, columns, owners)]
@@ -299,27 +315,26 @@ class LoopSimulator:
     @property
     def knows_torques(self) -> bool:
         """Whether measured torques weigh, along what was measured or along roll-outs."""
-        return self.torque is not None or self.error != "output"
+        return self.torque is not None or self.behind is not None
 
     @property
     def _outputs(self) -> int:
-        """How many outputs are compared: positions, positions and speeds, or torques."""
-        return len(self.base.kp) * (2 if self.velocities and self.error == "output" else 1)
+        """How many outputs are compared: positions, speeds beside them, torques, in this order."""
+        beside = self.velocities + (self.behind is not None) if self.error == "output" else 0
+        return len(self.base.kp) * (1 + beside)
 
     def _error(self, out: RollOut, loops: Loops) -> Array:
         """Return what is measured less what comes out, shape (N, outputs)."""
-        if self.error != "output":
-            given = drive_torques(out, loops, self._behind).given
-            missed: Array = out.window.log.tau[out.window.counted] - given
-            return missed
-        error = _error(out)
-        if self.velocities:
-            error = np.hstack([error, out.window.log.v[out.window.counted] - out.v])  # type: ignore[index]
+        counted, parts = out.window.counted, []
+        if self.error == "output":
+            parts.append(_error(out))
+            if self.velocities:
+                parts.append(out.window.log.v[counted] - out.v)  # type: ignore[index]
+        if self.behind is not None:
+            given = drive_torques(out, loops, self.behind).given
+            parts.append(out.window.log.tau[counted] - given)
+        error: Array = np.hstack(parts)
         return error
-
-    @property
-    def _behind(self) -> Array:
-        return np.zeros(len(self.base.kp), dtype=int) if self.behind is None else self.behind
 
     def _parts(
         self, out: RollOut, loops: Loops, columns: list[Column], owners: Array
@@ -327,12 +342,14 @@ class LoopSimulator:
         """Yield the residuals of a roll-out's parts, with all that they change with."""
         error, wanted, n = self._error(out, loops), [*columns, *self._starts()], len(loops.kp)
         for joints, places, slopes in out.slopes:
-            outputs = joints
-            if self.error != "output":
-                torques, kinds = drive_torques(out, loops, self._behind), self.robot.kinds
-                slopes = torques.slopes(joints, [wanted[p] for p in places], slopes, kinds)
-            elif self.velocities:
-                outputs = np.concatenate([joints, n + joints])
+            k = len(joints)
+            parts = [slopes[:, :k]] if self.error == "output" else []
+            parts += [slopes[:, k:]] if self.velocities else []
+            if self.behind is not None:
+                torques, kinds = drive_torques(out, loops, self.behind), self.robot.kinds
+                parts.append(torques.slopes(joints, [wanted[p] for p in places], slopes, kinds))
+            slopes = np.concatenate(parts, axis=1)
+            outputs = np.concatenate([joints + n * i for i in range(len(parts))])
             is_start = places >= len(columns)
             by_start, slopes = slopes[:, :, is_start], slopes[:, :, ~is_start]
             owner = owners[places[~is_start]]

@@ -138,3 +138,25 @@ def test_a_loop_that_is_soft_for_the_direct_method_is_named():
     assert soft.severity == "warning"
     assert soft.message.endswith("Set error = 'input'")
     assert soft.evidence["left"] > 0.5
+
+
+def test_torques_that_are_not_of_the_loop_are_named():
+    """Of two joints: swapped, and of the motor before a gear of 1:50 where the gain is stated."""
+    rng = np.random.default_rng(8)
+    robot = plant("planar", rng)
+    log, _ = recorded(robot, rng, duration=4.0, torque=0.5)
+    gains = LoopSettings(kp={"joint_1": 600.0, "joint_2": 250.0})
+
+    def missed(tau, loop):
+        own = replace(log, tau=tau)
+        found = identify_commands(
+            robot.model, [own], [], loop, settings(torques=True), chooses=False
+        )
+        return {f.where: f for f in found.findings if f.code == "torque_missed"}
+
+    assert not missed(log.tau, LoopSettings())
+    before = missed(log.tau * [1.0, 0.02], gains)
+    assert set(before) == {"joint_2"}
+    assert before["joint_2"].evidence["missed_pct"] > 500
+    assert before["joint_2"].severity == "warning"
+    assert set(missed(log.tau[:, ::-1], LoopSettings())) == {"joint_1", "joint_2"}

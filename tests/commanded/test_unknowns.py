@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 from helpers.mujoco_plant import multisine, plant, recorded
 
-from robotid.commanded.drive_torques import drive_torques, find_behind
+from robotid.commanded.drive_torques import drive_torques, find_gains, measured_motion
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.unknowns import LoopSimulator, Unknown, body_unknowns
@@ -58,25 +58,26 @@ def off(simulator, rng):
     return simulator.prior + np.where(is_body, 0.05 * rng.standard_normal(len(is_body)), 0.0)
 
 
-@pytest.mark.parametrize("compared", ["positions", "speeds", "torques"])
+@pytest.mark.parametrize("compared", ["positions", "speeds", "torques", "all"])
 def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
-    if compared == "speeds":
+    if compared in ("speeds", "all"):
         simulator = replace(simulator, velocities=True)
-    if compared == "torques":
-        simulator = replace(limited(simulator), error="input", behind=np.array([3, 2, 3]))
+    if compared in ("torques", "all"):
+        error = "output" if compared == "all" else "input"
+        simulator = replace(limited(simulator), error=error, behind=np.array([3, 2, 2.5]))
     theta = off(simulator, rng)
     found = simulator.residuals(theta, with_slopes=True)
     slopes = np.concatenate([r.slopes for r in found])  # of the outputs
     np.testing.assert_array_equal(found[0].columns, np.arange(len(theta)))
-    assert slopes.shape[1] == (6 if compared == "speeds" else 3)
+    assert slopes.shape[1] == {"speeds": 6, "all": 9}.get(compared, 3)
     plain = simulator.residuals(theta, with_slopes=False)
     for one, bare in zip(found, plain, strict=True):
         np.testing.assert_array_equal(one.e, bare.e)
         np.testing.assert_array_equal(one.joints, bare.joints)
     for k, name in enumerate(simulator.names):
         h = 1e-8 / max(np.abs(slopes[:, :3, k]).max(), 1e-4)
-        if compared == "torques":
-            h = 3e-8 / max(np.abs(slopes[..., k]).max(), 1e-2)
+        if compared in ("torques", "all"):
+            h = 3e-8 / max(np.abs(slopes[:, -3:, k]).max(), 1e-2)
         ends = []
         for s in (1, -1):
             moved = theta.copy()
@@ -85,9 +86,12 @@ def test_slopes_of_residuals_are_those_of_differences(simulator, rng, compared):
                 np.concatenate([r.e for r in simulator.residuals(moved, with_slopes=False)])
             )
         exact = -(ends[0] - ends[1]) / (2 * h)
-        size = np.maximum(np.abs(exact).max(axis=0), 1e-6)
-        close = 1e-4 if compared == "torques" else 1e-5  # by a wider step
-        assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size.max()).all(), name
+        close, least = 1e-5, 1e-6
+        if compared in ("torques", "all"):
+            close, least = 1e-4, 1e-3  # by a wider step
+        size = np.maximum(np.abs(exact).max(axis=0), least)
+        size = np.repeat(size.reshape(-1, 3).max(axis=1), 3)  # of positions, speeds, torques
+        assert (np.abs(slopes[..., k] - exact).max(axis=0) <= close * size).all(), name
     if compared == "torques":
         given = np.concatenate([out.window.log.tau[out.window.counted] - r.e for out, r in zip(
             simulator.roll_out(theta), simulator.residuals(theta, with_slopes=False), strict=True
@@ -126,15 +130,17 @@ def test_what_is_compared_is_what_was_logged(simulator):
     log, n = simulator.windows[0].log, 3
     outs = simulator.roll_out(theta)
     both = replace(simulator, velocities=True).residuals(theta, with_slopes=False)
-    behind = np.array([0, 3, 2])
+    behind = np.array([0, 3, 2.25])
     torques = replace(simulator, error="input", behind=behind).residuals(theta, with_slopes=False)
-    for out, moved, given in zip(outs, both, torques, strict=True):
+    all_ = replace(simulator, velocities=True, behind=behind).residuals(theta, with_slopes=False)
+    for out, moved, given, whole in zip(outs, both, torques, all_, strict=True):
+        np.testing.assert_array_equal(whole.e, np.hstack([moved.e, given.e]))
         k = out.window.counted
         np.testing.assert_array_equal(moved.e[:, :n], log.q[k] - out.q)
         np.testing.assert_array_equal(moved.e[:, n:], log.v[k] - out.v)
         rows = np.arange(k.start, k.stop)
         for j in range(n):
-            told = log.q_ref[np.maximum(rows - behind[j], 0), j]
+            told = np.interp(rows - behind[j], np.arange(len(log.t)), log.q_ref[:, j])
             tau = 20.0 * (told - out.q[:, j]) - 1.5 * out.v[:, j]
             np.testing.assert_allclose(given.e[:, j], log.tau[k, j] - tau, atol=1e-12)
 
@@ -202,7 +208,8 @@ def stiff(error, highest=1.5):
         replace(w, given=np.stack([out.q[w.begin], out.v[w.begin]]))
         for w in cut_windows(log, 0.5, 0.0)
     ]
-    return LoopSimulator(robot, tuple(windows), loops, tuple(unknowns), error=error, behind=behind)
+    told_by = None if error == "output" else behind
+    return LoopSimulator(robot, tuple(windows), loops, tuple(unknowns), error=error, behind=told_by)
 
 
 @pytest.mark.parametrize("error", ["output", "input", "direct"])
@@ -220,15 +227,48 @@ def test_drives_of_exact_data_are_recovered_from_20_percent_off(error):
     assert 0.05 < left < 0.4 if error == "direct" else left == 0.0
 
 
-def test_the_row_whose_command_a_torque_follows_is_found():
+@pytest.fixture(scope="module")
+def told():
+    """A planar arm whose commands act within the third row of 2 ms, its loops, and its log."""
     rng = np.random.default_rng(6)
-    arm = plant("planar", rng, delay=0.0053)  # within the third row of 2 ms
-    log, _ = recorded(arm, rng, duration=1.0, torque=0.3)
-    loops = truth_of(arm)
+    arm = plant("planar", rng, delay=0.0053)
+    log, _ = recorded(arm, rng, duration=2.0, torque=0.3, step=5e-5)
+    return arm, truth_of(arm), log
+
+
+def with_torques(outs, tau):
+    """The same roll-outs beside a log with other torques."""
+    return [replace(o, window=replace(o.window, log=replace(o.window.log, tau=tau))) for o in outs]
+
+
+def test_the_row_whose_command_a_torque_follows_is_found(told):
+    arm, loops, log = told
     outs = LoopedRobot(arm.model).roll_out(loops, cut_windows(log, np.inf, 0.0))
     known, unknown = np.zeros((2, 2), dtype=bool), np.array([[False, True], [True, False]])
-    np.testing.assert_array_equal(find_behind(outs, loops, known), [3, 3])
-    np.testing.assert_array_equal(find_behind(outs, loops, unknown), [3, 3])
-    early = replace(log, tau=np.vstack([log.tau[1:], log.tau[-1:]]))  # logged a row later
-    outs = [replace(out, window=replace(out.window, log=early)) for out in outs]
-    np.testing.assert_array_equal(find_behind(outs, loops, known), [2, 2])
+    for is_open in (known, unknown):
+        behind, found = find_gains(outs, loops, is_open, knows_delay=True, is_whole=False)
+        np.testing.assert_array_equal(behind, [3, 3])
+        np.testing.assert_allclose(found.kp, loops.kp, rtol=5e-3)
+        np.testing.assert_allclose(found.kd, loops.kd, rtol=2e-2)
+        np.testing.assert_array_equal(found.kp[0], loops.kp[0])  # is stated
+    noise = 0.3 * np.random.default_rng(7).standard_normal(log.tau.shape)
+    for true in ([2.0, 4.0], [2.3, 3.8]):  # others, and between two rows
+        other = with_torques(outs, drive_torques(outs[0], loops, np.array(true)).given + noise)
+        behind, _ = find_gains(other, loops, known, knows_delay=True, is_whole=False)
+        np.testing.assert_allclose(behind, true, atol=0.0 if true[0] == 2.0 else 0.05)
+
+
+def test_torques_tell_gains_before_anything_is_fitted(told):
+    _, loops, log = told
+    moved = [measured_motion(window) for window in cut_windows(log, np.inf, 0.0)]
+    open_ = replace(loops, kp=np.ones(2), kd=np.zeros(2), delay=np.zeros(2))
+    is_open = np.ones((2, 2), dtype=bool)
+    behind, found = find_gains(moved, open_, is_open, knows_delay=False, is_whole=True)
+    np.testing.assert_array_equal(behind, [3, 3])
+    np.testing.assert_allclose(found.kp, loops.kp, rtol=0.02)
+    np.testing.assert_allclose(found.kd, loops.kd, rtol=0.05)
+    _, found = find_gains(
+        with_torques(moved, -log.tau), open_, is_open, knows_delay=False, is_whole=True
+    )
+    np.testing.assert_array_equal(found.kp, open_.kp)  # no gain that would drive it away
+    np.testing.assert_array_equal(found.kd, open_.kd)

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 from helpers.mujoco_plant import plant, recorded
 
+from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.settings import LoopSettings
+from robotid.commanded.unknowns import LoopSimulator, body_unknowns
 from robotid.commanded.zeros import CLEAR, find_encoders, parallel_axes
 from robotid.identification.settings import SimulationSettings
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
+from robotid.simulation.loops import LoopedRobot
 
 AWAY = 0.5  # [rad] of the thigh's zero from the URDF's
 SETTINGS = SimulationSettings(window=1.0, lead=0.3, bodies=0.0, step=2e-3)
@@ -91,18 +94,32 @@ def test_an_encoder_that_counts_the_other_way_is_turned(leg):
 def test_torques_tell_the_gains_that_positions_leave_open():
     rng = np.random.default_rng(3)
     robot = plant("planar", rng)
-    log, truth = recorded(robot, rng, duration=6.0, rate=250.0, torque=0.5)
-    settings = replace(SETTINGS, bodies=0.1)
+    looped = LoopedRobot(robot.model)
+    unknowns = tuple(body_unknowns(looped, 0.1))
+    simulator = LoopSimulator(looped, (), stated_loops(robot.model, LoopSettings()), unknowns)
+    lighter = [np.log(0.7) / 2 if u.name.endswith("mass") else 0.0 for u in unknowns]
+    # by the URDF's masses positions take the scale, which the torques then have to move
+    robot = replace(robot, bodies=simulator.loops(np.array(lighter)).bodies.reshape(-1))
+    log, truth = recorded(robot, rng, duration=6.0, rate=250.0, torque=0.5, step=1e-4)
+    settings, loop = replace(SETTINGS, bodies=0.1), LoopSettings(delays="group")
     open_, told = (
-        identify_commands(robot.model, [each], [], LoopSettings(), settings, chooses=False)
+        identify_commands(robot.model, [each], [], loop, settings, chooses=False)
         for each in (replace(log, tau=0 * log.tau, has_torque=False), log)
     )
     for joint in robot.model.joints:
         name = f"{joint}.kp"
         k, m = (list(f.fitted.estimate.names).index(name) for f in (open_, told))
-        assert told.fitted.estimate.theta[m] == pytest.approx(truth[name], rel=0.01)
+        assert told.fitted.estimate.theta[m] == pytest.approx(truth[name], rel=0.001)
+        assert told.fitted.simulator.prior[m] == pytest.approx(truth[name], rel=0.01), (
+            "begins there"
+        )
         error, before = told.fitted.estimate.std_error[m], open_.fitted.estimate.std_error[k]
-        assert error < 0.1 * before
+        assert error < 0.01 * before
+    estimate = told.fitted.estimate
+    np.testing.assert_allclose(estimate.sigma[2:], 0.5, rtol=0.05)  # of torques: nothing is left
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std_error, strict=True):
+        if not name.endswith("offset") and name in truth:  # the plant's friction creeps
+            assert abs(value - truth[name]) < 4 * std, name
     assert f"{robot.model.joints[0]}.kd" in told.fitted.estimate.names
     assert "scale" in {f.code for f in open_.findings}
     assert "scale" not in {f.code for f in told.findings}
