@@ -33,9 +33,9 @@ STEP = 1e-3  # [s] of our roll-outs
 #: Gains of three joints [N m/rad], [N m s/rad], and the highest tone of their commands [Hz].
 CASES = {"stiff": (80.0, 3.0, 1.5), "soft": (20.0, 1.2, 4.0)}
 METHODS = {
-    "positions (output)": {"torques": False},
-    "positions, and torques along what was measured": {},
-    "torques along roll-outs (input)": {"error": "input"},
+    "positions alone (output)": {"torques": False},
+    "positions and torques (output)": {},
+    "torques alone (input)": {"error": "input"},
     "the same, motion neglected (direct)": {"error": "direct"},
 }
 
