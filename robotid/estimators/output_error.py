@@ -6,6 +6,7 @@ is correlated; it is whitened, e_t - rho e_(t-1), by joint, else what acts fast,
 beside what drifts.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -300,7 +301,7 @@ class OutputError:
             raise DataError(
                 f"{rows} samples of position for {len(theta)} parameters; record a longer motion"
             )
-        stretches = _stretches(simulator, weights, theta)
+        stretches = _stretches(simulator, weights, theta, are_windows=self.frees)
         meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
         if len(stretches) >= FEWEST_STRETCHES:
             found = scatter(stretches, np.zeros(len(theta)), np.ones(1), bread)
@@ -432,13 +433,22 @@ def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: floa
     return trial
 
 
-def _stretches(simulator: Simulator, weights: _Weights, theta: Array) -> list[Factors]:
-    """Return the factors of the whitened rows, stretch by stretch."""
+def _stretches(
+    simulator: Simulator, weights: _Weights, theta: Array, *, are_windows: bool
+) -> list[Factors]:
+    """Return the factors of the whitened rows, stretch by stretch.
+
+    Windows in which nothing takes back what drifts are stretches as they are: what is wrong early
+    stays until their end.
+    """
     found = list(linearised(simulator, weights, theta, frees=True))
     c, total = len(theta), sum(len(b) for _, b, _ in found)
     stretches: list[Factors] = []
     for A, b, columns in found:
-        for rows in np.array_split(np.arange(len(b)), max(1, round(_STRETCHES * len(b) / total))):
+        cuts = max(1, round(_STRETCHES * len(b) / total))
+        if are_windows:
+            cuts = math.ceil(FEWEST_STRETCHES / len(found))
+        for rows in np.array_split(np.arange(len(b)), cuts):
             triangle = triangle_of(np.column_stack([A[rows], b[rows]]))
             stretches.append(Factors((triangle,), (columns,), np.array([len(rows)]), _names(c)))
     return stretches

@@ -304,3 +304,17 @@ def test_what_is_linearised_is_whitened(rng):
     np.testing.assert_allclose(b, (r.e[1:, 0] - rho * r.e[:-1, 0]) / sigma)
     np.testing.assert_allclose(A, (r.slopes[1:, 0] - rho * r.slopes[:-1, 0]) / sigma)
     np.testing.assert_array_equal(columns, [0, 1, 2])
+
+
+def test_standard_errors_of_what_drifts_are_the_scatter_of_many_drifts():
+    """What an input's noise adds up to: whitening leaves much of it, as long as a window goes."""
+    rng = np.random.default_rng(9)
+    draws = []
+    for _ in range(100):
+        lag = lagging(rng, windows=20, samples=240)
+        drift = 0.002 * np.cumsum(rng.standard_normal(lag.told.shape), axis=1)
+        own = {**vars(lag), "measured": lag.simulated(TRUTH) + drift}
+        draws.append(OutputError(frees=True, rounds=2).fit(Started(**own), TRUTH))
+    theta = np.array([d.theta for d in draws])
+    ratio = np.mean([d.std_error for d in draws], axis=0) / theta.std(axis=0)
+    assert ((ratio > 0.8) & (ratio < 1.25)).all(), ratio
