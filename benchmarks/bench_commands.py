@@ -1,7 +1,7 @@
 """Drives from commands and positions: errors of open loops, intervals, and time.
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
-        [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque]]
+        [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque] [--driven]]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
@@ -12,8 +12,10 @@ and offset; and the last with what friction other windows confirm. The simulated
 16 kHz, written at 100 Hz, its torque with noise of 1 % of its size, encoders of 0.05 mrad.
 --coverage: MuJoCo rolls out a robot with known
 drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
-with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. Times are of the processor,
-all threads together, where they do not say otherwise: other loads of the machine add little.
+with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. --driven: again without
+commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %. Times are of the
+processor, all threads together, where they do not say otherwise: other loads of the machine add
+little.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -104,6 +106,9 @@ def main():
     parser.add_argument(
         "--with-torque", action="store_true", help="of --coverage, again with logged torques"
     )
+    parser.add_argument(
+        "--driven", action="store_true", help="of --coverage, again driven by the logged torque"
+    )
     parser.add_argument("--sysid-steps", type=int, default=30, help="most steps; 0: as published")
     parser.add_argument("--out", type=Path, help="folder that bench_commands.json is written to")
     options = parser.parse_args()
@@ -113,8 +118,13 @@ def main():
         "arms": options.arms and arms,
         "rollouts": options.rollouts and (lambda: rollouts(0.3 if options.quick else 3.0)),
         "coverage": options.coverage
-        and (lambda: coverage(options.robots, options.coverage, with_torque=options.with_torque)),
-    }
+        and (
+            lambda: coverage(
+                options.robots, options.coverage, with_torque=options.with_torque,
+                driven=options.driven,
+            )
+        ),
+    }  # fmt: skip
     if not any(parts.values()):
         runs = (["planar"], 2, 4.0) if options.quick else (options.robots, 20)
         parts["rollouts"] = lambda: rollouts(0.3 if options.quick else 3.0)
@@ -497,7 +507,7 @@ def drive_pi(plant):
     return pi
 
 
-def coverage(robots, runs, seconds=DURATION, *, with_torque=False):
+def coverage(robots, runs, seconds=DURATION, *, with_torque=False, driven=False):
     """Print how well intervals hold the truth, by robot and kind of parameter; return the rows."""
     print(f"| robot, {runs} runs | parameter | values | mean error over scatter | error said over "
           "scatter | 95 % intervals hold | said, over no torque's | error, likewise |")  # fmt: skip
@@ -510,6 +520,9 @@ def coverage(robots, runs, seconds=DURATION, *, with_torque=False):
             rows += coverage_rows(f"{name}, all found", alone)
             both = covered(name, runs, seconds, finds_all=True, torque=True)
             rows += coverage_rows(f"{name}, all found, torque", both, alone)
+        if driven:
+            for way, found in driven_errors(name, runs, seconds).items():
+                rows += coverage_rows(f"{name}, driven, {way}", found)
     print()
     return rows
 
@@ -524,6 +537,37 @@ def covered(name, runs, seconds, **how):
     print(f"{name}: {(time.process_time() - begun) / runs:.1f} s of processor a run",
           file=sys.stderr)  # fmt: skip
     return {kind: np.array(pairs).T for kind, pairs in found.items()}
+
+
+def driven_errors(name, runs, seconds):
+    """Return the same of a robot that its torque drives, by what it was fitted to."""
+    ways = {"roll-outs alone": {"torques": False}, "both": {"torques": True}}
+    errors = {way: {} for way in ("torque rows alone", *ways)}
+    for seed in range(runs):
+        rng = np.random.default_rng([18, seed])
+        plant = mujoco_plant.plant(name, rng, delay=0.0)
+        log = mujoco_plant.torque_log(plant, rng, duration=seconds, noise=5e-5, relative=0.05)
+        for way, changes in ways.items():
+            found = identify_commands(
+                plant.model, [log], [], LoopSettings(kind="torque"),
+                SimulationSettings(bodies=0.0, **changes), signals=SignalSettings(cutoff=10.0),
+                chooses=False,
+            )  # fmt: skip
+            estimate, linear = found.fitted.estimate, found.fitted.linear
+            kinds = [(key, key.rpartition(".")[2]) for key in estimate.names]
+            for (key, kind), theta, said in zip(
+                kinds, estimate.theta, estimate.std_error, strict=True
+            ):
+                errors[way].setdefault(kind, []).append((theta - plant.truth[key], said))
+        place = linear.model.layout.names.index
+        for key, kind in kinds:
+            error = linear.standard[place(key)] - plant.truth[key]
+            said = np.sqrt(linear.standard_covariance[place(key), place(key)])
+            if kind != "armature":  # which rows tell with the bodies alone
+                errors["torque rows alone"].setdefault(kind, []).append((error, said))
+    return {
+        way: {kind: np.array(pairs).T for kind, pairs in own.items()} for way, own in errors.items()
+    }
 
 
 def coverage_rows(name, found, alone=None):
