@@ -113,8 +113,15 @@ def fit_loops(
     begin = _begun_by_torque if loop.kind == "torque" else _begun_by_commands
     begun = begin(model, logs, loop, settings, signals, progress)
     simulator, estimator = begun.simulator, begun.estimator
-    few = replace(simulator, windows=_few(simulator.windows))
-    theta = replace(estimator, rounds=1).fit(few, simulator.prior).theta
+    # the URDF's bodies first: with bodies that change, too, many scales suit nearly as well
+    drives = [k for k, unknown in enumerate(simulator.unknowns) if unknown.what != "body"]
+    few = replace(
+        simulator,
+        windows=_few(simulator.windows),
+        unknowns=tuple(simulator.unknowns[k] for k in drives),
+    )
+    theta = simulator.prior.copy()
+    theta[drives] = replace(estimator, rounds=1).fit(few, few.prior).theta
     simulator = replace(simulator, error=settings.error)
     for left in reversed(range(_STARTS)):
         simulator = simulator.begun_better(theta)

@@ -165,6 +165,18 @@ def test_without_gains_the_scale_is_said_to_rest_on_the_urdf(leg):
     assert found.kept[0].urdf is None, "without gains, the URDF has no open loop"
 
 
+def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
+    rng = np.random.default_rng(5)
+    robot = plant("planar", rng)
+    log, truth = recorded(robot, rng, duration=6.0, rate=250.0, step=2e-4)
+    settings, loop = replace(SETTINGS, bodies=0.1, step=2e-3), LoopSettings(delays="group")
+    fitted = identify_commands(robot.model, [log], [], loop, settings, chooses=False).fitted
+    gains = [unknown.what == "kp" for unknown in fitted.simulator.unknowns]
+    exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
+    np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)
+    assert (fitted.estimate.std_error[gains] > 0.1 * exact).all(), "others would do, too"
+
+
 def test_joints_of_a_group_share_their_drive(leg):
     robot, log, kept = leg
     hip, thigh, calf = robot.model.joints
