@@ -1,4 +1,4 @@
-"""What drives give along a roll-out, and what changes it: the output of closed-loop input error."""
+"""What drives give along a motion, what changes it, and the gains that logged torques tell."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

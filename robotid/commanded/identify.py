@@ -31,7 +31,7 @@ _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is
 _FROM_PRIOR = 0.9  # ... above this share, what was assumed of it
 _TOGETHER = 0.98  # correlation from which two parameters are told together only
 _SOFT = 0.5  # of what a step should correct: a loop that leaves more is soft
-_MISSED = 0.5  # of a logged torque, that a loop which gives it does not miss
+_MISSED = 0.5  # of a torque, that a loop which gives it does not miss
 _NAMED = 8  # parameters that a sentence names
 
 
@@ -339,9 +339,10 @@ def _torques_missed(found: Commanded) -> Iterator[Finding]:
                 "torque_missed",
                 "warning",
                 joint,
-                f"{joint}: its loop misses {100 * share:.0f} % of the logged torque (root mean "
-                "square), by which gains and friction are scaled; see whether the column is this "
-                "joint's, in N m behind the gear and of this controller, or set torques = false",
+                f"{joint}: its loop and the logged torque, by which gains and friction are scaled, "
+                f"differ by {100 * share:.0f} % of the larger (root mean squares); see whether the "
+                "column is this joint's, in N m behind the gear and of this controller, or set "
+                "torques = false",
                 {"missed_pct": 100 * share},
             )
 

@@ -221,7 +221,9 @@ class LoopSimulator:
         return R[:, :-1] @ (K @ slopes), R[:, -1] - R[:, :-1] @ (K @ pi)
 
     def missed_torque(self, theta: Array) -> Array:
-        """Return how much of the logged torques roll-outs miss, root mean squares, shape (n,) [-].
+        """Return how much of the torques roll-outs miss, root mean squares, shape (n,) [-].
+
+        It is measured by the logged torque or by that of the roll-outs, whichever is larger.
 
         Args:
             theta: Values of the unknowns, shape (c,).
@@ -232,7 +234,8 @@ class LoopSimulator:
         torques = replace(self, error="input").residuals(theta, with_slopes=False)
         missed = np.concatenate([part.e for part in torques])
         logged = np.concatenate([w.log.tau[w.counted] for w in self.windows])
-        share: Array = np.sqrt(np.mean(missed**2, axis=0) / np.mean(logged**2, axis=0))
+        size = np.maximum(np.mean(logged**2, axis=0), np.mean((logged - missed) ** 2, axis=0))
+        share: Array = np.sqrt(np.mean(missed**2, axis=0) / np.maximum(size, 1e-300))
         return share
 
     def standard(self, model: RobotModel, theta: Array) -> tuple[Array, Array]:

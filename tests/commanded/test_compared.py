@@ -157,6 +157,7 @@ def test_torques_that_are_not_of_the_loop_are_named():
     assert not missed(log.tau, LoopSettings())
     before = missed(log.tau * [1.0, 0.02], gains)
     assert set(before) == {"joint_2"}
-    assert before["joint_2"].evidence["missed_pct"] > 500
+    assert before["joint_2"].evidence["missed_pct"] == pytest.approx(98, abs=0.5)
+    assert "differ by 98 % of the larger" in before["joint_2"].message
     assert before["joint_2"].severity == "warning"
     assert set(missed(log.tau[:, ::-1], LoopSettings())) == {"joint_1", "joint_2"}
