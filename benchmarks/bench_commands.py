@@ -405,10 +405,13 @@ def arm_rows(name, model, logs, kept, signals, truth=None):
     )
     plain = rows["torque rows alone"]
     for way, (torque, position, spent) in rows.items():
-        print(f"| {name} | {way} | {' '.join(f'{x:.2f}' for x in torque)} | "
-              f"{' '.join(f'{1e3 * x:.1f}' for x in position)} | "
-              f"{geometric_mean(torque / plain[0]):.2f} | "
-              f"{geometric_mean(position / plain[1]):.2f} | {spent:.0f} |", flush=True)  # fmt: skip
+        moved, ratio = "-", "-"
+        if np.isfinite(position).all():
+            moved = " ".join(f"{1e3 * x:.1f}" for x in position)
+            ratio = f"{geometric_mean(position / plain[1]):.2f}"
+        print(f"| {name} | {way} | {' '.join(f'{x:.2f}' for x in torque)} | {moved} | "
+              f"{geometric_mean(torque / plain[0]):.2f} | {ratio} | {spent:.0f} |",
+              flush=True)  # fmt: skip
     return {
         way: {"torque": list(own[0]), "position": list(own[1]), "seconds": own[2]}
         for way, own in rows.items()
@@ -420,7 +423,7 @@ def driven_error(model, pi, log, signals):
     heard = driven_log(model, log, signals)
     try:
         return run_open_loop(LoopedRobot(model), open_loops(model, pi), heard).rmse
-    except SettingsError:  # a term that rows of torque have, and roll-outs have not: shown as nan
+    except SettingsError:  # a term that rows of torque have, and roll-outs have not: shown as "-"
         return np.full(len(model.joints), np.nan)
 
 

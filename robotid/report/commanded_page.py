@@ -185,7 +185,7 @@ def _facts(content: Mapping[str, Any], files: Mapping[str, str]) -> str:
         )
     }
     times = [
-        f"{label} {theirs / ours:.2g} ×"
+        f"{label} {(ratio := theirs / ours):{'.2g' if ratio < 99.5 else '.0f'}} ×"
         for key, (label, _) in _OTHERS.items()
         if ours and (theirs := _mean([each.get(key) for each in joints]))
     ]
