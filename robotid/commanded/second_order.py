@@ -24,6 +24,7 @@ _FRICTIONS = (0.05, 0.5)  # of the loop's usual torque
 _DELAYS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08)  # [s]
 _TRIED = 8  # windows that the tries look at ...
 _FITTED = 16  # ... and the fit
+_SHOWS = 1e-3  # of the inertia of the fastest loop: below it, none is told
 _LEAST = 1e-6  # of the usual inertia, that a joint must have
 _TERMS = (TERMS["viscous"], TERMS["coulomb"], TERMS["offset"])
 _STEPS = 12  # of the fit
@@ -47,8 +48,9 @@ class SecondOrder:
 
     @property
     def inertia(self) -> Array:
-        """Inertia J of each joint [kg m^2 or kg]."""
-        return self.loops.armature
+        """Inertia J of each joint [kg m^2 or kg]; that of the fastest loop where none shows."""
+        fastest: Array = self.loops.kp / _FREQUENCIES[-1] ** 2
+        return np.where(self.loops.armature > _SHOWS * fastest, self.loops.armature, fastest)
 
     @property
     def time_constant(self) -> Array:

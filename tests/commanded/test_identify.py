@@ -8,6 +8,7 @@ from helpers.single_joint import slider
 from robotid.commanded.fit import stated_loops
 from robotid.commanded.identify import identify_commands
 from robotid.commanded.open_loop_verdict import judge_open_loops
+from robotid.commanded.second_order import SecondOrder
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import DataError
 from robotid.identification.settings import SimulationSettings
@@ -175,6 +176,13 @@ def test_of_many_scales_that_suit_the_positions_the_urdfs_is_taken():
     exact = np.array([truth[name] for name in np.array(fitted.estimate.names)[gains]])
     np.testing.assert_allclose(fitted.estimate.theta[gains], exact, rtol=0.02)
     assert (fitted.estimate.std_error[gains] > 0.1 * exact).all(), "others would do, too"
+
+
+def test_a_joint_whose_inertia_does_not_show_begins_as_the_fastest_loop(leg):
+    stated_ = stated_loops(leg[0].model, LoopSettings(kp={"FL_calf_joint": 50.0}))
+    loops = replace(stated_, armature=np.array([1e-12, 0.01, 1e-6]))
+    plain = SecondOrder(None, np.zeros(0), loops, np.ones(3))
+    np.testing.assert_allclose(plain.inertia, [1 / 96**2, 0.01, 50 / 96**2])
 
 
 def test_joints_of_a_group_share_their_drive(leg):
