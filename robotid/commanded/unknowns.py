@@ -344,13 +344,14 @@ class LoopSimulator:
     ) -> Iterator[Residual]:
         """Yield the residuals of a roll-out's parts, with all that they change with."""
         error, wanted, n = self._error(out, loops), [*columns, *self._starts()], len(loops.kp)
+        torques = None if self.behind is None else drive_torques(out, loops, self.behind)
         for joints, places, slopes in out.slopes:
             k = len(joints)
             parts = [slopes[:, :k]] if self.error == "output" else []
             parts += [slopes[:, k:]] if self.velocities else []
-            if self.behind is not None:
-                torques, kinds = drive_torques(out, loops, self.behind), self.robot.kinds
-                parts.append(torques.slopes(joints, [wanted[p] for p in places], slopes, kinds))
+            if torques is not None:
+                by = [wanted[p] for p in places]
+                parts.append(torques.slopes(joints, by, slopes, self.robot.kinds))
             slopes = np.concatenate(parts, axis=1)
             outputs = np.concatenate([joints + n * i for i in range(len(parts))])
             is_start = places >= len(columns)
