@@ -6,7 +6,9 @@ masses are unlike its URDF's. Recorded, if ROBOTID_DATA names the folder: other 
 and the first tenth of each ("short"), where the excitation is poor. "auto" is the default: by
 held-out stretches where the log is long enough, else 1.
 
-    ROBOTID_DATA=folder python benchmarks/bench_priors.py [--quick]
+    ROBOTID_DATA=folder python benchmarks/bench_priors.py [--quick | --weights]
+
+``--weights`` compares the chosen weight with fixed ones on the job files of tests/jobs.
 """
 
 import argparse
@@ -49,7 +51,11 @@ QUICK = [name for name in FITS if not name.startswith("entropic, ")]
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few cases, no entropic prior")
+    parser.add_argument("--weights", action="store_true", help="the chosen weight, fixed ones")
     options = parser.parse_args()
+    if options.weights:
+        weights()
+        return
     names = QUICK if options.quick else list(FITS)
     ratios, shorts = {name: [] for name in names}, {name: [] for name in names}
     for title, model, signals, train, test in cases(options.quick):
@@ -74,6 +80,31 @@ def main():
         cells += [summary(ratios[name], max), summary(shorts[name], max)]
         seconds = np.mean([s for _, s in ratios[name] + shorts[name]])
         print(f"| {name} | {' | '.join(cells)} | {seconds:.2f} |")
+    print(f"\n{machine()}")
+
+
+def weights():
+    """Print validation errors with the chosen and with fixed weights, for each job file."""
+    print("| job | weight | error per joint [%] | over the best fixed one | worst joint |")
+    print("|---|---|---|---|---|")
+    for path in sorted(JOBS.glob("*.toml")):
+        job, errors = read_job(path), {}
+        model = job.model()
+        fitted, kept = (
+            [job.read(e, model) for e in x] for x in (job.identification, job.validation)
+        )
+        for weight in (100.0, 10.0, 1.0, 0.1, "auto"):
+            settings = replace(job.estimator, prior_weight=weight, draws=0)
+            found = identify(
+                model, fitted, validation=kept, signals=job.signals, estimator=settings
+            )
+            errors[weight] = error_per_joint(found, "estimate")
+            chosen = found.estimate.details["prior"]["weight"]
+            best = min((errors[w] for w in errors if w != "auto"), key=mean)
+            ratio = errors[weight] / best
+            shown = f"{chosen:.3g}" if weight != "auto" else f"auto: {chosen:.3g}"
+            beside = f"{mean(ratio):.3f} | {ratio.max():.3f}" if weight == "auto" else "- | -"
+            print(f"| {path.stem} | {shown} | {row(errors[weight])} | {beside} |", flush=True)
     print(f"\n{machine()}")
 
 

@@ -17,7 +17,7 @@ from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import Sample, misfit_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
-from robotid.robot.bodies import held_parameters
+from robotid.robot.bodies import held_parameters, least_density
 from robotid.robot.geometry import body_boxes, body_points
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -45,6 +45,7 @@ _SHRUNK = 0.1  # of the URDF's smallest moment of mass: a link so much smaller i
 _MUCH = 0.2  # share of a body's mass in links on locked joints that may leave it so
 _USER_BOUNDS = ("mass ", "total_mass ", "centre_of_mass ")
 _BEYOND = 0.02  # share of a recording's rows beyond what friction was fitted to, that is told
+_DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
 
 
@@ -69,6 +70,7 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
     findings += _bound_findings(identification)
     findings += _total_mass(identification)
     findings += _impossible_shapes(identification)
+    findings += _dense_bodies(identification)
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
     findings += _drive_findings(identification)
@@ -329,6 +331,30 @@ def _impossible_shapes(identification: Identification) -> list[Finding]:
             message = f"as identified, {said}; record more motion of it, or pin it to the URDF"
             finding = replace(finding, message=message)
         findings.append(finding)
+    return findings
+
+
+def _dense_bodies(identification: Identification) -> list[Finding]:
+    """Return which identified bodies are so thin that no material is dense enough for their mass.
+
+    Bodies that are as dense in the URDF are left out.
+    """
+    findings, size = [], identification.model.layout.n_inertial
+    before, after = (
+        pi[:size].reshape(-1, 10) for pi in (identification.prior, identification.standard)
+    )
+    for body, was, now in zip(identification.model.layout.bodies, before, after, strict=True):
+        density = least_density(now)
+        if density <= max(_DENSEST, least_density(was)):
+            continue
+        message = (
+            f"{body}: as identified, its mass of {now[0]:.3g} kg is in a volume so small that its "
+            f"density is at least {density:.3g} kg/m^3, wanted at most {_DENSEST:g}. The torque "
+            "may be right, the body is not: record motion that moves it in more ways, or pin it "
+            "to the URDF"
+        )
+        evidence = {"mass": float(now[0]), "density": density}
+        findings.append(Finding("dense_body", "warning", f"link {body}", message, evidence))
     return findings
 
 

@@ -22,6 +22,7 @@ __all__ = [
     "central_inertial",
     "held_parameters",
     "inertial_parameters",
+    "least_density",
     "link_places",
     "link_transfer",
     "principal_moments",
@@ -159,3 +160,23 @@ def principal_moments(parameters: Array) -> tuple[Array, Array]:
     moments, axes = np.linalg.eigh(H @ pseudo_inertia(parameters)[0] @ H.T)
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return moments, axes
+
+
+def least_density(parameters: Array) -> float:
+    """Return the smallest density that a body's mass and second moments of mass allow [kg/m^3].
+
+    Of all bodies of one mass and largest density, a homogeneous ellipsoid has the smallest
+    determinant of second moments; with semi-axes a these are m a^2 / 5.
+
+    Args:
+        parameters: Inertial parameters of the body, shape (10,).
+
+    Returns:
+        The density; inf of a body with mass and without extent, 0 of one without mass.
+    """
+    mass = float(parameters[0])
+    if mass <= 0:
+        return 0.0
+    axes = np.sqrt(5.0 * np.maximum(principal_moments(parameters)[0], 0.0) / mass)  # (3,) [m]
+    volume = 4.0 / 3.0 * np.pi * float(np.prod(axes))
+    return mass / volume if volume > 0 else float("inf")

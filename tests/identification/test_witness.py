@@ -102,6 +102,28 @@ def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is
     assert "so it is in the URDF already" in finding.message
 
 
+def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5):
+    from robotid.identification.findings import fit_findings
+
+    found = found_of(ur5, near_urdf(ur5))
+
+    def dense(found):
+        return [f for f in fit_findings(found, None) if f.code == "dense_body"]
+
+    assert dense(found) == []
+    needle = found.standard.copy()
+    second = slice(10, 20)  # 7.6 kg about the URDF's frame, semi-axes of 6, 6 and 225 mm
+    x, y, z = 7.6 * np.array([0.006, 0.006, 0.225]) ** 2 / 5.0
+    needle[second] = [7.6, 0.0, 0.0, 0.0, y + z, 0.0, z + x, 0.0, 0.0, x + y]
+    (finding,) = dense(replace(found, standard=needle))
+    assert finding.where == f"link {ur5.layout.bodies[1]}"
+    density = 7.6 / (4.0 / 3.0 * np.pi * 0.006 * 0.006 * 0.225)
+    assert finding.evidence == {"mass": 7.6, "density": pytest.approx(density)}
+    assert "7.6 kg" in finding.message
+    assert "at least 2.24e+05 kg/m^3, wanted at most 12000" in finding.message
+    assert dense(replace(found, standard=needle, prior=needle)) == []
+
+
 def test_a_result_that_its_prior_holds_back_bears_no_witness(ur5, rng):
     pi = truth(ur5)
     size = ur5.layout.n_inertial

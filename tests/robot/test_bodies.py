@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robotid.robot.bodies import held_parameters, link_places
+from robotid.robot.bodies import held_parameters, least_density, link_places
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -37,3 +37,15 @@ def test_links_behind_a_locked_joint_are_held(panda):
     held = held_parameters(panda).reshape(-1, 10)
     assert held[-1, 0] == pytest.approx(2 * fingers)
     assert not held[:-1].any()
+
+
+def test_the_least_density_of_a_body_is_that_of_its_ellipsoid():
+    m, a = 3.0, np.array([0.1, 0.2, 0.05])  # [kg], [m] semi-axes
+    x, y, z = m * a**2 / 5.0
+    c = np.array([0.3, -0.1, 0.2])
+    inertia = np.diag([y + z, z + x, x + y]) + m * (c @ c * np.eye(3) - np.outer(c, c))
+    Ixx, Ixy, Ixz, Iyy, Iyz, Izz = inertia[np.triu_indices(3)]
+    pi = np.array([m, *(m * c), Ixx, Ixy, Iyy, Ixz, Iyz, Izz])
+    assert least_density(pi) == pytest.approx(m / (4.0 / 3.0 * np.pi * a.prod()))
+    assert least_density(np.zeros(10)) == 0.0
+    assert least_density(np.array([1.0, *np.zeros(9)])) == np.inf

@@ -80,7 +80,7 @@ def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
 def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
     fit, problem = case
     stretches = cut(problem, 3)
-    total, count = 0.0, 0
+    total, count = np.zeros(6), 0
     for k in range(3):
         others = [s for i, s in enumerate(stretches) if i != k]
         rows = fit.rows(merge(others), NOISE)
@@ -88,10 +88,10 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
         W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
-        total, count = total + (residual**2).sum(), count + residual.size
-    error = np.sqrt(held_out_errors(fit, stretches, NOISE, 2.0).sum())
+        total, count = total + (residual**2).sum(axis=0), count + len(residual)
+    error = np.sqrt(held_out_errors(fit, stretches, NOISE, 2.0).sum(axis=0))
     # it is computed to the solver's tolerance only
-    assert error == pytest.approx(np.sqrt(total / count), rel=2e-4)
+    np.testing.assert_allclose(error, np.sqrt(total / count), rtol=2e-4)
 
 
 def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
@@ -109,20 +109,59 @@ def test_the_chosen_weight_is_the_best_of_its_curve_and_is_stated(ur5, rng):
         assert weights.max() == 100.0
 
 
-@pytest.mark.parametrize(("gain", "weight"), [(0.01, 100.0), (0.5, 0.01)])
-def test_a_lighter_weight_must_be_better_beyond_chance(case, monkeypatch, gain, weight):
-    fit, problem = case
-    chance = np.array([0.1, -0.1, 0.05, -0.1, 0.1, -0.05])  # in favour of some stretches only
+CHANCE = np.array([[0.05], [-0.05], [0.02], [-0.05], [0.05], [-0.02]])  # (segments, 1)
 
-    def errors(fit, stretches, sigma, w, starts):
-        distance = abs(np.log10(w) + 2.0)  # smallest at 0.01
-        return 1.0 + distance * (gain + chance), []
+
+def chosen(case, monkeypatch, excess):
+    """Return the choice where mean squares rise by excess (6, n) per decade above 0.01."""
+    fit, problem = case
+
+    def errors(fit, segments, sigma, w, starts):
+        return (1.0 + abs(np.log10(w) + 2.0) * np.asarray(excess)) / 6.0, []
 
     monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
-    choice = choose_weight(fit, cut(problem, 6), "cv")
+    return choose_weight(fit, cut(problem, 6), "cv")
+
+
+@pytest.mark.parametrize(("gain", "weight"), [(0.009, 100.0), (0.03, 0.1), (0.5, 0.01)])
+def test_a_larger_weight_costs_at_most_two_percent_of_the_error(case, monkeypatch, gain, weight):
+    choice = chosen(case, monkeypatch, gain + CHANCE)
     assert choice.weight == pytest.approx(weight)
     weights, scores = zip(*choice.curve, strict=True)
     assert weights[int(np.argmin(scores))] == pytest.approx(0.01)
+    # the RMS over segments of chance that adds up to 0
+    assert scores[-1] == pytest.approx(np.sqrt(1.0 + 4.0 * gain))
+
+
+def test_a_certain_loss_is_refused_however_small(case, monkeypatch):
+    assert chosen(case, monkeypatch, np.full((6, 1), 0.009)).weight == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("bad", [[3], [1, 4]])
+def test_one_or_two_bad_segments_reject_a_weight(case, monkeypatch, bad):
+    excess = np.zeros((6, 2))
+    excess[bad] = 30.0
+    assert chosen(case, monkeypatch, excess).weight == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(("loss", "weight"), [(1.04, 100.0), (1.06, 10.0)])
+def test_no_joint_may_lose_more_than_five_percent(case, monkeypatch, loss, weight):
+    excess = np.tile(CHANCE, (1, 6))
+    excess[:, 4] += (loss**2 - 1.0) / 4.0  # at the weight of 100, four decades from the best
+    assert chosen(case, monkeypatch, excess).weight == pytest.approx(weight)
+
+
+def test_a_joint_at_rest_is_left_out_of_the_choice(case, monkeypatch):
+    fit, problem = case
+
+    def errors(fit, segments, sigma, w, starts):
+        squares = (1.0 + abs(np.log10(w) + 2.0) * (0.009 + CHANCE)) / 6.0
+        return np.hstack([squares, np.zeros_like(squares)]), []
+
+    monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
+    choice = choose_weight(fit, cut(problem, 6), "cv")
+    assert choice.weight == pytest.approx(100.0)
+    assert choice.curve[-1][1] == pytest.approx(np.sqrt(1.036))
 
 
 def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
