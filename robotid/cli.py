@@ -326,7 +326,7 @@ def _compare(options: argparse.Namespace) -> None:
 def _export(options: argparse.Namespace) -> None:
     from robotid.commands.export import export_result
 
-    chosen = {key: getattr(options, key) for key in ("step", "delay", "mean_friction")}
+    chosen = {key: getattr(options, key) for key in ("step", "delay")}
     done = export_result(options.result, options.format, options.out, **chosen)
     _show(done, options, "export")
 

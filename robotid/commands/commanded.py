@@ -12,12 +12,13 @@ from robotid.commands.job import Job, LogEntry
 from robotid.doctor.diagnosis import diagnose
 from robotid.exceptions import SettingsError
 from robotid.export.result import Result, build_commanded
-from robotid.export.urdf import write_urdf
+from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.identification.advice import Origin
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import check_ignored
 from robotid.logs.data import Log
 from robotid.logs.read import Needs
+from robotid.regressor.friction_projection import DriveMoments, project_friction
 from robotid.report.commanded_page import Followed, write_commanded_report
 from robotid.robot.drives import AUTO
 
@@ -66,7 +67,13 @@ def run_commanded(
     content = build_commanded(found, job.to_dict(), outputs)
     target.mkdir(parents=True, exist_ok=True)
     with folder_beside(target) as partial:
-        write_urdf(found.model, found.standard, partial / name, dynamics=job.dynamics)
+        model, pi = found.model, found.standard
+        moments = {
+            drive: DriveMoments.from_dict(table)
+            for drive, table in content["drive_moments"].items()
+        }
+        dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
+        write_urdf(model, pi, partial / name, dynamics=dynamics)
         if job.report:
             files = {"result": "result.json", "urdf": name, "sidecar": sidecar}
             write_commanded_report(

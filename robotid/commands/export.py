@@ -6,16 +6,16 @@ from typing import Any
 
 from robotid._files import write_text
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.commanded import commanded_drives, with_mean_friction
-from robotid.export.isaac import write_isaac
+from robotid.export.commanded import commanded_drives
+from robotid.export.isaac import ISAAC_TERMS, write_isaac
 from robotid.export.links import unstated_terms
-from robotid.export.mjcf import write_mjcf
+from robotid.export.mjcf import MJCF_TERMS, write_mjcf
 from robotid.export.ranges import ranges_text, stated_ranges
 from robotid.export.result import load_result
-from robotid.export.sdf import write_sdf
-from robotid.export.urdf import write_urdf
+from robotid.export.sdf import SDF_TERMS, write_sdf
+from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.findings import listed
-from robotid.robot.drives import TERMS
+from robotid.regressor.friction_projection import Projection, project_friction
 
 __all__ = ["export_result"]
 
@@ -28,12 +28,10 @@ _RATE = (
     "actuators follow at each step of the simulator. Where it matters, let a loop of your own set "
     "torques at that rate"
 )
-#: What says something of which formats.
-_OPTIONS = {
-    "step": ("mjcf", "isaac"),
-    "delay": ("mjcf",),
-    "mean_friction": ("mjcf", "sdf", "isaac"),
-}
+#: Which formats an option is for.
+_OPTIONS = {"step": ("mjcf", "isaac"), "delay": ("mjcf",)}
+#: The drive terms of the formats that friction is projected on.
+_TERMS = {"mjcf": MJCF_TERMS, "sdf": SDF_TERMS, "isaac": ISAAC_TERMS, "urdf": DYNAMICS_TERMS}
 
 
 def export_result(
@@ -43,7 +41,6 @@ def export_result(
     *,
     step: float | None = None,
     delay: str | None = None,
-    mean_friction: bool = False,
 ) -> dict[str, Any]:
     """Write what an identification found in another format.
 
@@ -53,11 +50,12 @@ def export_result(
         target: The file to write.
         step: Time step of the simulator of "mjcf" and "isaac" [s]; None: 1 ms and 5 ms.
         delay: How "mjcf" states the delay of a command, "history" or "filter".
-        mean_friction: Whether friction of "mjcf", "sdf" and "isaac" has the mean of what depends on
-            the position, for which they have no place.
+
+    Friction that a format has no place for is projected on that it has, see ``project_friction``.
 
     Returns:
-        {"result", "format", "files", "not_stated": what the files do not state, a sentence each}.
+        {"result", "format", "files", "not_stated": what the files do not state, a sentence each,
+        "projected": {drive: {"replaced", the parameters written, "error", "torque"}}}.
 
     Raises:
         DataError: If the result has no URDF, or no ranges or gains that the format needs, or the
@@ -65,13 +63,14 @@ def export_result(
         ModelError: If the URDF was changed, or a link of it is impossible.
         SettingsError: If the target is a folder, or an option is not of the format.
     """
-    _check_options(kind, {"step": step, "delay": delay, "mean_friction": mean_friction})
+    _check_options(kind, {"step": step, "delay": delay})
     result, goal = load_result(path), Path(target)
-    model, pi = result.identified
-    commanded, said = result.commanded, tuple[str, ...]()
-    if mean_friction:
-        pi, said = with_mean_friction(model, pi)
-        commanded = commanded_drives(model, pi, result.content, result.path.name)
+    full, parameters = result.identified
+    projection = Projection(full, parameters, ())
+    if kind in _TERMS:
+        projection = project_friction(full, parameters, result.drive_moments, _TERMS[kind])
+    model, pi, said = projection.model, projection.pi, tuple(map(str, projection.drives))
+    commanded = commanded_drives(model, pi, result.content, result.path.name)
     if commanded and result.content["settings"].get("controller", {}).get("gravity_compensation"):
         said = (*said, _GRAVITY)
     if commanded and result.rate is not None:
@@ -90,16 +89,19 @@ def export_result(
         case "isaac":
             notes = write_isaac(model, pi, commanded, goal, notes=said, **how)
         case "urdf":
-            files.append(str(write_urdf(model, pi, goal, dynamics=True)))
-            terms = [name for name, term in TERMS.items() if term.dynamics]
-            notes = unstated_terms(model, pi, "URDF", terms)
+            files.append(str(write_urdf(full, parameters, goal, dynamics=projection)))
+            notes = [*said, *unstated_terms(model, pi, "URDF", DYNAMICS_TERMS)]
         case _:
             if "ranges" not in result.content and not commanded:
                 raise DataError(
                     f"{result.path.name} has no ranges: an earlier version wrote it; identify again"
                 )
             write_text(ranges_text(stated_ranges(result.content)), goal)
-    return {"result": str(path), "format": kind, "files": files, "not_stated": list(notes)}
+    projected = {drive.name: drive.to_dict() for drive in projection.drives}
+    return {
+        "result": str(path), "format": kind, "files": files, "not_stated": list(notes),
+        "projected": projected,
+    }  # fmt: skip
 
 
 def _check_options(kind: str, options: dict[str, Any]) -> None:

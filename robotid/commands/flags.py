@@ -189,7 +189,7 @@ def _add_conversion(parser: argparse.ArgumentParser, command: str) -> None:
         add("--step", type=float, metavar="S", help=words)
         words = "how mjcf delays commands; default: history, which needs MuJoCo 3.5"
         add("--delay", choices=("history", "filter"), help=words)
-        words = "add the mean of friction that depends on the position, which formats lack"
+        words = "deprecated, without effect: friction that a format lacks is always projected"
         add("--mean-friction", action="store_true", help=words)
     else:
         add("log", metavar="IN", help="a log of any format, or a bag's folder")

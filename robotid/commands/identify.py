@@ -14,8 +14,9 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
 from robotid.exceptions import DataError
 from robotid.export.result import build_result
-from robotid.export.urdf import write_urdf
+from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
 from robotid.identification.advice import Origin
+from robotid.identification.bands import fitted_moments
 from robotid.identification.drive_choice import wanted_families
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.findings import locked_findings
@@ -24,6 +25,7 @@ from robotid.identification.recordings import Recordings
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import check_ignored
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.regressor.friction_projection import project_friction
 from robotid.report.document import write_report
 from robotid.robot.drives import AUTO, DriveTerm
 from robotid.robot.model import RobotModel
@@ -131,9 +133,10 @@ def _write(
             outputs["report"] = report
             identification = replace(identification, report=str(target / report))
         if written:
-            write_urdf(
-                identification.model, identification.standard, partial / name, dynamics=job.dynamics
-            )
+            model, pi = identification.model, identification.standard
+            moments = fitted_moments(identification) if job.dynamics else {}
+            dynamics = job.dynamics and project_friction(model, pi, moments, DYNAMICS_TERMS)
+            write_urdf(model, pi, partial / name, dynamics=dynamics)
             outputs |= written
         result = build_result(identification, job.to_dict(), outputs=outputs)
         write_json(result, partial / "result.json")

@@ -9,8 +9,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.data import Log
-from robotid.robot.drives import DriveMotion, DriveTerm
+from robotid.logs.data import Log, Trajectory
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 from robotid.simulation.loops import LoopedRobot, Loops, cut_windows, open_loops
@@ -20,11 +19,11 @@ __all__ = [
     "commanded_drives",
     "follow_commands",
     "limit_of",
+    "logged_motion",
     "loops_of",
-    "with_mean_friction",
 ]
 
-_POSITIONS = 200  # at which friction that depends on the position is averaged
+_GAP = 3.0  # median steps: across a longer one no speed is computed
 #: Parameters of a joint's controller, 0 where a result has none.
 _OF_CONTROLLER = ("kd", "delay", "zero")
 _OF_DRIVE = ("armature", "viscous", "coulomb", "offset")
@@ -172,38 +171,19 @@ def limit_of(drive: CommandedDrive, joint: Joint) -> float:
     return min(drive.effort_limit, joint.effort if joint.effort > 0 else np.inf)
 
 
-def with_mean_friction(model: RobotModel, pi: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return parameters whose Coulomb friction has the mean of what depends on the position.
-
-    Simulators have no friction that depends on the position. Its mean over the positions seen is
-    added to Coulomb's friction, and its own parameters become 0.
+def logged_motion(log: Log) -> Trajectory:
+    """Return the motion of a log of commands: positions, and their differences over time.
 
     Args:
-        model: The robot.
-        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-
-    Returns:
-        Parameters, shape (p,), and a sentence on each joint that was changed.
+        log: The log, of N samples; accelerations and torques of its motion are 0.
     """
-    layout, names, values, said = model.layout, model.layout.names, pi.copy(), []
-    means: dict[str, float] = {}
-    for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
-        name = layout.drives[d].name
-        if term.guards == "q" and term.follows_direction and f"{name}.coulomb" in names and pi[k]:
-            means[name] = means.get(name, 0.0) + float(pi[k]) * _mean(term)
-            values[k] = 0.0
-    for name, mean in means.items():
-        values[names.index(f"{name}.coulomb")] += mean
-        said.append(
-            f"{name}: friction has {mean:+.3g} of what depends on the position, its mean over the "
-            "positions seen"
-        )
-    return values, tuple(said)
-
-
-def _mean(term: DriveTerm) -> float:
-    """Return the mean of a term's column over the positions seen, as it slides up."""
-    low, high = term.seen
-    q = low + (high - low) * (np.arange(_POSITIONS) + 0.5) / _POSITIONS
-    one = np.ones_like(q)
-    return float(np.mean(term.column(DriveMotion(q, one, 0 * q, one, 0 * q, 0 * q))))
+    still = np.zeros_like(log.q)
+    dt = np.diff(log.t)
+    gaps = dt > _GAP * np.median(dt)
+    segment = np.append(0, np.cumsum(gaps))
+    v = still.copy()
+    for k in range(segment[-1] + 1):
+        rows = np.flatnonzero(segment == k)
+        if len(rows) > 1:
+            v[rows] = np.gradient(log.q[rows], log.t[rows], axis=0)
+    return Trajectory(log.t, log.q, v, still, still, log.joints, None, segment)

@@ -18,9 +18,10 @@ from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 from robotid.versions import __version__
 
-__all__ = ["isaac_actuators", "write_isaac"]
+__all__ = ["ISAAC_TERMS", "isaac_actuators", "write_isaac"]
 
-_STATED = ("armature", "viscous", "coulomb", "offset")  # the offset by a sentence of its own
+#: The drive terms that Isaac Lab's actuators have, the offset by a sentence of its own.
+ISAAC_TERMS = ("armature", "viscous", "coulomb", "offset")
 _STEP = 0.005  # [s]
 _HEAD = """\
 Actuators of {robot} for Isaac Lab 2.2 or later (Isaac Sim 5, where friction is a torque), by
@@ -102,7 +103,7 @@ def write_isaac(
         SettingsError: If step is not positive, or the target is a folder.
     """
     content = isaac_actuators(model, commanded, step)
-    said = [*notes, *unstated_terms(model, pi, "Isaac Lab", _STATED)]
+    said = [*notes, *unstated_terms(model, pi, "Isaac Lab", ISAAC_TERMS)]
     for key, words in (
         ("offset", "the offset, which may be subtracted from the effort target"),
         ("zero", "the encoder's zero, which the simulator's position and command have more"),

@@ -20,7 +20,7 @@ from robotid.robot.bodies import principal_moments
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import Joint
 
-__all__ = ["DELAYS", "write_mjcf"]
+__all__ = ["DELAYS", "MJCF_TERMS", "write_mjcf"]
 
 #: Attribute of a joint, or of a tendon over several, that states a term of a drive.
 _ATTRIBUTES = {
@@ -30,6 +30,8 @@ _ATTRIBUTES = {
     "spring": "stiffness",
 }
 _OFFSET = "offset"  # stated by the actuator's bias
+#: The drive terms that MJCF has.
+MJCF_TERMS = (*_ATTRIBUTES, _OFFSET)
 #: Sizes of a geom over those of a shape in a URDF: MuJoCo states half lengths.
 _SIZES = {"box": (0.5,), "sphere": (1.0,), "cylinder": (1.0, 0.5)}
 _SEEN = {"group": "2"}  # what the viewer shows by default
@@ -153,7 +155,7 @@ def write_mjcf(
     if delay not in DELAYS:
         raise SettingsError(f"delay is {delay!r}, wanted one of {listed(DELAYS)}")
     to, servos = (
-        Format("MJCF", (*_ATTRIBUTES, _OFFSET), True, _is_readable),
+        Format("MJCF", MJCF_TERMS, True, _is_readable),
         _Servos({drive.joint: drive for drive in commanded}, step, delay),
     )
     build = partial(_mjcf, model, servos)

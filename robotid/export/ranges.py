@@ -17,15 +17,26 @@ from robotid._files import write_text
 from robotid._typing import Array
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
-from robotid.identification.bands import REACH
+from robotid.identification.bands import REACH, fitted_moments
 from robotid.identification.pipeline import Identification
+from robotid.regressor.friction_projection import project_friction
 from robotid.robot.bodies import principal_moments
 from robotid.robot.drives import TERMS
+from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia_basis
 from robotid.versions import __version__
 
-__all__ = ["parameter_ranges", "ranges_text", "stated_ranges", "write_ranges"]
+__all__ = [
+    "body_ranges",
+    "parameter_ranges",
+    "projected_ranges",
+    "ranges_text",
+    "stated_ranges",
+    "write_ranges",
+]
 
+#: The terms of drives that simulators have.
+_SIMULATED = ("viscous", "coulomb", "offset")
 #: Parameters of drives that cannot be below 0.
 _NOT_NEGATIVE = {"kd", "delay", *(name for name, term in TERMS.items() if term.is_nonnegative)}
 _HEAD = """\
@@ -45,9 +56,11 @@ axes, whose quaternion w x y z turns them into the link's. The principal moments
 of them, which is possible for any draw; draws of principal_moments themselves need not be.
 
 Values drawn one by one change the torque more than the data allow, since it is sums of parameters
-that the motion determines. undetermined names the sums that it leaves open. Drive parameters are
-those of the joint, gear included: gains kp and kd, delay of commands and zero of the encoder, too,
-if commands were identified.
+that the motion determines. undetermined names the sums that it leaves open.
+projected_drives has the friction that exports state for drives whose own has more terms: viscous
+and Coulomb friction and an offset, nearest to it over the fitted rows. Drive parameters are those
+of the joint, gear included: gains kp and kd, delay of commands and zero of the encoder, too, if
+commands were identified.
 """
 
 
@@ -68,11 +81,7 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
         ModelError: If a link or a drive would be physically impossible.
     """
     layout, sources = found.model.layout, found.sources
-    own, errors, bodies = link_parameters(found.model, found.standard), found.standard_error, {}
-    for i, body in enumerate(layout.bodies):
-        part = slice(10 * i, 10 * i + 10)
-        covariance = found.standard_covariance[part, part]
-        bodies[body] = _body(own[body], covariance, sources[part])
+    errors, covariance = found.standard_error, found.standard_covariance
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
@@ -83,10 +92,55 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
     return {
         "robot": found.model.name,
         "confidence": 0.95,
-        "bodies": bodies,
+        "bodies": body_ranges(found.model, found.standard, covariance, sources),
         "drives": drives,
+        **projected_ranges(found),
         "undetermined": list(found.determination.undetermined),
     }
+
+
+def body_ranges(
+    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Return the ranges of links, without ends where a link was not identified.
+
+    Args:
+        model: The robot.
+        standard: Standard parameters, shape (p,), SI units.
+        covariance: Of them, shape (p, p); 0 of what was not identified.
+        sources: What determined each.
+
+    Raises:
+        ModelError: If a link or a drive would be physically impossible.
+    """
+    own, bodies = link_parameters(model, standard), {}
+    for i, body in enumerate(model.layout.bodies):
+        part = slice(10 * i, 10 * i + 10)
+        bodies[body] = _body(own[body], covariance[part, part], sources[part])
+    return bodies
+
+
+def projected_ranges(found: Identification) -> dict[str, Any]:
+    """Return the ranges of friction as exports for MuJoCo state it, of drives that need it.
+
+    Args:
+        found: What was identified.
+
+    Returns:
+        {"projected_drives": {drive: {term: range}}}, or nothing if no drive needs it.
+    """
+    moments = fitted_moments(found) if found.model.layout.own else {}
+    drives = project_friction(found.model, found.standard, moments, _SIMULATED).drives
+    ranges: dict[str, dict[str, Any]] = {}
+    for drive in drives:
+        C = found.standard_covariance[np.ix_(drive.own, drive.own)]
+        errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
+        ranges[drive.name] = {
+            term: _range(value, error, "data", least=0.0 if term in _NOT_NEGATIVE else -math.inf)
+            for (term, value), error in zip(drive.values.items(), errors, strict=True)
+            if error > 0
+        }
+    return {"projected_drives": ranges} if ranges else {}
 
 
 def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -153,6 +207,7 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any
     values = np.array([m, *c, *moments, *(moments.sum() - moments)])  # (10,)
     D = np.vstack([np.eye(10)[:1], d_com, d_moments, d_inertia])  # (10, 10), d values / d pi
     errors = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", D, covariance, D), 0.0))
+    errors = errors if covariance.any() else np.full(len(errors), math.inf)
     origins = [sources[0], *(_joint_source([sources[0], sources[k]]) for k in (1, 2, 3))]
     origins += [_joint_source(sources)] * 6
     x, y, z, w = Rotation.from_matrix(V).as_quat()

@@ -17,12 +17,17 @@ from robotid._typing import Array
 from robotid.commanded.errors import OpenLoop
 from robotid.commanded.identify import Commanded
 from robotid.exceptions import DataError, ModelError
-from robotid.export.commanded import CommandedDrive, commanded_drives, follow_commands
-from robotid.export.ranges import parameter_ranges
+from robotid.export.commanded import (
+    CommandedDrive,
+    commanded_drives,
+    follow_commands,
+    logged_motion,
+)
+from robotid.export.ranges import body_ranges, parameter_ranges
 from robotid.export.shape import FILE, FLAG, MAYBE, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.urdf import load_identified, terms_from_facts
 from robotid.findings import listed
-from robotid.identification.bands import REACH, FrictionCurve, usual_friction
+from robotid.identification.bands import REACH, FrictionCurve, fitted_moments, usual_friction
 from robotid.identification.drive_choice import DriveChoice
 from robotid.identification.evaluation import Evaluation
 from robotid.identification.parameter_table import parameter_entries, parameter_table
@@ -33,8 +38,12 @@ from robotid.identification.witness import Witness
 from robotid.logs.data import Log, suggestion
 from robotid.logs.transmission import Transmission
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
+from robotid.regressor.friction_projection import (
+    DriveMoments,
+    drive_moments,
+    projected_pinocchio_model,
+)
 from robotid.regressor.prediction import predict_instants
-from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.drives import TERMS
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
@@ -58,6 +67,7 @@ __all__ = [
 SCHEMA_VERSION = 1
 _STATUSES = ("good", "usable", "poor", "not evaluated")
 _EXTENT = ("samples", "rate", "start", "end", "rows_used", "segments")
+_MOVING = 0.05  # of a joint's largest speed, below which differences of positions are noise
 _STATUS = Range("good, usable, poor or not evaluated", _STATUSES.__contains__)
 _METRICS = {"per_joint": {...: {"relative_error_pct": MAYBE, "rmse": MAYBE, "unit": TEXT}}}
 _PARAMETER = {"name": TEXT, "value": NUMBER, "unit": TEXT}
@@ -92,6 +102,7 @@ _SHAPE = {
     "ranges?": {"robot": TEXT, "drives": {...: TABLE}},
     "simulation?": {"controller": {"kind": TEXT, "rate?": MAYBE}},
     "own_terms?": {...: [TABLE]},
+    "drive_moments?": {...: {"terms": [TEXT], "products": [[NUMBER]], "torque": NUMBER}},
     "identification": _METRICS,
     "validation": [{"log": TEXT, **_METRICS}],
     "verdict": {
@@ -141,6 +152,7 @@ def build_result(
         ],
         "motors": _motors(identification, settings),
         "own_terms": model.options["own_terms"],
+        "drive_moments": _plain(fitted_moments(identification)),
         "friction": {
             drive.joint: _friction(identification, drive) for drive in identification.drives
         },
@@ -208,7 +220,9 @@ def build_commanded(
         "standard_parameters": standard[: layout.n_inertial],
         "drive_parameters": [*standard[layout.n_inertial :], *_loop_parameters(found)],
         "own_terms": model.options["own_terms"],
+        "drive_moments": _plain(_commanded_moments(found)),
         "consistency": _commanded_bodies(found),
+        "ranges": _commanded_ranges(found, [entry["source"] for entry in standard], mapping),
         "identification": {"per_joint": _commanded_joints(found, found.errors)},
         "validation": [
             {"log": run.log.path, "per_joint": _commanded_joints(found, (run,))}
@@ -233,6 +247,18 @@ def build_commanded(
         ],
         "verdict": found.verdict.to_dict(),
     }
+
+
+def _plain(moments: Mapping[str, DriveMoments]) -> dict[str, Any]:
+    return {name: of_drive.to_dict() for name, of_drive in moments.items()}
+
+
+def _commanded_moments(found: Commanded) -> dict[str, DriveMoments]:
+    """Return what projects friction on simpler terms, from the positions of the fitted logs."""
+    model = found.model.with_reference(found.standard)
+    motions = [logged_motion(run.log) for run in found.errors] if model.layout.own else []
+    moving = [np.abs(m.v) > _MOVING * np.abs(m.v).max(axis=0) for m in motions]
+    return drive_moments(model, zip(motions, moving, strict=True))
 
 
 def _commanded_standard(found: Commanded) -> list[dict[str, Any]]:
@@ -268,6 +294,25 @@ def _commanded_base(found: Commanded, mapping: BaseMapping) -> list[dict[str, An
         }
         for name, expression, value, error, i in base
     ]
+
+
+def _commanded_ranges(
+    found: Commanded, sources: Sequence[str], mapping: BaseMapping
+) -> dict[str, Any]:
+    """Return the ranges of the links; those of drives and loops follow from their parameters."""
+    covariance, size = found.standard_covariance, found.model.layout.n_inertial
+    spread = np.diag(mapping.K @ covariance @ mapping.K.T)
+    kept = zip(mapping.base_names, mapping.independent, spread, strict=True)
+    return {
+        "robot": found.model.name,
+        "confidence": 0.95,
+        "bodies": body_ranges(found.model, found.standard, covariance, sources),
+        "drives": {},
+        "undetermined": [
+            *(name for name, i, variance in kept if i < size and not variance > 0),
+            *found.undetermined,
+        ],
+    }
 
 
 def _commanded_bodies(found: Commanded) -> dict[str, Any]:
@@ -570,13 +615,19 @@ class Result:
             self.content["standard_parameters"], self.content["drive_parameters"]
         )
 
+    @property
+    def drive_moments(self) -> dict[str, DriveMoments]:
+        """What projects friction on simpler terms, by drive that has terms of its own."""
+        tables = self.content.get("drive_moments", {})
+        return {name: DriveMoments.from_dict(table) for name, table in tables.items()}
+
     def pinocchio_model(self) -> Any:  # noqa: ANN401
         """Return Pinocchio's model of the robot; see ``Identification.pinocchio_model``.
 
         Raises:
             DataError: If the result has no URDF.
         """
-        return pinocchio_model(*self.identified)
+        return projected_pinocchio_model(*self.identified, self.drive_moments)
 
     @property
     def verdict(self) -> Mapping[str, Any]:

@@ -15,12 +15,14 @@ from robotid.robot.meshes import Shape
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import MOMENTS, Joint
 
-__all__ = ["write_sdf"]
+__all__ = ["SDF_TERMS", "write_sdf"]
 
 _VERSION, _VERSION_OF_MIMIC = "1.9", "1.11"
 #: Element of a joint's ``<dynamics>`` that states a term of its drive.
 _DYNAMICS = {"viscous": "damping", "coulomb": "friction"}
 _ROTOR = "armature"  # stated by an element of Drake's own
+#: The drive terms that SDF has.
+SDF_TERMS = (*_DYNAMICS, _ROTOR)
 _MESHES = (".dae", ".stl", ".obj", ".glb", ".gltf")
 _SIZES = {"sphere": ("radius",), "cylinder": ("radius", "length")}
 
@@ -60,7 +62,7 @@ def write_sdf(
         "Drake reads armature (drake:rotor_inertia), not friction; Gazebo the reverse",
         f"gravity is the world's to state: <gravity>{gravity}</gravity> was identified with",
     ]
-    to = Format("SDF", (*_DYNAMICS, _ROTOR), False, lambda mesh: mesh.suffix.lower() in _MESHES)
+    to = Format("SDF", SDF_TERMS, False, lambda mesh: mesh.suffix.lower() in _MESHES)
     return write_model(model, pi, target, original, to, partial(_sdf, model.name), said)
 
 

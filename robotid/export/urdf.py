@@ -21,16 +21,24 @@ from robotid.exceptions import DataError, ModelError
 from robotid.export import xml_splice
 from robotid.export.shape import FLAG, NUMBER, TABLE, TEXT, check_shape
 from robotid.export.xml_splice import Document, Edit
+from robotid.regressor.friction_projection import Projection
 from robotid.regressor.torque import random_regressor
-from robotid.robot.bodies import LinkPlace, central_inertial, held_parameters, link_places
+from robotid.robot.bodies import (
+    LinkPlace,
+    central_inertial,
+    held_parameters,
+    inertial_parameters,
+    link_places,
+)
 from robotid.robot.drives import TERMS, term_from_dict
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import Coupling, pseudo_inertia
-from robotid.robot.tree import MOMENTS, read_tree
+from robotid.robot.tree import MOMENTS, Inertial, read_tree
 from robotid.robot.urdf_text import read_with_yourdfpy
 from robotid.versions import __version__
 
 __all__ = [
+    "DYNAMICS_TERMS",
     "link_parameters",
     "load_identified",
     "numbers_text",
@@ -40,6 +48,8 @@ __all__ = [
     "write_urdf",
 ]
 
+#: The drive terms that ``<dynamics>`` has.
+DYNAMICS_TERMS = tuple(name for name, term in TERMS.items() if term.dynamics)
 _SCHEMA_VERSION = 1
 _SHAPE = {
     "urdf_sha256": TEXT,
@@ -57,11 +67,15 @@ _SHAPE = {
 }
 _HUNK = re.compile(r"@@ -(\d+)")
 _OWNER = re.compile(r"""<(?:link|joint)\s[^>]*?\bname\s*=\s*["']([^"']*)""")
+_UNCHANGED = 1e-12  # relative difference below which a parameter is that of the original
+_ROUNDING = 1e-12  # of the size of a link, below which a figure is 0
 _STATES = 64  # random states at which the written file must give the same torque
 _SAME = 1e-6  # largest relative difference of a row's torque over them
 
 
-def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bool = False) -> Path:
+def write_urdf(
+    model: RobotModel, pi: Array, target: str | Path, *, dynamics: Projection | bool = False
+) -> Path:
     """Write standard parameters into a copy of the model's URDF, and a sidecar beside it.
 
     The link that a body's joint moves gets the body's inertial; links joined to it by fixed
@@ -73,7 +87,8 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
         model: The robot; the file it was read from is the one that is copied.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
         target: The URDF to write; never the original itself.
-        dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``.
+        dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``: those of a
+            projection, which the sidecar then states, or those of pi.
 
     Returns:
         Path of the sidecar, ``<target stem>.drive.json``.
@@ -98,6 +113,7 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
         "urdf_sha256": _digest(content),
         "source": {"urdf": source.name, "sha256": _digest(original)},
         **_facts(model, pi, places),
+        **_projected_facts(dynamics),
         "read_back_with": readers,
     }
     with folder_beside(goal.parent) as partial:
@@ -110,13 +126,13 @@ def write_urdf(model: RobotModel, pi: Array, target: str | Path, *, dynamics: bo
     return sidecar
 
 
-def urdf_changes(model: RobotModel, pi: Array, *, dynamics: bool = False) -> list[str]:
+def urdf_changes(model: RobotModel, pi: Array, *, dynamics: Projection | bool = False) -> list[str]:
     """Return how the URDF that ``write_urdf`` writes differs from the original, line by line.
 
     Args:
         model: The robot; the file it was read from is compared.
         pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
-        dynamics: Whether viscous and Coulomb friction also go into ``<dynamics>``.
+        dynamics: As of ``write_urdf``.
 
     Returns:
         A unified diff without context, each stretch with the name of its link or joint; empty if
@@ -218,12 +234,24 @@ def terms_from_facts(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[
 
 
 def _content(
-    original: bytes, model: RobotModel, pi: Array, written: Mapping[str, Array], *, dynamics: bool
+    original: bytes,
+    model: RobotModel,
+    pi: Array,
+    written: Mapping[str, Array],
+    *,
+    dynamics: Projection | bool,
 ) -> bytes:
     """Return the original URDF with the parameters of its links, written, and of its drives."""
     document = xml_splice.parse(original, Path(model.tree.path).name)
-    edits = _inertial_edits(document, written, link_places(model)) + _angle_edits(document, model)
-    if dynamics:
+    changed = {
+        link: pi
+        for link, pi in written.items()
+        if not _is_as_stated(pi, model.tree.inertials.get(link))
+    }
+    edits = _inertial_edits(document, changed, link_places(model)) + _angle_edits(document, model)
+    if isinstance(dynamics, Projection):
+        edits += _dynamics_edits(document, dynamics.model, dynamics.pi)
+    elif dynamics:
         edits += _dynamics_edits(document, model, pi)
     return xml_splice.apply(document, edits)
 
@@ -252,6 +280,13 @@ def _facts(model: RobotModel, pi: Array, places: Sequence[LinkPlace]) -> dict[st
         "lumped": _lumped(model, places),
         "units": {"gravity": "m/s^2", "locked": "rad, or m if it slides", "ratios": "-", **units},
     }
+
+
+def _projected_facts(dynamics: Projection | bool) -> dict[str, Any]:
+    """Return how ``<dynamics>`` differs from the drives, if friction was projected on it."""
+    if not isinstance(dynamics, Projection) or not dynamics.drives:
+        return {}
+    return {"projected_dynamics": {drive.name: drive.to_dict() for drive in dynamics.drives}}
 
 
 def _lumped(model: RobotModel, places: Sequence[LinkPlace]) -> dict[str, list[str]]:
@@ -353,15 +388,27 @@ def _angle_edits(document: Document, model: RobotModel) -> list[Edit]:
     return edits
 
 
+def _is_as_stated(parameters: Array, stated: Inertial | None) -> bool:
+    """Return whether a link's parameters, shape (10,), are those of its ``<inertial>``."""
+    if stated is None:
+        return False
+    before = inertial_parameters(stated)
+    return bool(np.allclose(parameters, before, rtol=_UNCHANGED, atol=_ROUNDING * before[0]))
+
+
 def _inertial(parameters: Array) -> list[str]:
     """Return an ``<inertial>`` about the centre of mass, line by line."""
     body = central_inertial(parameters)
+    size = np.sqrt(np.trace(pseudo_inertia(parameters)[0][:3, :3]) / body.mass)  # [m]
+    com = np.where(np.abs(body.com) > _ROUNDING * size, body.com, 0.0)
+    least = _ROUNDING * body.mass * size**2
+    inertia = np.where(np.abs(body.inertia) > least, body.inertia, 0.0)
     moments = " ".join(
-        f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, body.inertia, strict=True)
+        f'{key}="{numbers_text([value])}"' for key, value in zip(MOMENTS, inertia, strict=True)
     )
     return [
         "<inertial>",
-        f'<origin xyz="{numbers_text(body.com)}" rpy="0 0 0"/>',
+        f'<origin xyz="{numbers_text(com)}" rpy="0 0 0"/>',
         f'<mass value="{numbers_text([body.mass])}"/>',
         f"<inertia {moments}/>",
         "</inertial>",

@@ -12,6 +12,7 @@ from robotid.findings import listed
 from robotid.identification.model_error import shape_slope
 from robotid.logs.data import Trajectory, suggestion
 from robotid.regressor.base_parameters import BaseMapping
+from robotid.regressor.friction_projection import DriveMoments, drive_moments
 from robotid.regressor.memory import drive_motion_along
 from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.drives import DriveMotion
@@ -24,6 +25,7 @@ __all__ = [
     "REACH",
     "FrictionCurve",
     "TorqueBand",
+    "fitted_moments",
     "friction_curve",
     "torque_band",
     "usual_friction",
@@ -163,6 +165,16 @@ def usual_friction(
             carried = [drive_motion_along(found.model, m).load[d] for m in motions]
             load = float(np.sqrt(np.mean(np.concatenate(carried)[np.concatenate(rows)] ** 2)))
     return friction_curve(found, joint, np.asarray(v, dtype=float), q=q, load=load)
+
+
+def fitted_moments(found: "Identification") -> dict[str, DriveMoments]:
+    """Return what projects the friction of drives on simpler terms, from the fitted rows.
+
+    Args:
+        found: The identification.
+    """
+    rows = ((e.recording.trajectory, e.recording.mask) for e in found.fitted)
+    return drive_moments(found.model, rows)
 
 
 def friction_curve(

@@ -29,6 +29,7 @@ from robotid.findings import Finding, listed
 from robotid.identification.bands import (
     FrictionCurve,
     TorqueBand,
+    fitted_moments,
     torque_band,
     usual_friction,
 )
@@ -76,8 +77,8 @@ from robotid.logs.settings import SignalSettings
 from robotid.pages.plots import Plot
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
 from robotid.regressor.factors import Factors, join
+from robotid.regressor.friction_projection import projected_pinocchio_model
 from robotid.regressor.prediction import predict_instants
-from robotid.robot.as_pinocchio import pinocchio_model
 from robotid.robot.bodies import held_parameters
 from robotid.robot.drives import AUTO
 from robotid.robot.mass_matrix import MassMatrixCheck, check_mass_matrix
@@ -265,13 +266,14 @@ class Identification:
 
         ``rnea(q, v, a) + damping v - where(v > 0, lowerDryFrictionLimit, upperDryFrictionLimit)``
 
-        which is that of ``predict``. Drives that turn with several joints, and friction that
-        depends on load, position, past or, other than linearly, on speed have no place in it: a
-        warning names them. Locked joints are part of the links that carry them; with mimic
-        joints, or joints in another order than the URDF's, ``model.configurations(q)`` and
-        ``model.velocity_map`` lead to Pinocchio's coordinates.
+        which is that of ``predict``. Friction that depends on load, position, past or, other than
+        linearly, on speed is projected on these terms, nearest over the fitted rows: a warning
+        states the error. Drives that turn with several joints have no place. Locked joints are
+        part of the links that carry them; with mimic joints, or joints in another order than the
+        URDF's, ``model.configurations(q)`` and ``model.velocity_map`` lead to Pinocchio's
+        coordinates.
         """
-        return pinocchio_model(self.model, self.standard)
+        return projected_pinocchio_model(self.model, self.standard, fitted_moments(self))
 
     def plot_torques(self, *joints: str, recording: Evaluation | None = None) -> Plot:
         """Return charts of measured and identified torque over time, and of the residual.

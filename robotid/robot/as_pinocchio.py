@@ -61,6 +61,6 @@ def pinocchio_model(model: RobotModel, pi: Array) -> pin.Model:
         warnings.warn(
             f"Pinocchio's model has no place for {listed(missing)}: torques from it are without "
             "them; predict(q, v, a) has them",
-            stacklevel=3,
+            stacklevel=4,
         )
     return made

@@ -16,11 +16,12 @@ from helpers.mujoco_plant import LEG, ROBOTS, followed, loaded, multisine, plant
 
 from robotid.cli import main
 from robotid.exceptions import DataError, SettingsError
-from robotid.export.commanded import loops_of, with_mean_friction
+from robotid.export.commanded import logged_motion, loops_of
 from robotid.export.isaac import isaac_actuators
 from robotid.export.mjcf import write_mjcf
 from robotid.export.ranges import stated_ranges
 from robotid.export.result import load_result
+from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 from robotid.simulation.loops import LoopedRobot, cut_windows
@@ -238,16 +239,12 @@ def export(folder, kind, target, capsys, *flags):
     return code, " ".join(out.split()), err
 
 
-def test_mjcf_of_a_result_says_what_it_lacks(result, tmp_path, capsys):
+def test_mjcf_of_a_result_has_the_nearest_friction_and_says_so(result, tmp_path, capsys):
     folder, leg = result
     code, out, _ = export(folder, "mjcf", tmp_path / "a.xml", capsys)
     assert code == 0
-    lacks = f"MJCF has no place for {LEG[2]}.coulomb_q1, {LEG[2]}.coulomb_q2"
-    assert lacks in out
-    assert lacks in (tmp_path / "a.xml").read_text()
     robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
     assert robot.opt.timestep == 0.001
-    np.testing.assert_allclose(robot.dof_frictionloss, [0.2, 0.2, 0.4])
     np.testing.assert_allclose(robot.dof_armature, [d.armature for d in leg.drives], rtol=1e-12)
     np.testing.assert_allclose(
         robot.dof_damping[:, 0] if robot.dof_damping.ndim > 1 else robot.dof_damping,
@@ -264,17 +261,12 @@ def test_mjcf_of_a_result_says_what_it_lacks(result, tmp_path, capsys):
     urdf = [[j.lower, j.upper] for j in leg.model.limits]
     np.testing.assert_allclose(robot.jnt_range, np.array(urdf) - 0.02)
 
-    code, out, _ = export(
-        folder, "mjcf", tmp_path / "b.xml", capsys, "--mean-friction", "--step", "0.002"
-    )
-    assert code == 0
     mean = 0.3 * 1.5**2 / 12  # of x (q - q_0)^2 over a range of 1.5 rad; that of q - q_0 is 0
-    said = f"{LEG[2]}: friction has {mean:+.3g} of what depends on the position"
-    assert said in out
-    assert said in " ".join((tmp_path / "b.xml").read_text().split())
+    assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in out
+    assert "offset 0.1; error" in out
+    written = " ".join((tmp_path / "a.xml").read_text().split())
+    assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in written
     assert "no place" not in out
-    robot = mujoco.MjModel.from_xml_path(str(tmp_path / "b.xml"))
-    assert robot.opt.timestep == 0.002
     np.testing.assert_allclose(robot.dof_frictionloss, [0.2, 0.2, 0.4 + mean], rtol=1e-4)
 
 
@@ -291,12 +283,15 @@ def test_a_controller_that_carries_the_weight_is_named(tmp_path, capsys):
         assert "adds the torque of gravity by the URDF" in said
 
 
-def test_mean_friction_changes_nothing_without_such_friction():
-    leg = plant("leg", np.random.default_rng(0))
-    pi = leg.model.standard_parameters()
-    found, said = with_mean_friction(leg.model, pi)
-    np.testing.assert_array_equal(found, pi)
-    assert said == ()
+def test_the_motion_of_a_log_is_that_of_its_positions_between_gaps():
+    t = np.concatenate([0.01 * np.arange(5), 1.0 + 0.01 * np.arange(4)])
+    q = np.column_stack([3.0 * t, -0.5 * t**2])
+    q[5:] += 10.0  # nothing is differentiated across the gap
+    motion = logged_motion(Log(t, q, np.zeros_like(q), ("a", "b"), q_ref=q, has_torque=False))
+    np.testing.assert_array_equal(motion.segment, [0] * 5 + [1] * 4)
+    np.testing.assert_allclose(motion.v[:, 0], 3.0)
+    np.testing.assert_allclose(motion.v[[1, 7], 1], -t[[1, 7]])
+    np.testing.assert_array_equal(motion.q, q)
 
 
 def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
@@ -304,7 +299,7 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
     # the hip has another effort limit, so it is a group of its own
     code, out, _ = export(folder, "isaac", tmp_path / "a.yaml", capsys, "--step", "0.002")
     assert code == 0
-    assert f"Isaac Lab has no place for {LEG[2]}.coulomb_q1, {LEG[2]}.coulomb_q2" in out
+    assert f"{LEG[2]}: coulomb_q1, coulomb_q2 projected on viscous" in out
     assert (
         f"the encoder's zero, which the simulator's position and command have more: "
         f"{LEG[0]} 0.02, {LEG[1]} 0.02, {LEG[2]} 0.02" in out
@@ -318,6 +313,7 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
     speeds = {joint.name: joint.velocity for joint in model.limits}
     assert content["physics_dt"] == 0.002
     assert list(content["actuators"]) == list(LEG)
+    by_position = dict.fromkeys(LEG, 0.0) | {LEG[2]: 0.3 * 1.5**2 / 12}  # its mean
     for drive, (joint, group) in zip(drives, content["actuators"].items(), strict=True):
         assert group == {
             "joint_names_expr": [joint],
@@ -326,8 +322,8 @@ def test_isaac_actuators_are_grouped_and_read_back(result, tmp_path, capsys):
             "stiffness": pytest.approx(drive.kp, rel=1e-5),
             "damping": pytest.approx(drive.kd, rel=1e-5),
             "armature": pytest.approx(drive.armature, rel=1e-5),
-            "friction": drive.coulomb,
-            "dynamic_friction": drive.coulomb,
+            "friction": pytest.approx(drive.coulomb + by_position[joint], rel=1e-5),
+            "dynamic_friction": pytest.approx(drive.coulomb + by_position[joint], rel=1e-5),
             "viscous_friction": pytest.approx(drive.viscous, rel=1e-5),
             "min_delay": 3 if joint != LEG[2] else 2,  # 3.15 and 2.4 steps
             "max_delay": 3 if joint != LEG[2] else 2,
@@ -386,7 +382,7 @@ def test_ranges_have_gains_delays_and_friction(result, tmp_path, capsys):
 def test_options_of_other_formats_and_results_without_gains_are_refused(result, tmp_path, capsys):
     folder, _ = result
     for kind, *flags in (
-        ("sdf", "--step", "0.001"), ("isaac", "--delay", "filter"), ("ranges", "--mean-friction"),
+        ("sdf", "--step", "0.001"), ("isaac", "--delay", "filter"),
     ):  # fmt: skip
         code, _, err = export(folder, kind, tmp_path / "a", capsys, *flags)
         assert code == 2

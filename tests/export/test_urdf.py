@@ -12,7 +12,7 @@ from robotid.doctor.urdf import inspect_urdf
 from robotid.estimators import OLS
 from robotid.exceptions import DataError, ModelError
 from robotid.export import urdf
-from robotid.export.urdf import load_identified, read_sidecar, write_urdf
+from robotid.export.urdf import load_identified, read_sidecar, urdf_changes, write_urdf
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import compress
 from robotid.regressor.torque import build_problem, random_regressor
@@ -494,3 +494,18 @@ def test_snapped_angles_are_written_and_nothing_else_of_the_joints(tmp_path, rng
     plain = RobotModel.from_urdf(source)
     write_urdf(plain, pi, tmp_path / "plain.urdf")
     assert read_tree(tmp_path / "plain.urdf").joints == plain.tree.joints
+
+
+def test_a_link_that_did_not_change_keeps_its_text_and_rounding_is_0(ur5, tmp_path):
+    pi = ur5.standard_parameters()
+    pi[1] += 1e-13 * pi[0]  # rounding of the first link's mcx
+    forearm = 10 * ur5.layout.bodies.index("forearm_link")
+    pi[forearm] *= 1.1
+    pi[forearm + 3] = 1e-60  # its centre of mass in z, of which rounding is left
+    lines = urdf_changes(ur5, pi)
+    owners = {line.rsplit(" ", 1)[-1] for line in lines if line.startswith("@@")}
+    assert owners == {"forearm_link", "ee_link", "tool0"}  # the last two are in wrist_3_link
+    (origin,) = [line for line in lines if line.startswith("+") and "<origin" in line]
+    assert origin.split('xyz="')[1].split('"')[0].split()[2] == "0.0"
+    write_urdf(ur5, pi, tmp_path / "new.urdf")
+    assert "e-6" not in (tmp_path / "new.urdf").read_text()

@@ -5,6 +5,8 @@ import json
 import numpy as np
 
 from robotid.export.urdf import write_urdf
+from robotid.logs.data import Trajectory
+from robotid.regressor.friction_projection import drive_moments
 from robotid.robot.drives import PositionCoulomb
 
 _UNITS = {
@@ -31,6 +33,23 @@ def drive_entries(plant, relative=0.1):
         }
         for name, value in plant.truth.items()
     ]
+
+
+def _moments(model, pi):
+    """Return the moments of friction over positions from the lowest to the highest seen."""
+    count = 2001
+    q, way = np.zeros((count, len(model.joints))), (np.arange(count) + 0.5) / count
+    for j, joint in enumerate(model.joints):
+        for term in model.layout.own.get(joint, ())[:1]:
+            q[:, j] = term.seen[0] + way * (term.seen[1] - term.seen[0])
+    still, first = np.zeros_like(q), np.zeros(count, dtype=int)
+    runs = [
+        Trajectory(np.arange(count) / 100.0, q, still + v, still, still, model.joints, None, first)
+        for v in (-1.0, -0.5, 0.5, 1.0)
+    ]
+    rows = np.ones(q.shape, dtype=bool)
+    found = drive_moments(model.with_reference(pi), [(run, rows) for run in runs])
+    return {name: moments.to_dict() for name, moments in found.items()}
 
 
 def written_result(plant, folder, *, position=None, limits=None, **changes):
@@ -72,6 +91,7 @@ def written_result(plant, folder, *, position=None, limits=None, **changes):
         "base_parameters": [],
         "standard_parameters": [],
         "drive_parameters": entries,
+        "drive_moments": _moments(model, np.array([*values.values()])),
         "identification": {"per_joint": {}},
         "validation": [],
         "verdict": {"status": "good", "reasons": ["it follows"]},

@@ -1,14 +1,21 @@
 """What Python asks of a result: torques, friction curves, Pinocchio's model; found or loaded."""
 
+import xml.etree.ElementTree as ET
+
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
+from robotid.commands.export import export_result
 from robotid.exceptions import DataError
+from robotid.export.ranges import parameter_ranges
 from robotid.export.result import load_result
+from robotid.export.urdf import read_sidecar
 from robotid.identification.bands import REACH, friction_curve
 from robotid.identification.settings import EstimatorSettings
+from robotid.regressor.friction_projection import project_friction
 from robotid.regressor.memory import drive_motion_along
 from robotid.robot.drives import LoadFriction
 
@@ -83,13 +90,15 @@ def test_another_joint_is_refused_by_name(found, loaded):
         loaded.friction("elbow_joint ")
 
 
-def test_pinocchios_model_lacks_what_it_says_and_nothing_else(found, loaded):
+def test_pinocchios_model_has_the_nearest_friction_and_says_so(found, loaded):
     motion, predicted = moving_rows(found)
     place = list(found.model.layout.names).index(f"{ELBOW}.load")
     plain = found.standard.copy()
     plain[place] = 0.0
     for result in (found, loaded):
-        with pytest.warns(UserWarning, match=rf"no place for {ELBOW}\.load: torques") as caught:
+        with pytest.warns(
+            UserWarning, match=rf"{ELBOW}: load projected on viscous .* error"
+        ) as caught:
             made = result.pinocchio_model()
         assert caught[0].filename == __file__
         data = made.createData()
@@ -109,5 +118,70 @@ def test_pinocchios_model_lacks_what_it_says_and_nothing_else(found, loaded):
         loads = drive_motion_along(found.model, motion).load[joints.index(ELBOW), k]
         sign = np.sign(motion.v[k, joints.index(ELBOW)])
         wanted = found.standard[place] * sign * np.abs(loads)
+        (drive,) = project_friction(
+            found.model, found.standard, loaded.drive_moments, ("viscous", "coulomb", "offset")
+        ).drives
+        names, speed = list(found.model.layout.names), motion.v[k, joints.index(ELBOW)]
+        for term, column in (("viscous", speed), ("coulomb", sign), ("offset", 1.0)):
+            before = found.standard[names.index(f"{ELBOW}.{term}")]
+            wanted = wanted - (drive.values[term] - before) * column
         np.testing.assert_allclose(left[:, joints.index(ELBOW)], wanted, atol=1e-6)
-        assert np.abs(wanted).max() > 0.5
+        assert drive.values["coulomb"] > 1.2 * found.standard[names.index(f"{ELBOW}.coulomb")]
+        assert np.sqrt(np.mean(wanted**2)) == pytest.approx(drive.error, rel=0.2)
+
+
+def test_mujocos_inverse_dynamics_of_an_export_are_as_near_as_its_friction_can_be(
+    found, loaded, tmp_path
+):
+    """Over the fitted rows: the prediction less the best viscous, Coulomb friction and offset."""
+    done = export_result(loaded.path, "mjcf", tmp_path / "a.xml")
+    stated = done["projected"][ELBOW]
+    assert stated["replaced"] == ["load"]
+    assert "load projected on viscous" in " ".join((tmp_path / "a.xml").read_text().split())
+    robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
+    robot.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data, j = mujoco.MjData(robot), found.model.joints.index(ELBOW)
+    motion, predicted = moving_rows(found)
+    torque = np.empty_like(predicted)
+    for k in range(len(predicted)):
+        data.qpos, data.qvel, data.qacc = motion.q[k], motion.v[k], motion.a[k]
+        mujoco.mj_inverse(robot, data)
+        data.ctrl = 0.0
+        mujoco.mj_fwdActuation(robot, data)
+        torque[k] = data.qfrc_inverse - data.qfrc_actuator
+    left = predicted - torque
+    others = [i for i in range(left.shape[1]) if i != j]
+    np.testing.assert_allclose(left[:, others], 0.0, atol=1e-6)
+    v = motion.v[:, j]
+    A = np.column_stack([v, np.sign(v), np.ones_like(v)])
+    best = left[:, j] - A @ np.linalg.lstsq(A, left[:, j], rcond=None)[0]
+    assert np.linalg.norm(left[:, j]) <= 1.02 * np.linalg.norm(best)
+    assert stated["error"] == pytest.approx(np.sqrt(np.mean(left[:, j] ** 2)), rel=0.1)
+
+
+def test_urdf_dynamics_and_ranges_have_the_projected_friction(found, loaded, tmp_path):
+    done = export_result(loaded.path, "urdf", tmp_path / "a.urdf")
+    drive = done["projected"][ELBOW]
+    (joint,) = [
+        joint
+        for joint in ET.parse(tmp_path / "a.urdf").getroot().findall("joint")
+        if joint.get("name") == ELBOW
+    ]
+    stated = {key: float(value) for key, value in joint.find("dynamics").items()}
+    assert stated == {"damping": drive["viscous"], "friction": drive["coulomb"]}
+    facts = read_sidecar(tmp_path / "a.drive.json")
+    assert facts["projected_dynamics"][ELBOW] == drive
+    assert facts["drives"][ELBOW]["load"] == pytest.approx(
+        found.standard[found.model.layout.names.index(f"{ELBOW}.load")]
+    )
+    ranges = parameter_ranges(found)["projected_drives"]
+    assert list(ranges) == [ELBOW]
+    (projected,) = project_friction(
+        found.model, found.standard, loaded.drive_moments, ("viscous", "coulomb", "offset")
+    ).drives
+    C = found.standard_covariance[np.ix_(projected.own, projected.own)]
+    for row, (term, value) in zip(projected.transfer, projected.values.items(), strict=True):
+        half = 1.96 * np.sqrt(row @ C @ row)
+        assert ranges[ELBOW][term]["nominal"] == pytest.approx(value)
+        assert ranges[ELBOW][term]["high"] == pytest.approx(value + half)
+    assert set(ranges[ELBOW]) == {"viscous", "coulomb", "offset"}

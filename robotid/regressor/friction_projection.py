@@ -1,0 +1,341 @@
+"""Friction of drives on the terms that simulators have: viscous, Coulomb, a spring, an offset.
+
+A drive's torque X x of all its terms is replaced by Y z of the terms of a format, Y z nearest to
+X x in least squares over the rows of the logs. The mean products of the columns of X and Y over
+the rows are all that this needs, so that a result states these and no logs are read again.
+"""
+
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.exceptions import DataError
+from robotid.logs.data import Trajectory
+from robotid.regressor.columns import drive_motion, friction_directions, trajectory_values
+from robotid.regressor.memory import remember
+from robotid.robot.as_pinocchio import pinocchio_model
+from robotid.robot.drives import TERMS, DriveMotion, DriveTerm, Spring
+from robotid.robot.model import RobotModel
+
+__all__ = [
+    "DriveMoments",
+    "ProjectedDrive",
+    "Projection",
+    "drive_moments",
+    "project_friction",
+    "projected_pinocchio_model",
+]
+
+#: The terms that friction is projected on. An offset is always among them, so that a format
+#: without one does not take it for friction.
+_SIMPLE: dict[str, DriveTerm] = {
+    **{name: TERMS[name] for name in ("viscous", "coulomb", "offset")}, "spring": Spring()
+}  # fmt: skip
+_ROUNDING = 1e-12  # of the largest eigenvalue of products: a smaller one is 0
+
+
+@dataclass(frozen=True, eq=False)
+class DriveMoments:
+    """Second moments of the terms of one drive over the rows of the logs.
+
+    Attributes:
+        terms: The drive's own terms but inertia, then those of a simulator that it lacks.
+        products: Mean products of their columns over the rows, shape (k, k).
+        torque: RMS torque of the rows in the drive's joints [N m or N].
+    """
+
+    terms: tuple[str, ...]
+    products: Array
+    torque: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as result.json has them."""
+        return {
+            "terms": list(self.terms), "products": self.products.tolist(), "torque": self.torque
+        }  # fmt: skip
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> "DriveMoments":
+        """Return the moments of plain values.
+
+        Args:
+            table: As ``to_dict`` returns them.
+
+        Raises:
+            DataError: If the products are not a finite matrix over the terms.
+        """
+        terms, products = tuple(table["terms"]), np.array(table["products"], dtype=float)
+        if products.shape != (len(terms), len(terms)) or not np.isfinite(products).all():
+            raise DataError(
+                f"drive_moments: products have shape {products.shape}, wanted a finite matrix over "
+                f"the {len(terms)} terms; identify again"
+            )
+        return cls(terms, products, float(table["torque"]))
+
+    def transfer(self, own: Sequence[str], onto: Sequence[str]) -> Array:
+        """Return the linear map from parameters of own terms to those projected on.
+
+        Args:
+            own: The drive's terms, in the order of its parameters.
+            onto: Names of the terms projected on.
+
+        Returns:
+            Map T with z = T x, shape (len(onto), len(own)), without the bounds of z.
+        """
+        root = self._root()
+        Y, X = (root[:, [self.terms.index(name) for name in names]] for names in (onto, own))
+        T: Array = np.linalg.lstsq(Y, X, rcond=None)[0]
+        return T
+
+    def _root(self) -> Array:
+        """Return M with M^T M the products, shape (k, k)."""
+        values, vectors = np.linalg.eigh(self.products)
+        floor = _ROUNDING * max(float(values[-1]), 0.0)
+        root: Array = np.sqrt(np.where(values > floor, values, 0.0))[:, None] * vectors.T
+        return root
+
+    def rms(self, x: Mapping[str, float]) -> float:
+        """Return the RMS torque of a sum of terms over the rows [N m or N].
+
+        Args:
+            x: Parameters by name of the term.
+        """
+        weights = np.array([x.get(name, 0.0) for name in self.terms])
+        return float(np.linalg.norm(self._root() @ weights))
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedDrive:
+    """A drive whose terms were projected.
+
+    Attributes:
+        name: Joint or coupling.
+        replaced: The terms that the format lacks.
+        values: Parameters of the terms that the format has, by name.
+        transfer: Map from the drive's parameters to these, shape (len(values), m); rows of a
+            parameter at its bound of 0 are 0.
+        own: Numbers of the drive's m parameters in the layout of the robot.
+        error: RMS torque that the projection leaves [N m or N].
+        torque: RMS torque of the drive's joints [N m or N].
+    """
+
+    name: str
+    replaced: tuple[str, ...]
+    values: Mapping[str, float]
+    transfer: Array
+    own: tuple[int, ...]
+    error: float
+    torque: float
+
+    def __str__(self) -> str:
+        stated = ", ".join(f"{term} {value:.4g}" for term, value in self.values.items())
+        share = f" ({100 * self.error / self.torque:.2g} % of its torque)" if self.torque else ""
+        return (
+            f"{self.name}: {', '.join(self.replaced)} projected on {stated}; "
+            f"error {self.error:.3g} RMS{share}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, as sidecars have them."""
+        return {
+            "replaced": list(self.replaced), **self.values,
+            "error": self.error, "torque": self.torque,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A robot whose drives have the terms of a format only.
+
+    Attributes:
+        model: The robot.
+        pi: Its standard parameters, shape (p,), SI units.
+        drives: The drives whose terms were projected; the others are as they were.
+    """
+
+    model: RobotModel
+    pi: Array
+    drives: tuple[ProjectedDrive, ...]
+
+
+def drive_moments(
+    model: RobotModel, recordings: Iterable[tuple[Trajectory, Array]]
+) -> dict[str, DriveMoments]:
+    """Return the moments of the drives that have terms of their own, by name.
+
+    Args:
+        model: The robot.
+        recordings: Trajectories and their rows used, shape (N, n_rows), bool.
+    """
+    layout = model.layout
+    sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
+    first = model.n_rows - len(model.joints)
+    for trajectory, mask in recordings if layout.own else ():
+        motion = trajectory if trajectory.memory is not None else remember(model, trajectory)
+        values = trajectory_values(layout, motion)  # (k, N)
+        signs = friction_directions(layout, motion.v, motion.direction)
+        moves = drive_motion(layout, motion.q, motion.v, motion.a, signs)
+        for d, drive in enumerate(layout.drives):
+            if drive.name not in layout.own:
+                continue
+            turns = layout.drive_ratios[d] != 0.0
+            rows = mask[:, first:][:, turns].all(axis=1)
+            names, columns = _columns(model, d, values, moves.of(d))
+            X = columns[:, rows]
+            torque = float((motion.tau[:, -len(model.joints) :][rows][:, turns] ** 2).sum())
+            _, products, total, count = sums.get(drive.name, (names, 0.0 * X @ X.T, 0.0, 0))
+            sums[drive.name] = (names, products + X @ X.T, total + torque, count + int(rows.sum()))
+    return {
+        name: DriveMoments(names, products / count, float(np.sqrt(total / count)))
+        for name, (names, products, total, count) in sums.items()
+        if count
+    }
+
+
+def _columns(
+    model: RobotModel, d: int, values: Array, motion: DriveMotion
+) -> tuple[tuple[str, ...], Array]:
+    """Return the names and columns, shape (k, N), of a drive's terms and of those it lacks."""
+    own = _own_terms(model, d)
+    names = [term.name for _, term in own]
+    first = model.layout.n_inertial
+    columns = [values[k - first] for k, _ in own]
+    for name, term in _SIMPLE.items():
+        if name not in names:
+            names.append(name)
+            columns.append(term.column(motion))
+    return tuple(names), np.array(columns)
+
+
+def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
+    """Return numbers and terms of a drive's parameters but inertia."""
+    layout = model.layout
+    return [
+        (k, term)
+        for k, (drive, term) in enumerate(layout.drive_parameters, start=layout.n_inertial)
+        if drive == d and not term.is_inertia
+    ]
+
+
+def project_friction(
+    model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments], onto: Collection[str]
+) -> Projection:
+    """Return a robot whose drives have the terms of a format only, nearest to their own.
+
+    Drives whose terms the format has stay as they are, and so do inertia and, where a format has
+    none, offsets. Viscous and Coulomb friction and a spring stay at 0 or above.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        moments: Of the drives that have terms of their own, as of ``drive_moments``.
+        onto: Names of the terms that the format has.
+
+    Raises:
+        DataError: If the moments of a drive are missing.
+    """
+    layout, projected = model.layout, []
+    for d, drive in enumerate(layout.drives):
+        own = _own_terms(model, d)
+        excess = [term.name for k, term in own if term.name not in _SIMPLE and pi[k] != 0.0]
+        excess += [t.name for k, t in own if t.name == "spring" not in onto and pi[k] != 0.0]
+        if excess:
+            if drive.name not in moments:
+                raise DataError(
+                    f"{drive.name} has {', '.join(excess)}, and the result has no drive_moments to "
+                    "project it on simpler friction with: an earlier version wrote it; identify "
+                    "again"
+                )
+            projected.append(_projected(model, d, pi, moments[drive.name], excess, onto))
+    if not projected:
+        return Projection(model, pi, ())
+    return Projection(*_simplified(model, pi, projected), tuple(projected))
+
+
+def projected_pinocchio_model(
+    model: RobotModel, pi: Array, moments: Mapping[str, DriveMoments]
+) -> Any:  # noqa: ANN401
+    """Return ``pinocchio_model`` of a robot, its friction projected; a warning names what was.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), SI units, in ``layout.names`` order.
+        moments: As of ``project_friction``.
+    """
+    projection = project_friction(model, pi, moments, ("viscous", "coulomb", "offset"))
+    if projection.drives:
+        said = "; ".join(str(drive) for drive in projection.drives)
+        warnings.warn(
+            f"Pinocchio's model has viscous and Coulomb friction and an offset: {said}; "
+            "predict(q, v, a) has all terms",
+            stacklevel=3,
+        )
+    return pinocchio_model(projection.model, projection.pi)
+
+
+def _projected(
+    model: RobotModel,
+    d: int,
+    pi: Array,
+    moments: DriveMoments,
+    excess: Sequence[str],
+    onto: Collection[str],
+) -> ProjectedDrive:
+    """Return one drive on the terms that a format has."""
+    own = _own_terms(model, d)
+    names, x = [term.name for _, term in own], pi[[k for k, _ in own]]
+    has_spring = any(term.part in ("spring", "ripple") for _, term in own)
+    usable = {*names, "spring"} if has_spring else {*names}
+    bounded = [name for name in _SIMPLE if name in onto and name in usable and name != "offset"]
+    best, least = tuple[str, ...](), np.inf
+    for size in range(len(bounded) + 1):
+        for free in combinations(bounded, size):  # the others at their bound of 0
+            z = moments.transfer(names, (*free, "offset")) @ x
+            error = moments.rms(_difference(names, x, (*free, "offset"), z))
+            if (z[:-1] >= 0).all() and error < least:
+                best, least = free, error
+    free = (*best, "offset")
+    T = dict(zip(free, moments.transfer(names, free), strict=True))
+    stated = [name for name in _SIMPLE if name in bounded or (name in onto and name in names)]
+    transfer = np.array([T.get(name, np.zeros(len(names))) for name in stated])
+    return ProjectedDrive(
+        name=model.layout.drives[d].name,
+        replaced=tuple(excess),
+        values=dict(zip(stated, (transfer @ x).tolist(), strict=True)),
+        transfer=transfer,
+        own=tuple(k for k, _ in own),
+        error=least,
+        torque=moments.torque,
+    )
+
+
+def _difference(
+    names: Sequence[str], x: Array, others: Sequence[str], z: Array
+) -> dict[str, float]:
+    """Return the parameters x less z by name of the term."""
+    left = dict(zip(names, x.tolist(), strict=True))
+    for name, value in zip(others, z.tolist(), strict=True):
+        left[name] = left.get(name, 0.0) - value
+    return left
+
+
+def _simplified(
+    model: RobotModel, pi: Array, projected: Sequence[ProjectedDrive]
+) -> tuple[RobotModel, Array]:
+    """Return the robot without the terms that were projected, and its parameters."""
+    values = dict(zip(model.layout.names, pi.tolist(), strict=True))
+    changed = {drive.name: drive.values for drive in projected}
+    own = {
+        name: (Spring(),) if "spring" in changed.get(name, {}) else terms
+        for name, terms in model.layout.own.items()
+        if name not in changed or "spring" in changed[name]
+    }
+    simple = model.with_terms(own)
+    for name, terms in changed.items():
+        values |= {f"{name}.{term}": value for term, value in terms.items()}
+    return simple, np.array([values.get(name, 0.0) for name in simple.layout.names])

@@ -1,0 +1,151 @@
+"""Friction on the terms of simulators: brute force over the rows, bounds, what is left."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+from helpers.robots import motion
+
+from robotid.exceptions import DataError
+from robotid.logs.data import Trajectory
+from robotid.regressor.friction_projection import DriveMoments, drive_moments, project_friction
+from robotid.regressor.memory import remember
+from robotid.regressor.torque import trajectory_regressor
+from robotid.robot.drives import Asymmetric, Harmonic, LoadFriction, Spring, Stribeck
+
+LIFT, ELBOW, WRIST = "shoulder_lift_joint", "elbow_joint", "wrist_1_joint"
+OWN = {
+    LIFT: (LoadFriction(),),
+    ELBOW: (Stribeck(seen=(0.05, 2.0), speed=0.3), Asymmetric()),
+    WRIST: (Harmonic(seen=(-3.0, 3.0), order=2.0),),
+}
+VALUES = {
+    f"{LIFT}.load": 0.08, f"{LIFT}.coulomb": 3.0, f"{LIFT}.viscous": 4.0,
+    f"{ELBOW}.coulomb": 9.0, f"{ELBOW}.stribeck": -6.0, f"{ELBOW}.viscous": 2.0,
+    f"{ELBOW}.asymmetric": 0.7, f"{ELBOW}.offset": 0.4,
+    f"{WRIST}.cos2": 1.5, f"{WRIST}.coulomb": 0.6,
+}  # fmt: skip
+
+
+@pytest.fixture
+def case(ur5):
+    """A robot, its parameters, two recordings of unlike length and their rows used."""
+    model = ur5.with_terms(OWN)
+    pi = model.standard_parameters()
+    for name, value in VALUES.items():
+        pi[model.layout.names.index(name)] = value
+    model, rng = model.with_reference(pi), np.random.default_rng(4)
+    recordings = []
+    for count in (300, 120):
+        m = motion(model, rng, count)
+        plain = Trajectory(
+            np.arange(count) / 100.0, m.q, m.v, m.a, np.zeros_like(m.q), m.joints, None,
+            np.zeros(count, dtype=int),
+        )  # fmt: skip
+        m = remember(model, plain)
+        tau = (trajectory_regressor(model, m) @ pi).reshape(m.q.shape)
+        mask = np.abs(m.v) > 0.3
+        mask[: count // 3, 1] = False
+        recordings.append((Trajectory(m.t, m.q, m.v, m.a, tau, m.joints, None, m.segment,
+                                      m.direction, m.memory), mask))  # fmt: skip
+    return model, pi, recordings
+
+
+def torque_and_columns(model, pi, recordings, joint):
+    """Return a joint's friction and offset over its rows, and v, sign(v), q, 1 there."""
+    j = model.joints.index(joint)
+    own = [k for k, n in enumerate(model.layout.names) if n.startswith(f"{joint}.")]
+    own = [k for k in own if not model.layout.names[k].endswith("armature")]
+    y, v, q = [], [], []
+    for m, mask in recordings:
+        W = trajectory_regressor(model, m).reshape(*m.v.shape, -1)[:, j]
+        y.append((W[:, own] @ pi[own])[mask[:, j]])
+        v.append(m.v[mask[:, j], j])
+        q.append(m.q[mask[:, j], j])
+    y, v, q = (np.concatenate(x) for x in (y, v, q))
+    return y, {"viscous": v, "coulomb": np.sign(v), "spring": q, "offset": np.ones_like(v)}
+
+
+@pytest.mark.parametrize("onto", [("viscous", "coulomb", "offset"), ("viscous", "coulomb"),
+                                  ("viscous", "coulomb", "offset", "spring")])  # fmt: skip
+def test_it_is_the_nearest_friction_over_the_rows(case, onto):
+    model, pi, recordings = case
+    projection = project_friction(model, pi, drive_moments(model, recordings), onto)
+    assert [drive.name for drive in projection.drives] == [LIFT, ELBOW, WRIST]
+    assert projection.drives[1].replaced == ("stribeck", "asymmetric")
+    for drive in projection.drives:
+        y, columns = torque_and_columns(model, pi, recordings, drive.name)
+        used = [n for n in ("viscous", "coulomb", "spring") if n in onto]
+        if drive.name != WRIST:  # nothing else depends on the position
+            used = [n for n in used if n != "spring"]
+        A = np.column_stack([*(columns[n] for n in used), columns["offset"]])
+        low = [0.0] * len(used) + [-np.inf]
+        best = scipy.optimize.lsq_linear(A, y, (low, np.inf), method="bvls")
+        wanted = dict(zip([*used, "offset"], best.x, strict=True))
+        assert drive.error == pytest.approx(np.sqrt(2.0 * best.cost / len(y)), rel=1e-6)
+        assert set(drive.values) == {n for n in wanted if n in onto}
+        for name, value in drive.values.items():
+            assert value == pytest.approx(wanted[name], abs=1e-9), (drive.name, name)
+        j = model.joints.index(drive.name)
+        tau = np.concatenate([m.tau[mask[:, j], j] for m, mask in recordings])
+        assert drive.torque == pytest.approx(np.sqrt(np.mean(tau**2)))
+    names = projection.model.layout.names
+    assert not any(name.endswith(("load", "stribeck", "asymmetric", "cos2")) for name in names)
+    for k, name in enumerate(names):  # all else stays
+        joint, _, term = name.rpartition(".")
+        if joint not in OWN or term in ("armature", *(() if "offset" in onto else ("offset",))):
+            assert projection.pi[k] == pi[model.layout.names.index(name)]
+
+
+def test_friction_that_would_be_negative_is_0_and_the_rest_is_fitted_again(case):
+    model, pi, recordings = case
+    pi = pi.copy()
+    for name, value in {f"{ELBOW}.coulomb": 0.5, f"{ELBOW}.viscous": 0.1}.items():
+        pi[model.layout.names.index(name)] = value
+    moments = drive_moments(model, recordings)
+    drive = project_friction(model, pi, moments, ("viscous", "coulomb", "offset")).drives[1]
+    assert drive.values["coulomb"] == 0.0
+    assert not drive.transfer[1].any()
+    y, columns = torque_and_columns(model, pi, recordings, ELBOW)
+    A = np.column_stack([columns["viscous"], columns["offset"]])
+    (viscous, offset), *_ = np.linalg.lstsq(A, y, rcond=None)
+    assert drive.values["viscous"] == pytest.approx(viscous, rel=1e-8)
+    assert drive.values["offset"] == pytest.approx(offset, rel=1e-8)
+
+
+def test_what_a_format_states_stays_to_the_last_bit(case, ur5):
+    model, pi, recordings = case
+    plain, values = ur5.with_terms({ELBOW: (Spring(),)}), ur5.standard_parameters()
+    values = np.insert(values, plain.layout.names.index(f"{ELBOW}.spring"), 7.0)
+    kept = project_friction(plain, values, {}, ("viscous", "coulomb", "spring"))
+    assert kept.model is plain
+    assert kept.pi is values
+    with pytest.raises(DataError, match="elbow_joint has spring, and the result has no drive_mo"):
+        project_friction(plain, values, {}, ("viscous", "coulomb"))
+    # a term of size 0 needs no projection
+    zero = pi.copy()
+    zero[[model.layout.names.index(f"{LIFT}.load")]] = 0.0
+    moments = drive_moments(model, recordings)
+    drives = project_friction(model, zero, moments, ("viscous", "coulomb")).drives
+    assert [drive.name for drive in drives] == [ELBOW, WRIST]
+
+
+def test_the_moments_are_read_back_and_the_sentence_states_the_figures(case):
+    model, pi, recordings = case
+    moments = drive_moments(model, recordings)
+    assert moments[ELBOW].terms == (
+        "viscous", "coulomb", "offset", "stribeck", "asymmetric", "spring"
+    )  # fmt: skip
+    again = {name: DriveMoments.from_dict(m.to_dict()) for name, m in moments.items()}
+    first, second = (project_friction(model, pi, m, ("viscous", "coulomb"))
+                     for m in (moments, again))  # fmt: skip
+    np.testing.assert_array_equal(first.pi, second.pi)
+    drive = first.drives[1]
+    assert str(drive) == (
+        f"elbow_joint: stribeck, asymmetric projected on viscous {drive.values['viscous']:.4g}, "
+        f"coulomb {drive.values['coulomb']:.4g}; error {drive.error:.3g} RMS "
+        f"({100 * drive.error / drive.torque:.2g} % of its torque)"
+    )
+    assert drive.to_dict()["error"] == drive.error
+    broken = moments[ELBOW].to_dict() | {"terms": ["viscous"]}
+    with pytest.raises(DataError, match=r"shape \(6, 6\), wanted a finite matrix over the 1 terms"):
+        DriveMoments.from_dict(broken)
