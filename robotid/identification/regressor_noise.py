@@ -1,0 +1,314 @@
+"""How far the steps of an encoder bias least squares: errors in the variables of the regressor.
+
+A position that an encoder rounds has noisy derivatives, so the regressor W has noise E of its own,
+which does not average out. Of H = W^T S^-1 W, D = E[E^T S^-1 E] is that noise, and least squares
+find (H - D) theta / H, too small: theta = theta_ls + H^-1 D theta.
+
+D theta is found by rounding once more. Rounding errors e of the same encoder on the same motion,
+with another phase, go through the same filter, differences and regressor; of +e and -e together
+what is linear in e cancels. With the scores s(theta) = W^T S^-1 (tau - W theta):
+
+    D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
+
+What is linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score that the encoder makes. Where
+a motion is repeated so are its rounding errors, and segments of the log do not scatter as much as
+their sum: the covariance of the score then grows by what the sum scatters more.
+
+References:
+    Carroll, Ruppert, Stefanski, Crainiceanu (2006), Measurement Error in Nonlinear Models, chapters
+    5 (simulation extrapolation) and 7 (corrected scores).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotid._typing import Array
+from robotid.estimators.batch import solve_factor
+from robotid.findings import Finding, listed
+from robotid.identification.recordings import Recordings
+from robotid.identification.survey import SurveyedLog, hold_log
+from robotid.logs.data import Trajectory
+from robotid.logs.measured_velocity import quantum
+from robotid.logs.settings import SignalSettings
+from robotid.regressor.factors import Factors, Reduction
+
+if TYPE_CHECKING:
+    from robotid.identification.pipeline import Identification
+
+__all__ = [
+    "RegressorNoise",
+    "acceleration_noise",
+    "encoder_findings",
+    "find_regressor_noise",
+    "rounding_errors",
+]
+
+_FEWEST, _MOST = 3, 8  # pairs of rounding errors
+_SURE = 0.2  # standard errors by which the shift may be uncertain without more pairs
+_TERMS = 4  # of the series (1 - H^-1 D)^-1
+_MATTERS = 0.1  # standard errors that all parameters move together, below which nothing is done
+_NAMED, _WARNED = 0.5, 2.0  # standard errors of one parameter: a note, and a warning
+_ALIKE = 0.1  # of the largest share of noise, from which a joint is named
+_ROWS = 20_000  # of a log, in which the step of its positions is sought
+_FREQUENCIES = 2048  # at which the noise of an acceleration is summed
+_JOINTS = 4  # named in a finding
+
+
+@dataclass(frozen=True, eq=False)
+class RegressorNoise:
+    """What the steps of the positions do to least squares.
+
+    Attributes:
+        steps: Largest step of each joint's position in the logs, shape (n,) [rad or m]; 0: none.
+        share: Root mean square of what they add to each acceleration, over its own, shape (n,) [-].
+        shift: By how much they move base parameters, E[theta_ls] - theta, shape (b,).
+        meat: Covariance that the score has beyond the scatter of its segments, shape (b, b): that
+            of repeated rounding errors, and of the shift.
+        is_corrected: Whether the estimate is corrected; otherwise its covariance has the shift.
+    """
+
+    steps: Array
+    share: Array
+    shift: Array
+    meat: Array
+    is_corrected: bool = True
+
+    def uncorrected(self, information: Array) -> "RegressorNoise":
+        """Return the same where the shift is not corrected, but counts as an error.
+
+        Args:
+            information: W^T S^-1 W of all rows, shape (b, b).
+        """
+        score = information @ self.shift
+        return replace(self, meat=self.meat + np.outer(score, score), is_corrected=False)
+
+
+def find_regressor_noise(
+    recordings: Recordings, whole: Reduction, theta: Array, sigma: Array
+) -> RegressorNoise | None:
+    """Return what the steps of the positions do to least squares; None if next to nothing.
+
+    Args:
+        recordings: The recordings. Of logs in files, the windows that are in memory stand for all.
+        whole: What all of their rows come down to, base parameters.
+        theta: Base parameters that least squares find in them, shape (b,).
+        sigma: Noise level per joint that weighted the rows, shape (n_rows,) [N m or N].
+    """
+    model, factors, weights = recordings.model, whole.factors, 1.0 / sigma**2
+    if model.is_static or model.free_flyer:
+        return None
+    near = _in_memory(recordings)
+    steps = [_steps(log) for log in near.fitted]
+    share = _share(near.fitted, steps, whole)
+    size = np.sqrt(recordings.share * theta @ factors.information(weights) @ theta)
+    if not near.fitted or (share.max() ** 2) * size < _MATTERS:
+        return None
+    plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
+    scale = float(factors.rows.sum() / plain.rows)  # all rows over those that are looked at
+    bread = scale * solve_factor(factors, sigma, theta).covariance
+    error = np.sqrt(np.diag(bread) / (scale * recordings.share))
+    rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
+    while len(pairs) < _MOST:
+        pairs.append(_pair(near, steps, theta, weights, rng))
+        pulls = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
+        spread = np.std(pulls @ bread, axis=0, ddof=1) if len(pairs) > 1 else np.inf
+        if len(pairs) >= _FEWEST and (spread <= _SURE * np.sqrt(len(pairs)) * error).all():
+            break
+    D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
+    D = D - plain.information
+    move = np.zeros_like(theta)
+    for _ in range(_TERMS):
+        move = bread @ (pulls.mean(axis=0) + D @ move)
+    odd = np.array([0.5 * (one.segments - two.segments) for one, two in pairs])  # (k, s, b)
+    meat = scale * _repeated(odd, bread) + scale**2 * np.cov(pulls.T) / len(pulls)
+    return RegressorNoise(np.max(steps, axis=0), share, -move, meat)
+
+
+def encoder_findings(identification: "Identification") -> list[Finding]:
+    """Return a finding where the steps of encoders move inertial parameters.
+
+    Args:
+        identification: What was found.
+    """
+    noise, model = identification.regressor_noise, identification.model
+    if noise is None:
+        return []
+    is_inertial = identification.mapping.K[:, : model.layout.n_inertial].any(axis=1)
+    moved = np.where(is_inertial, np.abs(noise.shift), 0.0) / identification.base_error
+    worst = int(np.argmax(moved))
+    if moved[worst] < _NAMED:
+        return []
+    coarse = np.flatnonzero(noise.share > _ALIKE * noise.share.max())
+    names = [model.joints[j] for j in coarse]
+    largest = int(coarse[np.argmax(noise.steps[coarse])])
+    step, unit = float(noise.steps[largest]), "rad"
+    resolution = f" ({np.log2(2 * np.pi / step):.1f} bits a turn)"
+    if model.joints[largest] in model.layout.prismatic:
+        unit, resolution = "m", ""
+    effect = (
+        "the estimate is corrected for it"
+        if noise.is_corrected
+        else "this estimator is not corrected for it, its standard errors count it"
+    )
+    message = (
+        f"{listed(names, _JOINTS)}: the position has steps of up to {step:.3g} {unit}{resolution}, "
+        f"which are up to {100 * noise.share.max():.2g} % of the acceleration behind the filter. "
+        f"This noise of the regressor moves {identification.mapping.base_names[worst]} by "
+        f"{moved[worst]:.1f} standard errors; {effect}. A longer log does not reduce it: lower "
+        "cutoff, move faster, log the velocity of the drive, or use a finer encoder"
+    )
+    evidence = {
+        f"step_{name}": float(noise.steps[j]) for name, j in zip(names, coarse, strict=True)
+    }
+    evidence |= {"std_errors": float(moved[worst]), "share_pct": 100 * float(noise.share.max())}
+    severity = "warning" if moved[worst] >= _WARNED else "note"
+    return [Finding("encoder_noise", severity, listed(names), message, evidence)]
+
+
+def rounding_errors(q: Array, steps: Array, width: int, rng: np.random.Generator) -> Array:
+    """Return errors that encoders of the same steps make on the same motion, shape (N, n).
+
+    The motion is smoothed, and rounded with the steps at another place.
+
+    Args:
+        q: Positions, rounded, shape (N, n) [rad or m].
+        steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
+        width: Rows over which the motion is averaged, twice.
+        rng: Source of the places.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    smooth = q
+    for _ in range(2):
+        smooth = uniform_filter1d(smooth, width, axis=0, mode="nearest")
+    count = smooth / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
+    errors: Array = (np.round(count) - count) * steps
+    return errors
+
+
+def acceleration_noise(step: float, signals: SignalSettings) -> float:
+    """Return the acceleration's root mean square of white noise of 1 on the positions [1/s^2].
+
+    Behind the filter, which has the gain 1 / (1 + (f / cutoff)^(2 order)), and two central
+    differences, each of the gain sin(2 pi f step) / step.
+
+    Args:
+        step: Time step of the rows [s].
+        signals: The settings, resolved.
+    """
+    f = (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES * step)
+    gain = (np.sin(2 * np.pi * f * step) / step) ** 2
+    if signals.cutoff is not None:
+        gain = gain / (1.0 + (f / signals.cutoff) ** (2 * signals.order))
+    return float(np.sqrt(np.mean(gain**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """What the rows of logs on some motion sum up to."""
+
+    segments: Array  # (s, b), score W^T S^-1 (tau - W theta) of each segment
+    information: Array  # (b, b), W^T S^-1 W of all rows
+    rows: int
+
+    @property
+    def score(self) -> Array:
+        """That of all rows, shape (b,)."""
+        total: Array = self.segments.sum(axis=0)
+        return total
+
+
+def _sums(near: Recordings, motions: Sequence[Trajectory], theta: Array, weights: Array) -> _Sums:
+    """Return what the rows sum up to if the logs in memory had moved so."""
+    segments, rows = list[Array](), 0
+    information = np.zeros((len(theta), len(theta)))
+    for k, motion in enumerate(motions):
+        factors: Factors
+        for factors in near.segments(k, motion):
+            segments.append(factors.score(theta, weights))
+            information += factors.information(weights)
+            rows += int(factors.rows.sum())
+    return _Sums(np.array(segments), information, rows)
+
+
+def _pair(
+    near: Recordings,
+    steps: Sequence[Array],
+    theta: Array,
+    weights: Array,
+    rng: np.random.Generator,
+) -> tuple[_Sums, _Sums]:
+    """Return what the rows sum up to with rounding errors added, and subtracted."""
+    errors = []
+    for log, own in zip(near.fitted, steps, strict=True):
+        half = 0.5 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter's period
+        errors.append(rounding_errors(log.head.q, own, max(3, round(half)), rng))
+
+    def summed(sign: float) -> _Sums:
+        pairs = zip(near.fitted, errors, strict=True)
+        return _sums(near, [_moved(log, sign * e) for log, e in pairs], theta, weights)
+
+    return summed(1.0), summed(-1.0)
+
+
+def _moved(log: SurveyedLog, errors: Array) -> Trajectory:
+    """Return the smooth motion of a log in memory with errors of its positions."""
+    source = replace(log.head, q=log.head.q + errors)
+    return replace(log, source=source, windows=(source,), asked=log.signals).whole.trajectory
+
+
+def _repeated(odd: Array, bread: Array) -> Array:
+    """Return the covariance of the score that segments do not show, shape (b, b).
+
+    Segments that have the same rounding errors do not scatter, but add up: the sum's variance over
+    that of the segments, weighed by what the parameters make of it, is then above 1.
+
+    Args:
+        odd: What is linear in k draws of the errors of the score of s segments, shape (k, s, b).
+        bread: Covariance of the parameters if rows were independent, shape (b, b).
+    """
+    total, each = odd.sum(axis=1), odd.reshape(-1, odd.shape[2])
+    size = float(np.einsum("si,ij,sj->", each, bread, each))
+    if size <= 0.0:
+        return np.zeros_like(bread)
+    ratio = float(np.einsum("ki,ij,kj->", total, bread, total)) / size
+    covariance: Array = max(ratio - 1.0, 0.0) / len(odd) * (each.T @ each)
+    return covariance
+
+
+def _in_memory(recordings: Recordings) -> Recordings:
+    """Return the fitted logs in memory; of those in files the windows that were looked at."""
+    if all(log.is_held for log in recordings.fitted):
+        return recordings
+    windows = [
+        hold_log(log.model, window, log.signals)
+        for log in recordings.fitted
+        for window in log.looks
+    ]
+    usable = [log for log in windows if len(log.pieces[0].read().trajectory.t)]
+    return replace(recordings, fitted=usable, kept=(), plan=None, checkpoint=None)
+
+
+def _steps(log: SurveyedLog) -> Array:
+    """Return the steps of the positions of a log in memory, shape (n,); 0 if they do not matter.
+
+    They do not where velocities are measured.
+    """
+    if log.signals.velocity == "measured":
+        return np.zeros(len(log.model.joints))
+    return np.array([quantum(x, repeats=False) for x in log.head.q[:_ROWS].T])
+
+
+def _share(logs: Sequence[SurveyedLog], steps: Sequence[Array], whole: Reduction) -> Array:
+    """Return what steps add to each acceleration over its own size, at most 1, shape (n,)."""
+    noise = [
+        own / np.sqrt(12.0) * acceleration_noise(log.step, log.signals)
+        for log, own in zip(logs, steps, strict=True)
+    ]
+    own = np.sqrt(whole.squares[2] / max(whole.samples, 1))
+    largest = np.max(noise, axis=0)
+    share: Array = np.where(own > 0, largest / np.where(own > 0, own, 1.0), 0.0)
+    return np.minimum(share, 1.0)
