@@ -139,15 +139,16 @@ class Recordings:
             mass_stream if with_mass else None,
         )
 
-    def segments(self, k: int, motion: Trajectory) -> tuple[Factors, ...]:
+    def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
         """Return the factors of each segment of a log in memory, as ``reduce`` cuts it.
 
         Args:
             k: Which of the logs to fit.
             motion: Its smooth motion, or another one of as many samples; the rows used and their
                 weights are those of its own.
+            joined: How many of the segments are one.
         """
-        return compress_stretches(self._problem(k, motion), self._length(k))
+        return compress_stretches(self._problem(k, motion), joined * self._length(k))
 
     def _problem(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
         """Return the rows of a log in memory, weighted, on a motion of as many samples."""

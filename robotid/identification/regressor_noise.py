@@ -46,12 +46,13 @@ __all__ = [
     "rounding_errors",
 ]
 
-_FEWEST, _MOST = 3, 8  # pairs of rounding errors
+_FEWEST, _MOST = 3, 6  # pairs of rounding errors
 _SURE = 0.2  # standard errors by which the shift may be uncertain without more pairs
 _TERMS = 4  # of the series (1 - H^-1 D)^-1
 _MATTERS = 0.1  # standard errors that all parameters move together, below which nothing is done
 _NAMED, _WARNED = 0.5, 2.0  # standard errors of one parameter: a note, and a warning
 _ALIKE = 0.1  # of the largest share of noise, from which a joint is named
+_JOINED = 4  # segments that are one, which is faster
 _ROWS = 20_000  # of a log, in which the step of its positions is sought
 _FREQUENCIES = 2048  # at which the noise of an acceleration is summed
 _JOINTS = 4  # named in a finding
@@ -137,7 +138,7 @@ def encoder_findings(identification: "Identification") -> list[Finding]:
     if noise is None:
         return []
     is_inertial = identification.mapping.K[:, : model.layout.n_inertial].any(axis=1)
-    moved = np.where(is_inertial, np.abs(noise.shift), 0.0) / identification.base_error
+    moved = np.where(is_inertial, np.abs(noise.shift) / identification.wls.std_error, 0.0)
     worst = int(np.argmax(moved))
     if moved[worst] < _NAMED:
         return []
@@ -227,7 +228,7 @@ def _sums(near: Recordings, motions: Sequence[Trajectory], theta: Array, weights
     information = np.zeros((len(theta), len(theta)))
     for k, motion in enumerate(motions):
         factors: Factors
-        for factors in near.segments(k, motion):
+        for factors in near.segments(k, motion, _JOINED):
             segments.append(factors.score(theta, weights))
             information += factors.information(weights)
             rows += int(factors.rows.sum())
