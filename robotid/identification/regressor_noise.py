@@ -49,7 +49,7 @@ __all__ = [
 _FEWEST, _MOST = 3, 6  # pairs of rounding errors
 _SURE = 0.2  # standard errors by which the shift may be uncertain without more pairs
 _TERMS = 4  # of the series (1 - H^-1 D)^-1
-_MATTERS = 0.1  # standard errors that all parameters move together, below which nothing is done
+_MATTERS = 0.1  # standard errors by which parameters move, below which nothing is done
 _NAMED, _WARNED = 0.5, 2.0  # standard errors of one parameter: a note, and a warning
 _ALIKE = 0.1  # of the largest share of noise, from which a joint is named
 _JOINED = 4  # segments that are one, which is faster
@@ -63,7 +63,8 @@ class RegressorNoise:
     """What the steps of the positions do to least squares.
 
     Attributes:
-        steps: Largest step of each joint's position in the logs, shape (n,) [rad or m]; 0: none.
+        steps: Largest step of each joint's position in the logs, shape (n,) [rad or m]; 0: none, or
+            of no effect since velocities are measured.
         share: Root mean square of what they add to each acceleration, over its own, shape (n,) [-].
         shift: By how much they move base parameters, E[theta_ls] - theta, shape (b,).
         meat: Covariance that the score has beyond the scatter of its segments, shape (b, b): that
@@ -110,14 +111,16 @@ def find_regressor_noise(
     plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
     scale = float(factors.rows.sum() / plain.rows)  # all rows over those that are looked at
     bread = scale * solve_factor(factors, sigma, theta).covariance
-    error = np.sqrt(np.diag(bread) / (scale * recordings.share))
+    variance = np.diag(bread) / (scale * recordings.share)
+    error = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.inf)  # inf: left open
     rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
-    while len(pairs) < _MOST:
+    is_enough = False
+    while not is_enough:
         pairs.append(_pair(near, steps, theta, weights, rng))
         pulls = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
-        spread = np.std(pulls @ bread, axis=0, ddof=1) if len(pairs) > 1 else np.inf
-        if len(pairs) >= _FEWEST and (spread <= _SURE * np.sqrt(len(pairs)) * error).all():
-            break
+        is_enough = _is_enough(pulls @ bread / error)
+    if len(pairs) < _FEWEST:
+        return None
     D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
     D = D - plain.information
     move = np.zeros_like(theta)
@@ -156,8 +159,8 @@ def encoder_findings(identification: "Identification") -> list[Finding]:
     )
     message = (
         f"{listed(names, _JOINTS)}: the position has steps of up to {step:.3g} {unit}{resolution}, "
-        f"which are up to {100 * noise.share.max():.2g} % of the acceleration behind the filter. "
-        f"This noise of the regressor moves {identification.mapping.base_names[worst]} by "
+        f"which add noise of up to {100 * noise.share.max():.2g} % to the RMS acceleration. Noise "
+        f"of the regressor moves {identification.mapping.base_names[worst]} by "
         f"{moved[worst]:.1f} standard errors; {effect}. A longer log does not reduce it: lower "
         "cutoff, move faster, log the velocity of the drive, or use a finer encoder"
     )
@@ -220,6 +223,18 @@ class _Sums:
         """That of all rows, shape (b,)."""
         total: Array = self.segments.sum(axis=0)
         return total
+
+
+def _is_enough(moves: Array) -> bool:
+    """Return whether draws show by how much parameters move, or that it is next to nothing.
+
+    Args:
+        moves: What each of k draws says, in standard errors, shape (k, b).
+    """
+    count = len(moves)
+    if count < _FEWEST:
+        return bool((np.abs(moves.mean(axis=0)) < _MATTERS).all())
+    return count >= _MOST or bool((moves.std(axis=0, ddof=1) <= _SURE * np.sqrt(count)).all())
 
 
 def _sums(near: Recordings, motions: Sequence[Trajectory], theta: Array, weights: Array) -> _Sums:
