@@ -2,13 +2,18 @@
 
 A position that an encoder rounds has noisy derivatives, so the regressor W has noise E of its own,
 which does not average out. Of H = W^T S^-1 W, D = E[E^T S^-1 E] is that noise, and least squares
-find (H - D) theta / H, too small: theta = theta_ls + H^-1 D theta.
+find theta_ls = H^-1 (H - D) theta. Corrected, theta = theta_ls + (H - D)^-1 D theta_ls, and errors
+of theta_ls are amplified by (H - D)^-1 H.
 
-D theta is found by rounding once more. Rounding errors e of the same encoder on the same motion,
-with another phase, go through the same filter, differences and regressor; of +e and -e together
-what is linear in e cancels. With the scores s(theta) = W^T S^-1 (tau - W theta):
+D is found by rounding once more. Rounding errors e of the same encoder on the same motion, with
+another phase, go through the same filter, differences and regressor; of +e and -e together what is
+linear in e cancels. With the scores s(theta) = W^T S^-1 (tau - W theta):
 
     D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
+
+In the eigenvectors of D against H, whose eigenvalues x are the share of noise in what seems to be
+known of a direction, the correction is by 1 / (1 - x); D is not known so well that directions of
+nothing but noise could be corrected, so x counts up to a bound, and an error of D as an error.
 
 What is linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score that the encoder makes. Where
 a motion is repeated so are its rounding errors, and segments of the log do not scatter as much as
@@ -48,10 +53,14 @@ __all__ = [
 
 _FEWEST, _MOST = 3, 6  # pairs of rounding errors
 _SURE = 0.2  # standard errors by which the shift may be uncertain without more pairs
-_TERMS = 4  # of the series (1 - H^-1 D)^-1
+_WORST = 0.8  # share of noise in a direction from which it is corrected no further
+_UNSURE = 0.1  # of a share of noise: its standard error
 _MATTERS = 0.1  # standard errors by which parameters move, below which nothing is done
 _NAMED, _WARNED = 0.5, 2.0  # standard errors of one parameter: a note, and a warning
 _ALIKE = 0.1  # of the largest share of noise, from which a joint is named
+
+
+_CUBIC = 5  # rows either way in which the motion is smoothed, at least
 _JOINED = 4  # segments that are one, which is faster
 _ROWS = 20_000  # of a log, in which the step of its positions is sought
 _FREQUENCIES = 2048  # at which the noise of an acceleration is summed
@@ -67,14 +76,19 @@ class RegressorNoise:
             of no effect since velocities are measured.
         share: Root mean square of what they add to each acceleration, over its own, shape (n,) [-].
         shift: By how much they move base parameters, E[theta_ls] - theta, shape (b,).
-        meat: Covariance that the score has beyond the scatter of its segments, shape (b, b): that
-            of repeated rounding errors, and of the shift.
+        std_error: Standard errors of base parameters by residual and filter alone, without what the
+            steps add to them, shape (b,); inf where the data leave them open.
+        gain: By what the correction amplifies the score, H (H - D)^-1, shape (b, b).
+        meat: Covariance that the score then has beyond the scatter of its segments, shape (b, b):
+            that of repeated rounding errors, and of the shift.
         is_corrected: Whether the estimate is corrected; otherwise its covariance has the shift.
     """
 
     steps: Array
     share: Array
     shift: Array
+    std_error: Array
+    gain: Array
     meat: Array
     is_corrected: bool = True
 
@@ -82,10 +96,21 @@ class RegressorNoise:
         """Return the same where the shift is not corrected, but counts as an error.
 
         Args:
-            information: W^T S^-1 W of all rows, shape (b, b).
+            information: H = W^T S^-1 W of all rows, shape (b, b).
         """
-        score = information @ self.shift
-        return replace(self, meat=self.meat + np.outer(score, score), is_corrected=False)
+        score, still = information @ self.shift, np.eye(len(self.gain))
+        return replace(
+            self, gain=still, meat=self.meat + np.outer(score, score), is_corrected=False
+        )
+
+    def enlarged(self, meat: Array) -> Array:
+        """Return the covariance of the score of all rows, shape (b, b).
+
+        Args:
+            meat: What the scatter of its segments shows, shape (b, b).
+        """
+        covariance: Array = self.gain @ meat @ self.gain.T + self.meat
+        return covariance
 
 
 def find_regressor_noise(
@@ -121,14 +146,18 @@ def find_regressor_noise(
         is_enough = _is_enough(pulls @ bread / error)
     if len(pairs) < _FEWEST:
         return None
+    H = factors.information(weights)
     D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
-    D = D - plain.information
-    move = np.zeros_like(theta)
-    for _ in range(_TERMS):
-        move = bread @ (pulls.mean(axis=0) + D @ move)
+    root, x = _directions(bread / scale, scale * (D - plain.information))
+    pull = scale * root.T @ pulls.mean(axis=0)  # along each direction
+    inverse = (root / (1.0 - x)) @ root.T  # (H - D)^-1
+    gain = H @ inverse
+    unsure = (H @ root) * (pull * _UNSURE * x / (1.0 - x) ** 2)
     odd = np.array([0.5 * (one.segments - two.segments) for one, two in pairs])  # (k, s, b)
-    meat = scale * _repeated(odd, bread) + scale**2 * np.cov(pulls.T) / len(pulls)
-    return RegressorNoise(np.max(steps, axis=0), share, -move, meat)
+    own = scale * _repeated(odd, bread) + scale**2 * np.cov(pulls.T) / len(pulls)
+    meat = gain @ own @ gain.T + unsure @ unsure.T
+    shift = -(root / (1.0 - x)) @ pull
+    return RegressorNoise(np.max(steps, axis=0), share, shift, error, gain, meat)
 
 
 def encoder_findings(identification: "Identification") -> list[Finding]:
@@ -141,7 +170,7 @@ def encoder_findings(identification: "Identification") -> list[Finding]:
     if noise is None:
         return []
     is_inertial = identification.mapping.K[:, : model.layout.n_inertial].any(axis=1)
-    moved = np.where(is_inertial, np.abs(noise.shift) / identification.wls.std_error, 0.0)
+    moved = np.where(is_inertial, np.abs(noise.shift) / noise.std_error, 0.0)
     worst = int(np.argmax(moved))
     if moved[worst] < _NAMED:
         return []
@@ -180,14 +209,12 @@ def rounding_errors(q: Array, steps: Array, width: int, rng: np.random.Generator
     Args:
         q: Positions, rounded, shape (N, n) [rad or m].
         steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
-        width: Rows over which the motion is averaged, twice.
+        width: Rows in which the motion is taken to be a cubic, odd.
         rng: Source of the places.
     """
-    from scipy.ndimage import uniform_filter1d
+    from scipy.signal import savgol_filter
 
-    smooth = q
-    for _ in range(2):
-        smooth = uniform_filter1d(smooth, width, axis=0, mode="nearest")
+    smooth = savgol_filter(q, min(width, (len(q) - 1) // 2 * 2 + 1), 3, axis=0)
     count = smooth / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
     errors: Array = (np.round(count) - count) * steps
     return errors
@@ -196,8 +223,9 @@ def rounding_errors(q: Array, steps: Array, width: int, rng: np.random.Generator
 def acceleration_noise(step: float, signals: SignalSettings) -> float:
     """Return the acceleration's root mean square of white noise of 1 on the positions [1/s^2].
 
-    Behind the filter, which has the gain 1 / (1 + (f / cutoff)^(2 order)), and two central
-    differences, each of the gain sin(2 pi f step) / step.
+    Behind the digital Butterworth filter, forward and backward, and two central differences:
+
+    1 / (1 + (tan(pi f step) / tan(pi cutoff step))^(2 order)) and (sin(2 pi f step) / step)^2.
 
     Args:
         step: Time step of the rows [s].
@@ -206,7 +234,8 @@ def acceleration_noise(step: float, signals: SignalSettings) -> float:
     f = (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES * step)
     gain = (np.sin(2 * np.pi * f * step) / step) ** 2
     if signals.cutoff is not None:
-        gain = gain / (1.0 + (f / signals.cutoff) ** (2 * signals.order))
+        ratio = np.tan(np.pi * f * step) / np.tan(np.pi * signals.cutoff * step)
+        gain = gain / (1.0 + ratio ** (2 * signals.order))
     return float(np.sqrt(np.mean(gain**2)))
 
 
@@ -223,6 +252,22 @@ class _Sums:
         """That of all rows, shape (b,)."""
         total: Array = self.segments.sum(axis=0)
         return total
+
+
+def _directions(bread: Array, D: Array) -> tuple[Array, Array]:
+    """Return directions in which noise and information do not mix, and the noise's share of each.
+
+    Args:
+        bread: Inverse of the information H, shape (b, b); 0 of what it leaves open.
+        D: Noise of H, shape (b, b).
+
+    Returns:
+        Columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); its diagonal within bounds.
+    """
+    size, axes = np.linalg.eigh(bread)
+    root = axes * np.sqrt(np.maximum(size, 0.0))
+    x, turn = np.linalg.eigh(root.T @ D @ root)
+    return root @ turn, np.clip(x, 0.0, _WORST)
 
 
 def _is_enough(moves: Array) -> bool:
@@ -260,8 +305,8 @@ def _pair(
     """Return what the rows sum up to with rounding errors added, and subtracted."""
     errors = []
     for log, own in zip(near.fitted, steps, strict=True):
-        half = 0.5 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter's period
-        errors.append(rounding_errors(log.head.q, own, max(3, round(half)), rng))
+        period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
+        errors.append(rounding_errors(log.head.q, own, 2 * max(_CUBIC, round(period)) + 1, rng))
 
     def summed(sign: float) -> _Sums:
         pairs = zip(near.fitted, errors, strict=True)
