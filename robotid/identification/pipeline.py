@@ -861,8 +861,8 @@ def _measured(
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
     stretches, share, K = ground.before.stretches, ground.before.share, mapping.K
-    noise = ground.noise
-    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, noise=noise)
+    more = None if ground.noise is None else ground.noise.meat
+    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, more=more)
     if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
@@ -875,7 +875,7 @@ def _measured(
         is_filter = weighing == "by age"
         estimate, errors = measured_errors(
             estimate, stretches, factors, share, K, sigma,
-            is_filter=is_filter, pull=pull, redraws=redraws, noise=noise,
+            is_filter=is_filter, pull=pull, redraws=redraws, more=more,
         )  # fmt: skip
     if ground.grown != 1.0:
         estimate = replace(estimate, covariance=ground.grown * estimate.covariance)

@@ -2,18 +2,20 @@
 
 A position that an encoder rounds has noisy derivatives, so the regressor W has noise E of its own,
 which does not average out. Of H = W^T S^-1 W, D = E[E^T S^-1 E] is that noise, and least squares
-find theta_ls = H^-1 (H - D) theta. Corrected, theta = theta_ls + (H - D)^-1 D theta_ls, and errors
-of theta_ls are amplified by (H - D)^-1 H.
+find theta_ls = H^-1 (H - D) theta. Corrected, theta = theta_ls + (H - D)^-1 D theta_ls.
 
-D is found by rounding once more. Rounding errors e of the same encoder on the same motion, with
-another phase, go through the same filter, differences and regressor; of +e and -e together what is
-linear in e cancels. With the scores s(theta) = W^T S^-1 (tau - W theta):
+D is found by rounding once more. Rounding errors e of the same encoder on the same motion, its zero
+elsewhere, are added to smoothed positions and go through the same filter, differences and
+regressor; of +e and -e together what is linear in e cancels. With the scores s(theta) =
+W^T S^-1 (tau - W theta):
 
     D theta = s(theta) - mean over e of [s_{+e}(theta) + s_{-e}(theta)] / 2
 
 In the eigenvectors of D against H, whose eigenvalues x are the share of noise in what seems to be
 known of a direction, the correction is by 1 / (1 - x); D is not known so well that directions of
-nothing but noise could be corrected, so x counts up to a bound, and an error of D as an error.
+nothing but noise could be corrected, so x counts up to a bound, and an error of D as an error. The
+correction amplifies errors by as much; the bias is uneven over a log, so segments scatter more than
+the errors do by about the same, and their scatter is taken as it is (docs/trust.md has coverages).
 
 What is linear in e, [s_{+e} - s_{-e}] / 2, is the noise of the score that the encoder makes. Where
 a motion is repeated so are its rounding errors, and segments of the log do not scatter as much as
@@ -49,9 +51,10 @@ __all__ = [
     "encoder_findings",
     "find_regressor_noise",
     "rounding_errors",
+    "smoothed",
 ]
 
-_FEWEST, _MOST = 3, 6  # pairs of rounding errors
+_FEWEST, _MOST = 4, 6  # pairs of rounding errors
 _SURE = 0.2  # standard errors by which the shift may be uncertain without more pairs
 _WORST = 0.8  # share of noise in a direction from which it is corrected no further
 _UNSURE = 0.1  # of a share of noise: its standard error
@@ -78,9 +81,8 @@ class RegressorNoise:
         shift: By how much they move base parameters, E[theta_ls] - theta, shape (b,).
         std_error: Standard errors of base parameters by residual and filter alone, without what the
             steps add to them, shape (b,); inf where the data leave them open.
-        gain: By what the correction amplifies the score, H (H - D)^-1, shape (b, b).
-        meat: Covariance that the score then has beyond the scatter of its segments, shape (b, b):
-            that of repeated rounding errors, and of the shift.
+        meat: Covariance of the score that the scatter of segments does not show, shape (b, b): of
+            repeated rounding errors, and of the shift.
         is_corrected: Whether the estimate is corrected; otherwise its covariance has the shift.
     """
 
@@ -88,7 +90,6 @@ class RegressorNoise:
     share: Array
     shift: Array
     std_error: Array
-    gain: Array
     meat: Array
     is_corrected: bool = True
 
@@ -98,19 +99,8 @@ class RegressorNoise:
         Args:
             information: H = W^T S^-1 W of all rows, shape (b, b).
         """
-        score, still = information @ self.shift, np.eye(len(self.gain))
-        return replace(
-            self, gain=still, meat=self.meat + np.outer(score, score), is_corrected=False
-        )
-
-    def enlarged(self, meat: Array) -> Array:
-        """Return the covariance of the score of all rows, shape (b, b).
-
-        Args:
-            meat: What the scatter of its segments shows, shape (b, b).
-        """
-        covariance: Array = self.gain @ meat @ self.gain.T + self.meat
-        return covariance
+        score = information @ self.shift
+        return replace(self, meat=self.meat + np.outer(score, score), is_corrected=False)
 
 
 def find_regressor_noise(
@@ -133,6 +123,7 @@ def find_regressor_noise(
     size = np.sqrt(recordings.share * theta @ factors.information(weights) @ theta)
     if not near.fitted or (share.max() ** 2) * size < _MATTERS:
         return None
+    near = _without_steps(near, steps)
     plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
     scale = float(factors.rows.sum() / plain.rows)  # all rows over those that are looked at
     bread = scale * solve_factor(factors, sigma, theta).covariance
@@ -150,14 +141,13 @@ def find_regressor_noise(
     D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
     root, x = _directions(bread / scale, scale * (D - plain.information))
     pull = scale * root.T @ pulls.mean(axis=0)  # along each direction
-    inverse = (root / (1.0 - x)) @ root.T  # (H - D)^-1
-    gain = H @ inverse
-    unsure = (H @ root) * (pull * _UNSURE * x / (1.0 - x) ** 2)
-    odd = np.array([0.5 * (one.segments - two.segments) for one, two in pairs])  # (k, s, b)
-    own = scale * _repeated(odd, bread) + scale**2 * np.cov(pulls.T) / len(pulls)
-    meat = gain @ own @ gain.T + unsure @ unsure.T
+    odd = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])  # (k, s, b)
+    unsure = (pull * _UNSURE * x / (1.0 - x) ** 2) ** 2
+    along = H @ root  # what a move along each direction adds to the score
+    meat = (along * (scale * _repeated(odd) + unsure)) @ along.T
+    meat = meat + scale**2 * np.cov(pulls.T) / len(pulls)
     shift = -(root / (1.0 - x)) @ pull
-    return RegressorNoise(np.max(steps, axis=0), share, shift, error, gain, meat)
+    return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
 
 
 def encoder_findings(identification: "Identification") -> list[Finding]:
@@ -201,21 +191,33 @@ def encoder_findings(identification: "Identification") -> list[Finding]:
     return [Finding("encoder_noise", severity, listed(names), message, evidence)]
 
 
-def rounding_errors(q: Array, steps: Array, width: int, rng: np.random.Generator) -> Array:
-    """Return errors that encoders of the same steps make on the same motion, shape (N, n).
+def smoothed(q: Array, steps: Array, width: int) -> Array:
+    """Return what brings rounded positions near to what they were before, shape (N, n).
 
-    The motion is smoothed, and rounded with the steps at another place.
+    A cubic through the rows around each, at most a step away.
 
     Args:
-        q: Positions, rounded, shape (N, n) [rad or m].
+        q: Positions, without full turns, shape (N, n) [rad or m].
         steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
         width: Rows in which the motion is taken to be a cubic, odd.
-        rng: Source of the places.
     """
     from scipy.signal import savgol_filter
 
-    smooth = savgol_filter(q, min(width, (len(q) - 1) // 2 * 2 + 1), 3, axis=0)
-    count = smooth / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
+    rows = (len(q) - 1) // 2 * 2 + 1
+    smooth = savgol_filter(q, min(width, rows), min(3, rows - 1), axis=0)
+    change: Array = np.clip(smooth - q, -steps, steps)
+    return change
+
+
+def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
+    """Return errors of encoders whose zeros lie anywhere, shape (N, n).
+
+    Args:
+        q: Positions before they are rounded, shape (N, n) [rad or m].
+        steps: Steps of the encoders, shape (n,) [rad or m]; 0: none.
+        rng: Source of the zeros.
+    """
+    count = q / np.where(steps > 0, steps, 1.0) + rng.random(q.shape[1])
     errors: Array = (np.round(count) - count) * steps
     return errors
 
@@ -303,41 +305,50 @@ def _pair(
     rng: np.random.Generator,
 ) -> tuple[_Sums, _Sums]:
     """Return what the rows sum up to with rounding errors added, and subtracted."""
-    errors = []
-    for log, own in zip(near.fitted, steps, strict=True):
-        period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
-        errors.append(rounding_errors(log.head.q, own, 2 * max(_CUBIC, round(period)) + 1, rng))
+    logs = zip(near.fitted, steps, strict=True)
+    errors = [rounding_errors(log.head.q, own, rng) for log, own in logs]
 
     def summed(sign: float) -> _Sums:
         pairs = zip(near.fitted, errors, strict=True)
-        return _sums(near, [_moved(log, sign * e) for log, e in pairs], theta, weights)
+        motions = [_shifted(log, sign * e).whole.trajectory for log, e in pairs]
+        return _sums(near, motions, theta, weights)
 
     return summed(1.0), summed(-1.0)
 
 
-def _moved(log: SurveyedLog, errors: Array) -> Trajectory:
-    """Return the smooth motion of a log in memory with errors of its positions."""
-    source = replace(log.head, q=log.head.q + errors)
-    return replace(log, source=source, windows=(source,), asked=log.signals).whole.trajectory
+def _shifted(log: SurveyedLog, change: Array) -> SurveyedLog:
+    """Return a log in memory with other positions, smoothed alike."""
+    source = replace(log.head, q=log.head.q + change)
+    return replace(log, source=source, windows=(source,), asked=log.signals)
 
 
-def _repeated(odd: Array, bread: Array) -> Array:
-    """Return the covariance of the score that segments do not show, shape (b, b).
+def _without_steps(near: Recordings, steps: Sequence[Array]) -> Recordings:
+    """Return logs in memory with positions about as they were before they were rounded.
 
-    Segments that have the same rounding errors do not scatter, but add up: the sum's variance over
-    that of the segments, weighed by what the parameters make of it, is then above 1.
+    Errors that are added are then not multiplied by those that the positions had.
+    """
+    logs = []
+    for log, own in zip(near.fitted, steps, strict=True):
+        period = 1.0 / ((log.signals.cutoff or np.inf) * log.step)  # [rows], of the filter
+        width = 2 * max(_CUBIC, round(period)) + 1
+        slides = np.isin(log.model.joints, list(log.model.layout.prismatic))
+        q = np.where(slides, log.head.q, np.unwrap(log.head.q, axis=0))
+        logs.append(_shifted(log, smoothed(q, own, width)))
+    return replace(near, fitted=logs, kept=())
+
+
+def _repeated(odd: Array) -> Array:
+    """Return the variance of the score along each direction that segments do not show, shape (b,).
+
+    Segments that have the same rounding errors do not scatter, but add up.
 
     Args:
-        odd: What is linear in k draws of the errors of the score of s segments, shape (k, s, b).
-        bread: Covariance of the parameters if rows were independent, shape (b, b).
+        odd: What is linear in k draws of the errors of the score of s segments along b directions,
+            shape (k, s, b).
     """
-    total, each = odd.sum(axis=1), odd.reshape(-1, odd.shape[2])
-    size = float(np.einsum("si,ij,sj->", each, bread, each))
-    if size <= 0.0:
-        return np.zeros_like(bread)
-    ratio = float(np.einsum("ki,ij,kj->", total, bread, total)) / size
-    covariance: Array = max(ratio - 1.0, 0.0) / len(odd) * (each.T @ each)
-    return covariance
+    total, scattered = odd.sum(axis=1) ** 2, (odd**2).sum(axis=1)
+    more: Array = np.maximum(np.mean(total - scattered, axis=0), 0.0)
+    return more
 
 
 def _in_memory(recordings: Recordings) -> Recordings:
