@@ -832,10 +832,9 @@ def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Gro
     """
     if isinstance(choice, TLSSettings):
         return ground
-    is_alike = isinstance(choice, OLSSettings)
-    sigma = np.ones_like(ground.rough.sigma) if is_alike else ground.rough.sigma
-    theta = ground.rough.theta
-    noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma)
+    level, theta = ground.rough.sigma, ground.rough.theta
+    sigma = np.ones_like(level) if isinstance(choice, OLSSettings) else level
+    noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma, level)
     if noise is None:
         return ground
     if isinstance(choice, RecursiveSettings):
@@ -862,7 +861,8 @@ def _measured(
         raise ground.determination.refusal(error) from error
     stretches, share, K = ground.before.stretches, ground.before.share, mapping.K
     more = None if ground.noise is None else ground.noise.meat
-    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, more=more)
+    of_wls = None if weighing == "alike" else more  # which is of other weights
+    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, more=of_wls)
     if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:

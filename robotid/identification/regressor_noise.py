@@ -61,8 +61,6 @@ _UNSURE = 0.1  # of a share of noise: its standard error
 _MATTERS = 0.1  # standard errors by which parameters move, below which nothing is done
 _NAMED, _WARNED = 0.5, 2.0  # standard errors of one parameter: a note, and a warning
 _ALIKE = 0.1  # of the largest share of noise, from which a joint is named
-
-
 _CUBIC = 5  # rows either way in which the motion is smoothed, at least
 _JOINED = 4  # segments that are one, which is faster
 _ROWS = 20_000  # of a log, in which the step of its positions is sought
@@ -104,7 +102,7 @@ class RegressorNoise:
 
 
 def find_regressor_noise(
-    recordings: Recordings, whole: Reduction, theta: Array, sigma: Array
+    recordings: Recordings, whole: Reduction, theta: Array, sigma: Array, level: Array
 ) -> RegressorNoise | None:
     """Return what the steps of the positions do to least squares; None if next to nothing.
 
@@ -113,33 +111,37 @@ def find_regressor_noise(
         whole: What all of their rows come down to, base parameters.
         theta: Base parameters that least squares find in them, shape (b,).
         sigma: Noise level per joint that weighted the rows, shape (n_rows,) [N m or N].
+        level: That of the residual, likewise.
     """
     model, factors, weights = recordings.model, whole.factors, 1.0 / sigma**2
     if model.is_static or model.free_flyer:
         return None
     near = _in_memory(recordings)
+    if not near.fitted:
+        return None
     steps = [_steps(log) for log in near.fitted]
     share = _share(near.fitted, steps, whole)
-    size = np.sqrt(recordings.share * theta @ factors.information(weights) @ theta)
-    if not near.fitted or (share.max() ** 2) * size < _MATTERS:
+    size = np.sqrt(recordings.share * theta @ factors.information(1.0 / level**2) @ theta)
+    if share.max() ** 2 * size < _MATTERS:
         return None
     near = _without_steps(near, steps)
     plain = _sums(near, [log.whole.trajectory for log in near.fitted], theta, weights)
     scale = float(factors.rows.sum() / plain.rows)  # all rows over those that are looked at
-    bread = scale * solve_factor(factors, sigma, theta).covariance
-    variance = np.diag(bread) / (scale * recordings.share)
-    error = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.inf)  # inf: left open
+    bread = solve_factor(factors, sigma, theta).covariance
+    variance = np.diag(bread @ factors.information((level * weights) ** 2) @ bread)
+    error = np.sqrt(np.maximum(variance, 0.0) / recordings.share)
+    error = np.where(error > 0, error, np.inf)  # inf: left open
     rng, pairs = np.random.default_rng(0), list[tuple[_Sums, _Sums]]()
     is_enough = False
     while not is_enough:
         pairs.append(_pair(near, steps, theta, weights, rng))
         pulls = np.array([plain.score - 0.5 * (one.score + two.score) for one, two in pairs])
-        is_enough = _is_enough(pulls @ bread / error)
+        is_enough = _is_enough(scale * pulls @ bread / error)
     if len(pairs) < _FEWEST:
         return None
     H = factors.information(weights)
     D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
-    root, x = _directions(bread / scale, scale * (D - plain.information))
+    root, x = _directions(bread, scale * (D - plain.information))
     pull = scale * root.T @ pulls.mean(axis=0)  # along each direction
     odd = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])  # (k, s, b)
     unsure = (pull * _UNSURE * x / (1.0 - x) ** 2) ** 2

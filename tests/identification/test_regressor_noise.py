@@ -6,7 +6,7 @@ from helpers.fitting import identify
 from helpers.paths import ROOT
 from helpers.synthetic import truth
 
-from robotid.estimators import WLS
+from robotid.estimators import OLS, WLS
 from robotid.identification import survey
 from robotid.identification.recordings import Recordings
 from robotid.identification.regressor_noise import (
@@ -69,7 +69,7 @@ def fitted(model, *logs):
 
 def found_in(model, *logs):
     recordings, _, whole, wls = fitted(model, *logs)
-    return find_regressor_noise(recordings, whole, wls.theta, wls.sigma)
+    return find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
 
 
 @pytest.mark.parametrize(("cutoff", "order"), [(8.0, 4), (20.0, 2), (None, 4)])
@@ -112,13 +112,13 @@ def runs(planar, motion):
     return many(planar, motion)
 
 
-def many(model, motion, count=30, looked=6):
+def many(model, motion, count=24, looked=6):
     beta, errors, few = structural_mapping(model).to_base(truth(model)), [], []
     for seed in range(count):
         recordings, parts, whole, wls = fitted(model, recorded(model, motion, seed=seed))
         errors.append(wls.theta - beta)
         if seed < looked:
-            noise = find_regressor_noise(recordings, whole, wls.theta, wls.sigma)
+            noise = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
             fixed = wls, [part.factors for part in parts], whole.factors, recordings.share
             known, plain = (
                 measured_errors(*fixed, np.eye(len(beta)), wls.sigma, more=x)[0].std_error
@@ -193,7 +193,7 @@ def test_measured_velocities_have_no_noise_of_the_positions(planar, motion):
     )
     whole = join(recordings.reduce())
     wls = WLS().fit(whole.factors)
-    assert find_regressor_noise(recordings, whole, wls.theta, wls.sigma) is None
+    assert find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma) is None
 
 
 def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, motion):
@@ -208,6 +208,30 @@ def test_an_estimator_that_reads_samples_counts_the_shift_as_an_error(planar, mo
     assert (rls.base_error >= 0.95 * np.abs(noise.shift)).all()
     (finding,) = [f for f in rls.findings if f.code == "encoder_noise"]
     assert "its standard errors count it" in finding.message
+
+
+def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
+    _, noises, known, _ = runs
+    found = identify(
+        planar, [recorded(planar, motion)], signals=SIGNALS, estimator="wls",
+        friction="viscous+coulomb",
+    )  # fmt: skip
+    np.testing.assert_allclose(found.regressor_noise.shift, noises[0].shift, rtol=1e-6)
+    np.testing.assert_allclose(found.base_error, known[0], rtol=1e-4)
+    beta = found.mapping.to_base(truth(planar))
+    assert (np.abs(found.base - beta) < 3.0 * known[0]).all()
+
+
+def test_ordinary_least_squares_are_corrected_by_their_own_weights(planar, motion):
+    log = recorded(planar, motion)
+    recordings, _, whole, _ = fitted(planar, log)
+    found = identify(planar, [log], estimator="ols", signals=SIGNALS, friction="viscous+coulomb")
+    plain = OLS(independent_share=recordings.share).fit(whole.factors)
+    np.testing.assert_allclose(found.base, plain.theta - found.regressor_noise.shift, rtol=1e-6)
+    np.testing.assert_allclose(found.regressor_noise.std_error, plain.std_error, rtol=0.05)
+    beta = found.mapping.to_base(truth(planar))
+    assert np.mean(np.abs(plain.theta - beta) > 2.5 * found.base_error) > 0.15
+    assert (np.abs(found.base - beta) < 2.5 * found.base_error).all()
 
 
 def test_total_least_squares_have_a_correction_of_their_own(planar, motion):
@@ -228,6 +252,6 @@ def test_of_a_log_in_a_file_windows_stand_for_all_rows(planar, motion, tmp_path,
     recordings = Recordings(planar, structural_mapping(planar), [surveyed])
     whole = join(recordings.reduce())
     wls = WLS(independent_share=recordings.share).fit(whole.factors)
-    found = find_regressor_noise(recordings, whole, wls.theta, wls.sigma)
+    found = find_regressor_noise(recordings, whole, wls.theta, wls.sigma, wls.sigma)
     worst = int(np.argmax(np.abs(whole_log.shift) / wls.std_error))
     assert found.shift[worst] == pytest.approx(whole_log.shift[worst], rel=0.3)
