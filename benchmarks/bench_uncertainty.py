@@ -1,6 +1,6 @@
 """Are the standard errors true? Reported ones against the scatter of many simulated recordings.
 
-    python benchmarks/bench_uncertainty.py [--runs 200] [--quick] [--encoders]
+    python benchmarks/bench_uncertainty.py [--runs 200] [--quick] [--encoders [--uncorrected]]
 
 Each run draws a robot near the URDF (bodies deformed by 10 % of their size) or far from it (moved
 by 10 cm, more than the size of a wrist), always with a tool of 1.2 kg and friction, simulates a log
@@ -15,7 +15,8 @@ the truth; wanted 92-98 %. "band" is the same of the predicted torque on another
 log, torques by Pinocchio's RNEA and drives with viscous and Coulomb friction, white noise of 1 %.
 A motion of its own in each run, of 24 s, or of 12 s that is run twice: rounding errors repeat.
 Counted are inertial base parameters; "shift" is the largest correction in standard errors, the
-median over the runs, "named" in how many runs there is a finding ``encoder_noise``.
+median over the runs, "named" in how many runs there is a finding ``encoder_noise``. With
+``--uncorrected`` the noise of the regressor is left as it is, to compare.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -30,6 +31,7 @@ import scipy.signal
 
 from robotid.logs.data import Log
 from robotid.simulation.motions import random_fourier
+from robotid.identification import pipeline
 from robotid.identification.pipeline import identify
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.examples import example_urdf
@@ -190,17 +192,17 @@ def torque(model, pi, q, v, a):
     return rigid + np.column_stack(drives)
 
 
-def print_encoders(robots, frictions, runs):
+def print_encoders(robots, frictions, bits, runs):
     print(f"{runs} runs each; inertial base parameters; torque noise {100 * ENCODER_NOISE:g} %")
     print("robot  bits  motion    friction         estimator    coverage   rms z   shift  named")
-    for name, period, friction, bits in itertools.product(
-        robots, (DURATION, DURATION / 2), frictions, (12, 14, 18)
+    for name, period, friction, bit in itertools.product(
+        robots, (DURATION, DURATION / 2), frictions, bits
     ):
-        study = EncoderStudy(name, bits, period, friction, runs)
+        study = EncoderStudy(name, bit, period, friction, runs)
         motion = "once" if period == DURATION else "twice"
         for key in study.z:
             print(
-                f"{name:6} {bits:4}  {motion:8}  {friction:15}  {key:12} {study.row(key)}",
+                f"{name:6} {bit:4}  {motion:8}  {friction:15}  {key:12} {study.row(key)}",
                 flush=True,
             )
 
@@ -211,14 +213,19 @@ def main():
     parser.add_argument("--robots", nargs="+")
     parser.add_argument("--quick", action="store_true", help="few runs of one robot: a try-out")
     parser.add_argument("--encoders", action="store_true", help="encoders of 12, 14 and 18 bits")
+    parser.add_argument("--uncorrected", action="store_true", help="of encoders: as before")
+    parser.add_argument("--bits", type=int, nargs="+", default=[12, 14, 18])
     parser.add_argument("--friction", nargs="+", default=["viscous+coulomb", "auto"])
     options = parser.parse_args()
     if options.encoders:
         print(setting.machine())
+        if options.uncorrected:
+            pipeline.find_regressor_noise = lambda *_: None
         if options.quick:
-            print_encoders(["UR5"], options.friction[:1], 2)
+            print_encoders(["UR5"], options.friction[:1], options.bits, 2)
         else:
-            print_encoders(options.robots or ["UR5", "panda"], options.friction, options.runs)
+            robots = options.robots or ["UR5", "panda"]
+            print_encoders(robots, options.friction, options.bits, options.runs)
         return
     robots, runs = (
         (["UR10"], 4) if options.quick else (options.robots or ["UR10", "panda"], options.runs)

@@ -52,6 +52,7 @@ __all__ = [
     "find_regressor_noise",
     "rounding_errors",
     "smoothed",
+    "without_noise",
 ]
 
 _FEWEST, _MOST = 4, 6  # pairs of rounding errors
@@ -139,16 +140,14 @@ def find_regressor_noise(
         is_enough = _is_enough(scale * pulls @ bread / error)
     if len(pairs) < _FEWEST:
         return None
-    H = factors.information(weights)
     D = np.mean([0.5 * (one.information + two.information) for one, two in pairs], axis=0)
-    root, x = _directions(bread, scale * (D - plain.information))
-    pull = scale * root.T @ pulls.mean(axis=0)  # along each direction
+    D, pull = scale * (D - plain.information), scale * pulls.mean(axis=0)
+    root, move, unsure = without_noise(bread, D, pull)
     odd = np.array([0.5 * (one.segments - two.segments) @ root for one, two in pairs])  # (k, s, b)
-    unsure = (pull * _UNSURE * x / (1.0 - x) ** 2) ** 2
-    along = H @ root  # what a move along each direction adds to the score
-    meat = (along * (scale * _repeated(odd) + unsure)) @ along.T
+    along = factors.information(weights) @ root  # what a move along each direction adds to s
+    meat = (along * (scale * _repeated(odd) + unsure**2)) @ along.T
     meat = meat + scale**2 * np.cov(pulls.T) / len(pulls)
-    shift = -(root / (1.0 - x)) @ pull
+    shift = -root @ move
     return RegressorNoise(np.max(steps, axis=0), share, shift, error, meat)
 
 
@@ -224,6 +223,27 @@ def rounding_errors(q: Array, steps: Array, rng: np.random.Generator) -> Array:
     return errors
 
 
+def without_noise(bread: Array, D: Array, pull: Array) -> tuple[Array, Array, Array]:
+    """Return (H - D)^-1 (D theta) in directions in which noise and information do not mix.
+
+    Args:
+        bread: Inverse of the information H, shape (b, b); 0 of what it leaves open.
+        D: Noise of H, shape (b, b).
+        pull: D theta, shape (b,).
+
+    Returns:
+        The directions, columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); how far to
+        go along each, as if at most 80 % of its information were noise; and how uncertain that is
+        by what is not known of D, shape (b,) each.
+    """
+    size, axes = np.linalg.eigh(bread)
+    root = axes * np.sqrt(np.maximum(size, 0.0))
+    x, turn = np.linalg.eigh(root.T @ D @ root)
+    root, x = root @ turn, np.clip(x, 0.0, _WORST)
+    move = root.T @ pull / (1.0 - x)
+    return root, move, move * _UNSURE * x / (1.0 - x)
+
+
 def acceleration_noise(step: float, signals: SignalSettings) -> float:
     """Return the acceleration's root mean square of white noise of 1 on the positions [1/s^2].
 
@@ -256,22 +276,6 @@ class _Sums:
         """That of all rows, shape (b,)."""
         total: Array = self.segments.sum(axis=0)
         return total
-
-
-def _directions(bread: Array, D: Array) -> tuple[Array, Array]:
-    """Return directions in which noise and information do not mix, and the noise's share of each.
-
-    Args:
-        bread: Inverse of the information H, shape (b, b); 0 of what it leaves open.
-        D: Noise of H, shape (b, b).
-
-    Returns:
-        Columns X with X X^T = H^-1 and X^T D X diagonal, shape (b, b); its diagonal within bounds.
-    """
-    size, axes = np.linalg.eigh(bread)
-    root = axes * np.sqrt(np.maximum(size, 0.0))
-    x, turn = np.linalg.eigh(root.T @ D @ root)
-    return root @ turn, np.clip(x, 0.0, _WORST)
 
 
 def _is_enough(moves: Array) -> bool:

@@ -14,6 +14,7 @@ from robotid.identification.regressor_noise import (
     find_regressor_noise,
     rounding_errors,
     smoothed,
+    without_noise,
 )
 from robotid.identification.standard_errors import measured_errors
 from robotid.identification.survey import hold_log, survey_log
@@ -104,6 +105,20 @@ def test_smoothed_positions_are_nearer_to_the_truth_and_at_most_a_step_from_what
     change = smoothed(rounded, steps, 51)
     assert np.std((rounded + change - q)[:1900, 0]) < 0.3 * 0.01 / np.sqrt(12)
     assert np.abs(change).max(axis=0).tolist() == pytest.approx([0.01, 0.0])
+
+
+def test_the_correction_solves_without_the_noise_and_not_beyond_a_bound(rng):
+    A, E = rng.standard_normal((2, 30, 4))
+    H, pull = A.T @ A, rng.standard_normal(4)
+    D = 0.05 * E.T @ E
+    root, move, unsure = without_noise(np.linalg.inv(H), D, pull)
+    np.testing.assert_allclose(root @ move, np.linalg.solve(H - D, pull), rtol=1e-9)
+    x = np.diag(root.T @ D @ root)
+    np.testing.assert_allclose(root.T @ D @ root, np.diag(x), atol=1e-12)
+    # to first order what an error of a tenth of D does
+    np.testing.assert_allclose(unsure, 0.1 * x / (1 - x) * move, rtol=1e-9)
+    root, move, _ = without_noise(np.linalg.inv(H), 0.99 * H, pull)
+    np.testing.assert_allclose(root @ move, 5.0 * np.linalg.solve(H, pull), rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
