@@ -861,7 +861,7 @@ def _measured(
         raise ground.determination.refusal(error) from error
     stretches, share, K = ground.before.stretches, ground.before.share, mapping.K
     more = None if ground.noise is None else ground.noise.meat
-    of_wls = None if weighing == "alike" else more  # which is of other weights
+    of_wls = more if weighing != "alike" else None  # which is of other weights
     wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, more=of_wls)
     if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)

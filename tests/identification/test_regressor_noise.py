@@ -233,6 +233,7 @@ def test_corrected_factors_are_those_of_the_fit(planar, motion, runs):
     )  # fmt: skip
     np.testing.assert_allclose(found.regressor_noise.shift, noises[0].shift, rtol=1e-6)
     np.testing.assert_allclose(found.base_error, known[0], rtol=1e-4)
+    np.testing.assert_allclose(found.wls.theta, found.base, rtol=1e-6)
     beta = found.mapping.to_base(truth(planar))
     assert (np.abs(found.base - beta) < 3.0 * known[0]).all()
 
