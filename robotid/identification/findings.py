@@ -15,6 +15,7 @@ from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
 from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.misfit import Sample, misfit_findings
+from robotid.identification.regressor_noise import encoder_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
 from robotid.robot.bodies import held_parameters, least_density
@@ -75,6 +76,7 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
     findings += misfit_findings(identification)
     findings += _drive_findings(identification)
     findings += discrepancy_findings(identification, sample)
+    findings += encoder_findings(identification)
     for evaluation in identification.refitted:
         message = (
             f"the validation log {evaluation.recording.name} holds rows that were fitted: its "

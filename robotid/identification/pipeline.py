@@ -44,8 +44,15 @@ from robotid.identification.model_error import settled_shapes, with_model_error
 from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
 from robotid.identification.recordings import Recordings
+from robotid.identification.regressor_noise import RegressorNoise, find_regressor_noise
 from robotid.identification.robust import Outlier, find_outliers, reweigh
-from robotid.identification.settings import BoundedSettings, EstimatorSettings, RecursiveSettings
+from robotid.identification.settings import (
+    BoundedSettings,
+    EstimatorSettings,
+    OLSSettings,
+    RecursiveSettings,
+    TLSSettings,
+)
 from robotid.identification.standard_errors import (
     Redraws,
     StandardErrors,
@@ -76,7 +83,7 @@ from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.pages.plots import Plot
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
-from robotid.regressor.factors import Factors, join
+from robotid.regressor.factors import Factors, Reduction, join
 from robotid.regressor.friction_projection import projected_pinocchio_model
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.bodies import held_parameters
@@ -157,6 +164,7 @@ class Identification:
         misfits: Terms that the model of its drives still lacks.
         on_misfit: Names of drive parameters whose errors grew by these.
         asked: Signals, friction and findings to ignore, as they were asked for.
+        regressor_noise: What the steps of the positions do to least squares; None: next to nothing.
     """
 
     model: RobotModel
@@ -184,6 +192,7 @@ class Identification:
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
     asked: Asked = field(default_factory=Asked)
+    regressor_noise: RegressorNoise | None = None
     _checked: list[tuple[Array, MassMatrixCheck]] = field(default_factory=list, repr=False)
 
     def __repr__(self) -> str:
@@ -661,9 +670,8 @@ def with_drives(
     most = _MOST_SHAPES if any(drive.shapes for drive in drives) else 0
     for done in range(most):
         report("fits", 1 + done, 2 + most, "fits")
-        moved = settled_shapes(
-            replace(_fitted(_with_own(recordings, fit, drives), rough), drives=drives)
-        )
+        found = _fitted(_with_own(recordings, fit, drives), rough, is_last=False)
+        moved = settled_shapes(replace(found, drives=drives))
         if moved is None:
             break
         drives = moved
@@ -693,11 +701,15 @@ def _rough(choice: EstimatorSettings) -> EstimatorSettings:
     return replace(choice, prior_weight=weight, draws=0)
 
 
-def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification:
-    """Identify a robot's parameters from recordings."""
+def _fitted(
+    recordings: Recordings, choice: EstimatorSettings, *, is_last: bool = True
+) -> Identification:
+    """Identify a robot's parameters from recordings; in between with the noise of the regressor."""
     recordings = _under_own_load(recordings, choice)
     model, mapping = recordings.model, recordings.mapping
     ground = _ground(recordings, choice)
+    if is_last:
+        ground = _without_regressor_noise(ground, choice)
     prior, spread = ground.before.pi, ground.before.spread
     estimate, wls, errors = _measured(ground, choice)
     standard, covariance = standard_of(estimate, mapping, prior, spread)
@@ -731,6 +743,7 @@ def _fitted(recordings: Recordings, choice: EstimatorSettings) -> Identification
         errors=errors,
         factors=ground.factors,
         determination=ground.determination,
+        regressor_noise=ground.noise,
     )
     hidden = (mapping.K[:, ~found.at_bound] == 0).all(axis=1)  # nothing but terms at their bounds
     return replace(found, base_error=np.where(hidden, np.inf, base_error))
@@ -779,11 +792,17 @@ class _Ground:
     """What every estimator stands on."""
 
     recordings: Recordings  # their rows weighted if a robust loss was asked for
-    factors: Factors  # what all fitted rows come down to, base parameters
+    whole: Reduction  # what all fitted rows come down to, base parameters
     before: Known  # without them, and how they are cut into stretches
     rough: Estimate  # weighted least squares on them
     determination: Determination  # which base parameters they determine
     grown: float  # by how much a robust loss widens the covariance [-]
+    noise: RegressorNoise | None = None  # what the steps of the positions do
+
+    @property
+    def factors(self) -> Factors:
+        """The factors of all fitted rows."""
+        return self.whole.factors
 
 
 def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
@@ -803,7 +822,34 @@ def _ground(recordings: Recordings, choice: EstimatorSettings) -> _Ground:
     known = model.layout.owned_by(choice.bounds.pinned)
     rows = factors.weighted(rough.sigma / np.sqrt(share))[:, :-1]
     determination = determine(factors.names, rows, base_spread(mapping.K, spread, known))
-    return _Ground(recordings, factors, before, rough, determination, grown)
+    return _Ground(recordings, reduction, before, rough, determination, grown)
+
+
+def _without_regressor_noise(ground: _Ground, choice: EstimatorSettings) -> _Ground:
+    """Return the ground without the bias that the steps of the positions make.
+
+    The torque loses what least squares find of it by that bias, W shift, so that every fit to the
+    factors finds as much less. Estimators that read samples keep the bias as an error. Total least
+    squares have a correction of their own.
+    """
+    if isinstance(choice, TLSSettings):
+        return ground
+    level, theta = ground.rough.sigma, ground.rough.theta
+    sigma = np.ones_like(level) if isinstance(choice, OLSSettings) else level
+    noise = find_regressor_noise(ground.recordings, ground.whole, theta, sigma, level)
+    if noise is None:
+        return ground
+    if isinstance(choice, RecursiveSettings):
+        noise = noise.uncorrected(ground.factors.information(1.0 / sigma**2))
+        return replace(ground, noise=noise)
+    stretches = tuple(part.without(noise.shift) for part in ground.before.stretches)
+    return replace(
+        ground,
+        whole=replace(ground.whole, factors=ground.factors.without(noise.shift)),
+        before=replace(ground.before, stretches=stretches),
+        rough=replace(ground.rough, theta=theta - noise.shift),
+        noise=noise,
+    )
 
 
 def _measured(
@@ -816,7 +862,9 @@ def _measured(
     except RankDeficientError as error:
         raise ground.determination.refusal(error) from error
     stretches, share, K = ground.before.stretches, ground.before.share, mapping.K
-    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma)
+    more = None if ground.noise is None else ground.noise.meat
+    of_wls = more if weighing != "alike" else None  # which is of other weights
+    wls, errors = measured_errors(rough, stretches, factors, share, K, rough.sigma, more=of_wls)
     if weighing == "by step" and fit is None:
         estimate = with_wls_errors(estimate, wls)
     else:
@@ -829,7 +877,7 @@ def _measured(
         is_filter = weighing == "by age"
         estimate, errors = measured_errors(
             estimate, stretches, factors, share, K, sigma,
-            is_filter=is_filter, pull=pull, redraws=redraws,
+            is_filter=is_filter, pull=pull, redraws=redraws, more=more,
         )  # fmt: skip
     if ground.grown != 1.0:
         estimate = replace(estimate, covariance=ground.grown * estimate.covariance)

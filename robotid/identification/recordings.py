@@ -6,8 +6,9 @@ from itertools import chain, islice
 
 from robotid._typing import Array
 from robotid.identification.survey import ReducedPiece, SurveyedLog
+from robotid.logs.data import Trajectory
 from robotid.regressor.base_parameters import BaseMapping, structural_mapping
-from robotid.regressor.factors import Reduction, compress_stretches, join_stretches
+from robotid.regressor.factors import Factors, Reduction, compress_stretches, join_stretches
 from robotid.regressor.problem import Block, Problem, concatenate
 from robotid.regressor.used_rows import base_problem, independent_share
 from robotid.robot.model import RobotModel
@@ -113,7 +114,8 @@ class Recordings:
             The base problem; of logs in files in blocks only: each pass reads them anew.
         """
         if self.is_held:
-            return concatenate([self._problem(k, with_mass) for k in range(len(self.fitted))])
+            motions = [log.whole.trajectory for log in self.fitted]
+            return concatenate([self._problem(k, x, with_mass) for k, x in enumerate(motions)])
 
         def problems() -> Iterator[Problem]:
             for piece in (piece for log in self.fitted for piece in log.pieces):
@@ -137,19 +139,34 @@ class Recordings:
             mass_stream if with_mass else None,
         )
 
-    def _problem(self, k: int, with_mass: bool = False) -> Problem:
-        """Return the rows of a log in memory, weighted."""
-        rows = self.fitted[k].whole
-        weight = rows.mask if self.weights is None else rows.mask * self.weights[k]
-        return base_problem(self.model, self.mapping, rows.trajectory, weight, with_mass=with_mass)
+    def segments(self, k: int, motion: Trajectory, joined: int = 1) -> tuple[Factors, ...]:
+        """Return the factors of each segment of a log in memory, as ``reduce`` cuts it.
 
-    def _stretches(self, k: int) -> Iterator[Reduction]:
-        """Yield what each stretch of a log in memory comes down to."""
-        motion, count = self.fitted[k].whole.trajectory, -(-_STRETCHES // len(self.fitted))
+        Args:
+            k: Which of the logs to fit.
+            motion: Its smooth motion, or another one of as many samples; the rows used and their
+                weights are those of its own.
+            joined: How many of the segments are one.
+        """
+        return compress_stretches(self._problem(k, motion), joined * self._length(k))
+
+    def _problem(self, k: int, motion: Trajectory, with_mass: bool = False) -> Problem:
+        """Return the rows of a log in memory, weighted, on a motion of as many samples."""
+        mask = self.fitted[k].whole.mask
+        weight = mask if self.weights is None else mask * self.weights[k]
+        return base_problem(self.model, self.mapping, motion, weight, with_mass=with_mass)
+
+    def _length(self, k: int) -> int:
+        """Return the samples of each segment of a log in memory."""
+        samples, count = len(self.fitted[k].whole.trajectory.t), -(-_STRETCHES // len(self.fitted))
         shortest = round(_CORRELATIONS / independent_share(self.fitted[k].signals))
         if self.model.is_static:  # means of stretches, behind no filter
             shortest = 1
-        length = max(-(-len(motion.t) // count), shortest)
-        for i, factors in enumerate(compress_stretches(self._problem(k), length)):
+        return max(-(-samples // count), shortest)
+
+    def _stretches(self, k: int) -> Iterator[Reduction]:
+        """Yield what each stretch of a log in memory comes down to."""
+        motion, length = self.fitted[k].whole.trajectory, self._length(k)
+        for i, factors in enumerate(self.segments(k, motion)):
             part = motion.part(i * length, (i + 1) * length)
             yield Reduction(factors, part.squares, len(part.t))

@@ -76,6 +76,7 @@ def measured_errors(
     is_filter: bool = False,
     pull: float = 1.0,
     redraws: Redraws | None = None,
+    more: Array | None = None,
 ) -> tuple[Estimate, StandardErrors]:
     """Return an estimate with the covariance that the scatter of the stretches shows.
 
@@ -99,6 +100,7 @@ def measured_errors(
         is_filter: Whether it weighs rows otherwise, too, as a filter that forgets or gates.
         pull: How much heavier the prior weighs than the truth's plausible spread says [-].
         redraws: How the spread is told of an estimate whose details name active bounds.
+        more: Covariance of the score that stretches do not show, shape (b, b); None: nothing.
 
     Returns:
         The estimate, and what its standard errors rest on. With fewer than 12 stretches rows count
@@ -127,15 +129,19 @@ def measured_errors(
     C = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     if len(estimate.theta) != b:
         found = scatter(stretches, K @ estimate.theta, sigma, share * K @ C @ K.T)
+        found = found if more is None else replace(found, meat=found.meat + more)
         R = factors.weighted(sigma)[:b, :b]
         covariance = about_prior(C, K, share**2 * found.meat, R, share, pull)
     elif not is_filter:
         bread = solve_factor(factors, sigma, estimate.theta).covariance
         found = scatter(stretches, estimate.theta, sigma, bread)
+        found = found if more is None else replace(found, meat=found.meat + more)
         covariance = found.covariance
     else:
         found = scatter(stretches, estimate.theta, sigma, share * C)
         covariance = C * (share * found.inflation)
+        if more is not None:
+            covariance += share**2 * C @ more @ C
     covariance[is_open, is_open] = np.inf
     estimate = replace(estimate, covariance=covariance)
     method = f"the scatter of the scores of {len(stretches)} stretches"

@@ -125,14 +125,15 @@ def unlike_velocities(log: Log) -> dict[str, float]:
     return found
 
 
-def quantum(x: Array) -> float:
+def quantum(x: Array, *, repeats: bool = True) -> float:
     """Return the step that all values are multiples of, 0 if there is none.
 
     Args:
         x: A channel, shape (N,).
+        repeats: Whether values must repeat, each twice on average.
     """
     levels = np.unique(x)
-    if len(levels) < 3 or len(levels) > 0.5 * len(x):
+    if len(levels) < 3 or (repeats and len(levels) > 0.5 * len(x)):
         return 0.0
     steps = np.diff(levels)
     steps = steps[steps > 1e-9 * np.ptp(x)]

@@ -117,6 +117,31 @@ class Factors:
         ]
         return np.array([residual @ residual for residual in residuals])
 
+    def score(self, theta: Array, weights: Array) -> Array:
+        """Return sum_j weight_j W_j^T (tau_j - W_j theta), shape (c,).
+
+        Args:
+            theta: Parameters, shape (c,).
+            weights: Weight per joint, shape (n,).
+        """
+        total = np.zeros(len(self.names))
+        for R, own, weight in zip(self.triangles, self.columns, weights, strict=True):
+            total[own] += weight * (R[:, :-1].T @ (R[:, -1] - R[:, :-1] @ theta[own]))
+        return total
+
+    def without(self, theta: Array) -> "Factors":
+        """Return the factors of the same rows with the torque tau_j - W_j theta.
+
+        Args:
+            theta: Parameters, shape (c,).
+        """
+        triangles = []
+        for R, own in zip(self.triangles, self.columns, strict=True):
+            left = R.copy(order="K")
+            left[:, -1] -= R[:, :-1] @ theta[own]
+            triangles.append(left)
+        return replace(self, triangles=tuple(triangles))
+
     def torque_squares(self) -> Array:
         """Return the sum of squared torques |tau_j|^2, shape (n,) [(N m)^2 or N^2]."""
         return np.array([R[:, -1] @ R[:, -1] for R in self.triangles])

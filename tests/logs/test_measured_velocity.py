@@ -9,6 +9,7 @@ from robotid.logs.data import Log
 from robotid.logs.measured_velocity import (
     coarse_velocities,
     is_trustworthy,
+    quantum,
     unlike_velocities,
     velocity_lag,
 )
@@ -57,3 +58,12 @@ def test_a_velocity_of_few_steps_is_coarse():
     assert coarse_velocities(replace(log, v=v)) == ("a",)
     assert not is_trustworthy(replace(log, v=v))
     assert is_trustworthy(log)
+
+
+def test_a_step_is_found_of_values_that_hardly_repeat_if_they_need_not():
+    x = np.round(np.sin(T) / 2e-3) * 2e-3 + 0.1
+    assert quantum(x) == 0.0  # most values are there once
+    assert quantum(x, repeats=False) == pytest.approx(2e-3)
+    assert quantum(np.sin(T), repeats=False) == 0.0
+    coarse = np.round(np.sin(T) / 0.05) * 0.05
+    assert quantum(coarse) == quantum(coarse, repeats=False) == pytest.approx(0.05)

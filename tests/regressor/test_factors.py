@@ -235,6 +235,18 @@ def test_compact_factors_are_those_of_the_dense_rows(rng, kind):
     C = gram(rng.standard_normal((5, 5)))
     traces = [np.trace(W_j @ C @ W_j.T) for W_j in by_joint]
     np.testing.assert_allclose(factors.leverages(C), traces, rtol=1e-10)
+    theta = rng.standard_normal(5)
+    before = factors.torque_squares()
+    left = [tau[j::3] - W_j @ theta for j, W_j in enumerate(by_joint)]
+    np.testing.assert_allclose(
+        factors.score(theta, sigma),
+        sum(s * W_j.T @ r for s, W_j, r in zip(sigma, by_joint, left, strict=True)),
+        atol=1e-10,
+    )
+    np.testing.assert_allclose(
+        factors.without(theta).torque_squares(), [r @ r for r in left], rtol=1e-10
+    )
+    np.testing.assert_array_equal(factors.torque_squares(), before)
 
 
 def test_factors_with_other_columns_per_joint_merge(rng):
