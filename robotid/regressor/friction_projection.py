@@ -7,7 +7,7 @@ the rows are all that this needs, so that a result states these and no logs are 
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -16,10 +16,9 @@ import numpy as np
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.logs.data import Trajectory
-from robotid.regressor.columns import drive_motion, friction_directions, trajectory_values
-from robotid.regressor.memory import remember
+from robotid.regressor.memory import drive_motion_along
 from robotid.robot.as_pinocchio import pinocchio_model
-from robotid.robot.drives import TERMS, DriveMotion, DriveTerm, Spring
+from robotid.robot.drives import TERMS, DriveMotion, DriveTerm, Lag, Spring
 from robotid.robot.model import RobotModel
 
 __all__ = [
@@ -168,6 +167,8 @@ def drive_moments(
 ) -> dict[str, DriveMoments]:
     """Return the moments of the drives that have terms of their own, by name.
 
+    Friction is that of ``predict``: of drives that have moved one way for long, without a delay.
+
     Args:
         model: The robot.
         recordings: Trajectories and their rows used, shape (N, n_rows), bool.
@@ -176,18 +177,16 @@ def drive_moments(
     sums: dict[str, tuple[tuple[str, ...], Array, float, int]] = {}
     first = model.n_rows - len(model.joints)
     for trajectory, mask in recordings if layout.own else ():
-        motion = trajectory if trajectory.memory is not None else remember(model, trajectory)
-        values = trajectory_values(layout, motion)  # (k, N)
-        signs = friction_directions(layout, motion.v, motion.direction)
-        moves = drive_motion(layout, motion.q, motion.v, motion.a, signs)
+        along = drive_motion_along(model, trajectory)
+        motion = replace(along, rate=np.zeros_like(along.rate), begins=None)
         for d, drive in enumerate(layout.drives):
             if drive.name not in layout.own:
                 continue
             turns = layout.drive_ratios[d] != 0.0
             rows = mask[:, first:][:, turns].all(axis=1)
-            names, columns = _columns(model, d, values, moves.of(d))
+            names, columns = _columns(model, d, motion.of(d))
             X = columns[:, rows]
-            torque = float((motion.tau[:, -len(model.joints) :][rows][:, turns] ** 2).sum())
+            torque = float((trajectory.tau[:, -len(model.joints) :][rows][:, turns] ** 2).sum())
             _, products, total, count = sums.get(drive.name, (names, 0.0 * X @ X.T, 0.0, 0))
             sums[drive.name] = (names, products + X @ X.T, total + torque, count + int(rows.sum()))
     return {
@@ -197,19 +196,11 @@ def drive_moments(
     }
 
 
-def _columns(
-    model: RobotModel, d: int, values: Array, motion: DriveMotion
-) -> tuple[tuple[str, ...], Array]:
+def _columns(model: RobotModel, d: int, motion: DriveMotion) -> tuple[tuple[str, ...], Array]:
     """Return the names and columns, shape (k, N), of a drive's terms and of those it lacks."""
-    own = _own_terms(model, d)
-    names = [term.name for _, term in own]
-    first = model.layout.n_inertial
-    columns = [values[k - first] for k, _ in own]
-    for name, term in _SIMPLE.items():
-        if name not in names:
-            names.append(name)
-            columns.append(term.column(motion))
-    return tuple(names), np.array(columns)
+    terms = {term.name: term for _, term in _own_terms(model, d)}
+    terms |= {name: term for name, term in _SIMPLE.items() if name not in terms}
+    return tuple(terms), np.array([term.column(motion) for term in terms.values()])
 
 
 def _own_terms(model: RobotModel, d: int) -> list[tuple[int, DriveTerm]]:
@@ -242,7 +233,8 @@ def project_friction(
     layout, projected = model.layout, []
     for d, drive in enumerate(layout.drives):
         own = _own_terms(model, d)
-        excess = [term.name for k, term in own if term.name not in _SIMPLE and pi[k] != 0.0]
+        simple = (*_SIMPLE, Lag.label)  # a delay is no friction: it is left out and named
+        excess = [term.name for k, term in own if term.name not in simple and pi[k] != 0.0]
         excess += [t.name for k, t in own if t.name == "spring" not in onto and pi[k] != 0.0]
         if excess:
             if drive.name not in moments:
@@ -330,10 +322,11 @@ def _simplified(
     """Return the robot without the terms that were projected, and its parameters."""
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))
     changed = {drive.name: drive.values for drive in projected}
+    replaced = {drive.name: (*drive.replaced, "spring") for drive in projected}
     own = {
-        name: (Spring(),) if "spring" in changed.get(name, {}) else terms
+        name: tuple(term for term in terms if term.name not in replaced.get(name, ()))
+        + ((Spring(),) if "spring" in changed.get(name, {}) else ())
         for name, terms in model.layout.own.items()
-        if name not in changed or "spring" in changed[name]
     }
     simple = model.with_terms(own)
     for name, terms in changed.items():

@@ -10,7 +10,15 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.friction_projection import DriveMoments, drive_moments, project_friction
 from robotid.regressor.memory import remember
 from robotid.regressor.torque import trajectory_regressor
-from robotid.robot.drives import Asymmetric, Harmonic, LoadFriction, Spring, Stribeck
+from robotid.robot.drives import (
+    Asymmetric,
+    Harmonic,
+    Lag,
+    LoadFriction,
+    Presliding,
+    Spring,
+    Stribeck,
+)
 
 LIFT, ELBOW, WRIST = "shoulder_lift_joint", "elbow_joint", "wrist_1_joint"
 OWN = {
@@ -149,3 +157,22 @@ def test_the_moments_are_read_back_and_the_sentence_states_the_figures(case):
     broken = moments[ELBOW].to_dict() | {"terms": ["viscous"]}
     with pytest.raises(DataError, match=r"shape \(6, 6\), wanted a finite matrix over the 1 terms"):
         DriveMoments.from_dict(broken)
+
+
+def test_a_delay_stays_by_itself_and_presliding_is_that_of_long_motion(case, ur5):
+    _, _, recordings = case
+    model = ur5.with_terms({ELBOW: (Lag(), Presliding(displacement=0.02))})
+    pi, names = model.standard_parameters(), list(model.layout.names)
+    values = {"lag": 0.01, "presliding": 3.0, "coulomb": 2.0, "viscous": 1.0, "offset": 0.1}
+    for term, value in values.items():
+        pi[names.index(f"{ELBOW}.{term}")] = value
+    moments = drive_moments(model.with_reference(pi), recordings)
+    found = project_friction(model, pi, moments, ("viscous", "coulomb", "offset"))
+    (drive,) = found.drives
+    assert drive.replaced == ("presliding",)
+    wanted = {"viscous": 1.0, "coulomb": 5.0, "offset": 0.1}
+    assert drive.values == pytest.approx(wanted, abs=1e-9)
+    assert drive.error == pytest.approx(0.0, abs=1e-6)
+    left = dict(zip(found.model.layout.names, found.pi, strict=True))
+    assert left[f"{ELBOW}.lag"] == 0.01
+    assert f"{ELBOW}.presliding" not in left
