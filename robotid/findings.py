@@ -1,10 +1,11 @@
 """What a user should know of logs, of a robot or of a result."""
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["Cause", "Finding", "by_severity", "grouped", "listed", "log_finding"]
+__all__ = ["Cause", "Finding", "by_severity", "grouped", "listed", "log_finding", "toml_key"]
 
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
@@ -83,6 +84,16 @@ def listed(names: Iterable[object], limit: int | None = None) -> str:
     shown = words[:limit]
     more = f" and {len(words) - len(shown)} more" if len(words) > len(shown) else ""
     return (", ".join(shown) or "none") + more
+
+
+def toml_key(name: str) -> str:
+    """Return a name as a key of a job file, in quotes where it needs them.
+
+    Args:
+        name: The name, as of a joint.
+    """
+    is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
+    return name if is_bare else json.dumps(name, ensure_ascii=False)
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:

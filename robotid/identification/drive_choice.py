@@ -217,7 +217,9 @@ def wanted_families(
 
 
 def choose_drives(
-    identification: "Identification", wanted: Mapping[str, Sequence[str] | None]
+    identification: "Identification",
+    wanted: Mapping[str, Sequence[str] | None],
+    balanced: Mapping[str, str] | None = None,
 ) -> tuple[DriveChoice, ...]:
     """Return the terms of each joint's drive.
 
@@ -225,6 +227,7 @@ def choose_drives(
         identification: What was found with viscous and Coulomb friction alone.
         wanted: Families that joints are to have, by name; None: those that held-out stretches of
             the fitted logs ask for; see ``wanted_families``.
+        balanced: Family of the counterbalance of joints whose families are to be chosen.
 
     Returns:
         A choice per joint; none where a joint hardly moved, or the logs are too short to judge.
@@ -245,7 +248,9 @@ def choose_drives(
         own = tuple(motion.of(j) for motion in motions)
         seen = _seen(own, sample.taken, used[:, j])
         drive = _Drive(j, bool(sample.slides[j]), own, sample.taken, seen)
-        choices.append(_auto(sample, drive) if names is None else _fixed(sample, drive, names))
+        first = [own for own in [(balanced or {}).get(joint)] if own is not None]
+        chosen = _auto(sample, drive, first) if names is None else _fixed(sample, drive, names)
+        choices.append(chosen)
     return tuple(choices)
 
 
@@ -329,15 +334,18 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
     return float(np.abs(term.column(DriveMotion(none, v, none, one, none, none))).max()) + _NOTHING
 
 
-def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
-    """Return the fewest families that held-out stretches ask for."""
+def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoice:
+    """Return the fewest families that held-out segments require beside the first ones."""
     grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
-    every = _Trials.of(sample, drive, grid)
-    torque = float(sample.torque[drive.j])
-    chosen: list[int] = []
+    known = list(_candidates(drive, [FAMILIES[name] for name in first]))
+    start = _weighed_anew(sample, drive, known)
+    every = _Trials.of(start, drive, [*known, *grid])
+    torque = float(start.torque[drive.j])
+    chosen = list(range(len(known)))
     doubted: list[tuple[Family, list[float]]] = []
-    before = every.left([])
-    tried = [Tried((), _percent(before, torque), 1.0, True)]
+    before = every.left(chosen)
+    names = tuple(family.name for family, _ in known)
+    tried = [Tried(names, _percent(before, torque), 1.0, True)]
     for _ in range(_FAMILIES):
         groups = {every.own[i][0].name.rstrip("0123456789") for i in chosen}
         left = {
@@ -346,8 +354,8 @@ def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
             if family.name.rstrip("0123456789") not in groups and every.is_possible([*chosen, i])
         }
         best = _best(every, left, before, torque)
-        names = [every.own[i][0].name for i in chosen]
-        tried += list(_told(every, left, before, torque, names, best))
+        before_it = [every.own[i][0].name for i in chosen]
+        tried += list(_told(every, left, before, torque, before_it, best))
         if best is None:
             nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
             if nearest is not None and left[nearest].sum() < before.sum():

@@ -144,7 +144,7 @@ def _drive_findings(identification: Identification) -> list[Finding]:
                     "bends; record slower and faster motion of this joint to tell"
                 )
                 findings.append(Finding("shape_at_bound", "note", choice.joint, message))
-        guards = {term.guards for term in choice.terms if term.guards}
+        guards = {term.guards for term in choice.terms if np.isfinite(term.seen).all()} - {""}
         j = model.joints.index(choice.joint)
         for evaluation in identification.validation:
             motion, mask = evaluation.recording.trajectory, evaluation.recording.mask

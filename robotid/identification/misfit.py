@@ -27,6 +27,7 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
 from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
+from robotid.robot.drives import COUNTERBALANCE, spring_family
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -37,11 +38,13 @@ __all__ = [
     "Sample",
     "Trial",
     "chance",
+    "counterbalanced",
     "find_misfits",
     "misfit_findings",
     "settled",
     "take_sample",
     "trials",
+    "with_known_springs",
 ]
 
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
@@ -61,6 +64,7 @@ _MATTERS = 0.02  # ... and than this is no warning
 _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
 _OF_POSITION = ("position_periodic", "spring")
 _OF_MASSES = ("current_for_torque", "urdf_mismatch")
+_SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
@@ -130,6 +134,42 @@ def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
         m for m in found
         if not m.term.coupled or m.share > _ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
+
+
+def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
+    """Return the family of the counterbalance of each joint that the fitted logs show one of.
+
+    Args:
+        found: What was found before the fit.
+        logs: Names of the fitted logs.
+    """
+    joints = {}
+    for finding in found:
+        log, _, joint = finding.where.rpartition(": ")
+        if finding.code == "counterbalance" and log in logs:
+            joints[joint] = spring_family(finding.evidence["turned"], COUNTERBALANCE)
+    return joints
+
+
+def with_known_springs(found: Sequence[Finding], fit: "Identification") -> list[Finding]:
+    """Return what was found before a fit, a counterbalance that its model has as a note.
+
+    Args:
+        found: What was found before the fit.
+        fit: The fit, whose drives have their terms.
+    """
+    own = fit.model.layout.own
+    springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
+
+    def as_known(finding: Finding) -> Finding:
+        joint = finding.where.rpartition(": ")[2]
+        if finding.code != "counterbalance" or joint not in springs:
+            return finding
+        names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
+        message = f"{finding.message.partition('. Add')[0]}. The model has it: {names} of {joint}"
+        return replace(finding, severity="note", message=message)
+
+    return [as_known(finding) for finding in found]
 
 
 def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
