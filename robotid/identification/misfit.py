@@ -21,13 +21,19 @@ from scipy.special import stdtr
 
 from robotid._typing import Array
 from robotid.findings import Finding, listed
-from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
+from robotid.identification.candidates import (
+    CANDIDATES,
+    Candidate,
+    JointMotion,
+    couplings,
+    ripples,
+)
 from robotid.identification.evaluation import Evaluation, Recording
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
 from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
-from robotid.robot.drives import COUNTERBALANCE, spring_family
+from robotid.robot.drives import COUNTERBALANCE, drive_line, has_turned, spring_family
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -63,7 +69,7 @@ _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
 _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
 _OF_POSITION = ("position_periodic", "spring")
-_OF_MASSES = ("current_for_torque", "urdf_mismatch")
+_OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
 _SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
@@ -88,6 +94,7 @@ class Misfit:
         unit: Unit of the size.
         error: Residual that base parameters leave without the term, over the torque [-].
         shift: By how much it would move base parameters over their spread, shape (b,).
+        line: Line of a job's [drives] that adds it to the model; empty if there is none.
     """
 
     joint: str
@@ -100,6 +107,7 @@ class Misfit:
     unit: str
     error: float
     shift: Array
+    line: str = ""
 
     @property
     def matters(self) -> bool:
@@ -303,7 +311,7 @@ def take_sample(identification: "Identification", *, is_steady: bool = True) -> 
     return Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
-        motions=_joint_motions([e.recording.trajectory for e, _ in parts], rows, load, model),
+        motions=_joint_motions([e.recording for e, _ in parts], rows, load, model),
         at=tuple(motion),
         taken=tuple(rows),
         weight=weight,
@@ -357,9 +365,11 @@ def _usual_size(r: Array, used: Array) -> Array:
 
 
 def _joint_motions(
-    motions: Sequence[Trajectory], rows: Sequence[Array], load: Array, model: RobotModel
+    recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
 ) -> tuple[JointMotion, ...]:
     """Return how each joint moves in the rows, with its neighbours."""
+    motions = [recording.trajectory for recording in recordings]
+    passes = max(recording.signals.cutoff or np.inf for recording in recordings)
     longest = max(float(np.ptp(m.t)) for m in motions)
 
     def joined(of: Callable[[Trajectory], Array]) -> Array:
@@ -370,7 +380,7 @@ def _joint_motions(
     way = joined(_travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
     alone = [
-        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time)
+        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time, passes)
         for j in range(len(model.joints))
     ]
     beside = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
@@ -510,7 +520,10 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     motion = sample.motions[j]
     if not sample.weight[: sample.rows, j].any():
         return
-    own = [c for c in (*CANDIDATES, *couplings(motion)) if not (c.turns and sample.slides[j])]
+    fitted = slice(sample.rows)
+    periodic = ripples(motion.at(fitted), sample.weight[fitted, j], sample.r[fitted, j])
+    every = (*CANDIDATES, *couplings(motion), *periodic)
+    own = [c for c in every if not (c.turns and sample.slides[j])]
     columns = [candidate.columns(motion) for candidate in own]
     ends = np.cumsum([x.shape[1] for x in columns]).tolist()
     place = {
@@ -545,9 +558,18 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 unit=unit,
                 error=error,
                 shift=_shift(whole, chosen, place[best]),
+                line=_line(sample, j, best),
             )
         chosen += place[best]
         before, own = left[best], [c for c in own if c.code != best.code]
+
+
+def _line(sample: Sample, j: int, term: Candidate) -> str:
+    """Return the line of a job's [drives] that adds a term to a joint; empty if there is none."""
+    turned = 0.0 if sample.slides[j] else float(np.ptp(sample.motions[j].q[: sample.rows]))
+    families = [name for name in term.families if has_turned(name, turned)]
+    entries = families[:1] or term.terms
+    return drive_line(sample.joints[j], *entries) if entries else ""
 
 
 def _best(
@@ -563,7 +585,7 @@ def _best(
     sure = {
         candidate: gain
         for candidate, gain in gains.items()
-        if gain > _LEAST and chance(before, left[candidate], fitted) < _CHANCE
+        if gain > _LEAST and candidate.tried * chance(before, left[candidate], fitted) < _CHANCE
     }
     alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
@@ -617,8 +639,8 @@ def _finding(misfit: Misfit, on_misfit: Sequence[str]) -> Finding:
     stands = f"; {listed(wide)} stand on this misfit, and their intervals count it" if wide else ""
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
     done = term.advice.format(joint=misfit.joint)
-    if term.family:
-        added = f"state {misfit.joint} = [{term.family!r}] in [drives] to add it to the model"
+    if misfit.line:
+        added = f"state {misfit.line} in [drives] to add it to the model"
         done = f"{done}, or {added}" if done else f"{added[0].upper()}{added[1:]}"
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "

@@ -34,6 +34,7 @@ __all__ = [
     "LoadFriction",
     "Shape",
     "drive_line",
+    "has_turned",
     "spring_family",
     "term_from_dict",
 ]
@@ -584,6 +585,7 @@ class Family:
 
 
 _SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
+_RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
 _WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
 _KNOTS = 4  # of a piecewise-linear curve of friction
 _SPARE = 1.1  # times what a family needs of the position, from which it is advised
@@ -642,7 +644,7 @@ FAMILIES: dict[str, Family] = {
                lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
                is_automatic=True),
         Family("tanh", "friction that sets in with speed",
-               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_SPEED,),
+               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_RISE,),
                is_automatic=True),
         Family("presliding", "friction that is taken up after each reversal",
                lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
@@ -655,7 +657,7 @@ FAMILIES: dict[str, Family] = {
         Family("harmonics4", "a torque that repeats one to four times a turn", _harmonics(4),
                needs=0.5, is_automatic=True),
         Family("asymmetric", "viscous friction that differs by direction",
-               lambda seen: (Asymmetric(),)),
+               lambda seen: (Asymmetric(),), is_automatic=True),
         Family("power", "friction that bends with speed",
                lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
                (Shape("exponent", ("-", "-"), (0.1, 0.9)),)),
@@ -688,8 +690,17 @@ def spring_family(turned: float, *families: str) -> str:
         turned: Range of its positions [rad].
         families: Names of families, those that need most first; "spring" needs nothing.
     """
-    least = {name: _SPARE * FAMILIES[name].needs * 2 * np.pi for name in families}
-    return next((name for name in families if least[name] <= turned), "spring")
+    return next((name for name in families if has_turned(name, turned)), "spring")
+
+
+def has_turned(family: str, turned: float) -> bool:
+    """Return whether a joint turned as far as a family of its torque needs, with room to spare.
+
+    Args:
+        family: Its name.
+        turned: Range of the joint's positions [rad]; 0 of a prismatic joint.
+    """
+    return _SPARE * FAMILIES[family].needs * 2 * np.pi <= turned
 
 
 def drive_line(joint: str, *entries: str | DriveTerm) -> str:
