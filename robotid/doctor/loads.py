@@ -15,7 +15,14 @@ from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
 from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 
-__all__ = ["NO_GRAVITY", "LoadModel", "check_loads", "counterbalance", "holds_gravity", "load_model"]
+__all__ = [
+    "NO_GRAVITY",
+    "LoadModel",
+    "check_loads",
+    "counterbalance",
+    "holds_gravity",
+    "load_model",
+]
 
 #: What is said of torques without gravity.
 NO_GRAVITY = (

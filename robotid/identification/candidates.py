@@ -70,14 +70,15 @@ class Candidate:
         columns: What its c parameters multiply in N rows, shape (N, c). Scales in it are those of
             the motion given, so that all rows are to be asked for at once.
         meaning: What it is, in words of a finding.
-        advice: What the user can do, with {joint} for the joint; empty if nothing.
-        families: Friction of a job that has it, see ``FAMILIES``, what is advised first first; those
-            that need more of the position than the motion has are not advised.
+        advice: What the user can do beside adding it to the model; empty if nothing.
+        families: Friction of a job that has it, see ``FAMILIES``; advised is the first for which
+            the joint turned far enough.
         terms: Terms of a job's [drives] that are it, if no family is.
         units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
             is the torque of the term, root mean square.
         turns: Whether only a joint that turns has it.
         coupled: The other joint of a coupling; empty for none.
+        ratio: Its ratio beside 1 of the joint's own.
         tried: How many such terms it was selected from by the residual.
         is_imitated: Whether a drive that sticks at its reversals looks like it behind a filter: it
             is no more than a note then.
@@ -94,6 +95,7 @@ class Candidate:
     terms: tuple[DriveTerm, ...] = ()
     tried: int = 1
     coupled: str = ""
+    ratio: float = 0.0
     is_imitated: bool = False
 
 
@@ -121,7 +123,8 @@ def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
 def _ripple(m: JointMotion, count: int) -> Array:
     """Return cosine and sine of many times the position, as the filter of torques passes them."""
     passed = _passed(m, np.array([count]))
-    return passed * np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+    columns: Array = passed * np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+    return columns
 
 
 def _passed(m: JointMotion, counts: Array) -> Array:
@@ -256,10 +259,8 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
             f"coupling {ratio:+g} {name}", "coupling",
             partial(_coupled, other=other, ratio=ratio),
             f"a drive that turns with {name}, too",
-            "Add [[coupling]] to the job with ratios = "
-            f"{{{{ {{joint}} = 1.0, {name} = {ratio} }}}}, the size of the second from the data "
-            "sheet",
             coupled=name,
+            ratio=ratio,
         )
         for name, other in motion.others.items()
         for ratio in (1.0, -1.0)

@@ -480,7 +480,7 @@ def _is_alike(best: Array, other: Array, slack: float) -> bool:
     """Return whether segments are left as small, within a slack or the difference's scatter."""
     more = other - best
     scatter = np.sqrt(len(more)) * float(np.std(more, ddof=1))
-    return float(more.sum()) <= max(slack, scatter)
+    return bool(float(more.sum()) <= max(slack, scatter))
 
 
 def _chance(before: Array, after: Array) -> float:

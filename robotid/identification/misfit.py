@@ -9,6 +9,7 @@ so that what base parameters can explain does not count (Frisch, Waugh 1933); C 
 before the data. What a term explains of the stretches left out, it explains beyond chance.
 """
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -20,7 +21,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from robotid._typing import Array
-from robotid.findings import Finding, listed
+from robotid.findings import Finding, listed, toml_key
 from robotid.identification.candidates import (
     CANDIDATES,
     Candidate,
@@ -33,7 +34,7 @@ from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
 from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
-from robotid.robot.drives import COUNTERBALANCE, drive_line, has_turned, spring_family
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, drive_line, has_turned, spring_family
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -47,9 +48,11 @@ __all__ = [
     "counterbalanced",
     "find_misfits",
     "misfit_findings",
+    "setting_of",
     "settled",
     "take_sample",
     "trials",
+    "with_entries",
     "with_known_springs",
 ]
 
@@ -71,6 +74,7 @@ _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks 
 _OF_POSITION = ("position_periodic", "spring")
 _OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
 _SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
+_DIGITS = "0123456789"
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
@@ -94,7 +98,7 @@ class Misfit:
         unit: Unit of the size.
         error: Residual that base parameters leave without the term, over the torque [-].
         shift: By how much it would move base parameters over their spread, shape (b,).
-        line: Line of a job's [drives] that adds it to the model; empty if there is none.
+        entries: What a job's [drives] says of the joint to add it; none if nothing does.
     """
 
     joint: str
@@ -107,7 +111,7 @@ class Misfit:
     unit: str
     error: float
     shift: Array
-    line: str = ""
+    entries: tuple[str | DriveTerm, ...] = ()
 
     @property
     def matters(self) -> bool:
@@ -124,7 +128,45 @@ def misfit_findings(identification: "Identification") -> list[Finding]:
     Args:
         identification: What was found.
     """
-    return [_finding(misfit, identification.on_misfit) for misfit in identification.misfits]
+    return [_finding(misfit, identification) for misfit in identification.misfits]
+
+
+def setting_of(misfit: Misfit, identification: "Identification") -> str:
+    """Return what to write into a job file to add a term to the model; empty if nothing does.
+
+    A line of [drives], which has what the joint's drive has already, or a table [[coupling]].
+
+    Args:
+        misfit: The term.
+        identification: What was found without it.
+    """
+    joint, other = misfit.joint, misfit.term.coupled
+    if other:
+        ratios = f"{toml_key(joint)} = 1.0, {toml_key(other)} = {misfit.term.ratio}"
+        return f"[[coupling]]\nname = {json.dumps(f'{joint}_{other}')}\nratios = {{ {ratios} }}"
+    if not misfit.entries:
+        return ""
+    return f"[drives]\n{with_entries(identification, joint, misfit.entries)}"
+
+
+def with_entries(
+    identification: "Identification", joint: str, entries: Sequence[str | DriveTerm]
+) -> str:
+    """Return the line of a job's [drives] that adds entries to what a joint's drive has.
+
+    Args:
+        identification: What was found without them.
+        joint: The joint.
+        entries: Names of families, or terms.
+    """
+    (families, chosen), *_ = [
+        *((c.families, c.terms) for c in identification.drives if c.joint == joint),
+        ((), ()),
+    ]
+    stated = [t for t in identification.model.layout.own.get(joint, ()) if t not in chosen]
+    kinds = {entry.rstrip(_DIGITS) for entry in entries if isinstance(entry, str)}
+    others = [name for name in families if name.rstrip(_DIGITS) not in kinds]
+    return drive_line(joint, *stated, *others, *entries)
 
 
 def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
@@ -558,18 +600,17 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 unit=unit,
                 error=error,
                 shift=_shift(whole, chosen, place[best]),
-                line=_line(sample, j, best),
+                entries=_entries(sample, j, best),
             )
         chosen += place[best]
         before, own = left[best], [c for c in own if c.code != best.code]
 
 
-def _line(sample: Sample, j: int, term: Candidate) -> str:
-    """Return the line of a job's [drives] that adds a term to a joint; empty if there is none."""
+def _entries(sample: Sample, j: int, term: Candidate) -> tuple[str | DriveTerm, ...]:
+    """Return what a job's [drives] says of a joint to add a term to it; none if nothing does."""
     turned = 0.0 if sample.slides[j] else float(np.ptp(sample.motions[j].q[: sample.rows]))
     families = [name for name in term.families if has_turned(name, turned)]
-    entries = families[:1] or term.terms
-    return drive_line(sample.joints[j], *entries) if entries else ""
+    return tuple(families[:1]) or term.terms
 
 
 def _best(
@@ -633,15 +674,24 @@ def _size(
     return size, error, ("N m rms", "N rms")[int(sample.slides[j])]
 
 
-def _finding(misfit: Misfit, on_misfit: Sequence[str]) -> Finding:
+def _advice(term: Candidate, setting: str) -> str:
+    """Return in words what the user can do about a term that the model lacks."""
+    if not setting:
+        return term.advice
+    table, *lines = setting.split("\n")
+    if term.coupled:
+        size = "the size of the second from the data sheet"
+        return f"Add {table} to the job with {' and '.join(lines)}, {size}"
+    added = f"state {lines[0]} in {table} to add it to the model"
+    return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
+
+
+def _finding(misfit: Misfit, found: "Identification") -> Finding:
     term, kept = misfit.term, misfit.confirmed
-    wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
+    wide = [name for name in found.on_misfit if name.startswith(f"{misfit.joint}.")]
     stands = f"; {listed(wide)} stand on this misfit, and their intervals count it" if wide else ""
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
-    done = term.advice.format(joint=misfit.joint)
-    if misfit.line:
-        added = f"state {misfit.line} in [drives] to add it to the model"
-        done = f"{done}, or {added}" if done else f"{added[0].upper()}{added[1:]}"
+    done = _advice(term, setting_of(misfit, found))
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
         f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"
