@@ -123,8 +123,11 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
         j for c in causes if c.severity != "note" and c.code in _NAMED_CAUSES for j in c.joints
     }
     for cause in causes:
-        if cause.code in _UNNAMED and cause.joints and named.issuperset(cause.joints):
-            continue  # what it is has a step of its own
+        if cause.code in _UNNAMED and named.intersection(cause.joints):
+            # what is wrong with these has a step of its own
+            cause = replace(cause, joints=tuple(j for j in cause.joints if j not in named))
+            if not cause.joints:
+                continue
         number = _step_for(cause)
         if cause.severity != "note" and number is not None:
             asked.setdefault(number, []).append(cause)
@@ -219,9 +222,7 @@ def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         for finding in cause.findings
         if "median" in finding.evidence
     }
-    asked = {
-        joint: places.get(joint, "POSITION") for joint in joints if joint in places or not places
-    }
+    asked = places or dict.fromkeys(joints, "POSITION")
     words = f"State where the locked joints {listed(asked, _NAMED)} truly stood."
     flags = [x for joint, place in asked.items() for x in ("--lock", f"{joint}={place}")]
     line = "\n".join(f"{toml_key(joint)} = {place}" for joint, place in asked.items())
