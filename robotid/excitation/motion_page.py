@@ -240,7 +240,7 @@ def _expected(preview: Preview) -> str:
     left = np.minimum(preview.base_error / preview.plausible, 1.0)
     order = np.argsort(-left, kind="stable")[:_NAMED]
     open_ones = [
-        f"{found.mapping.names[k]} {100 * left[k]:.0f} %" for k in order if left[k] > _OPEN
+        f"{found.mapping.base_names[k]} {100 * left[k]:.0f} %" for k in order if left[k] > _OPEN
     ]
     counts = {source: found.sources.count(source) for source in dict.fromkeys(found.sources)}
     sources = [f"{count} {_SOURCES[source]}" for source, count in counts.items()]

@@ -256,12 +256,26 @@ class JointTorque:
         for name, (unit, x) in self.quantities.items():
             if np.ptp(x[used]) > 0:
                 found.append(follow(name, unit, x[used], r[used], even_bins(x[used]), stretches))
-        left, best = r, self._best(found)
-        if best is not None and best.name in self.quantities:
-            left = r - np.interp(self.quantities[best.name][1], best.centres, best.means)
+        left = self._less_best(found)[0]
         quarter = np.unique(piece // _QUARTERS, return_inverse=True)[1]
         time = follow("time", "s", self.rows.time[used], left[used], quarter, piece)
         return (*found, time)
+
+    @cached_property
+    def against_time(self) -> tuple[Array, str]:
+        """The residual as time is asked what it explains, shape (N,), and what it is less of.
+
+        The second is the quantity that explains most, whose means are subtracted; "" if none is.
+        """
+        return self._less_best(self.follows[:-1])
+
+    def _less_best(self, found: Sequence[Dependence]) -> tuple[Array, str]:
+        """Return the residual less what the best quantity explains of it, and its name."""
+        best = self._best(found)
+        if best is None or best.name not in self.quantities:
+            return self.residual, ""
+        means = np.interp(self.quantities[best.name][1], best.centres, best.means)
+        return self.residual - means, best.name
 
     @staticmethod
     def _best(follows: Sequence[Dependence]) -> Dependence | None:

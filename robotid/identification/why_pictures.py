@@ -95,11 +95,14 @@ def _residual(torque: JointTorque, dependence: Dependence, link: str, points: in
     k = rows[_evenly(len(rows), points)]
     mean, error = dependence.at(x[k])
     is_one = name == "time" and len(torque.rows.recordings) == 1
+    residual, less = torque.against_time if name == "time" else (torque.residual, "")
+    explained = f" less its mean over {less}" if less else ""
     return Chart(
-        title=f"Residual of {torque.joint} against {name}, with its mean and 95 % interval",
+        title=f"Residual of {torque.joint}{explained} against {name}, with its mean and 95 % "
+        "interval",
         x=x[k],
         series=(
-            Series("residual", torque.residual[k], "residual", "dots", is_faint=True),
+            Series("residual", residual[k], "residual", "dots", is_faint=True),
             Series("mean", mean, "text", half=REACH * error),
         ),
         x_label=f"{name} [{unit}]",

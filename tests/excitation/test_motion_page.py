@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.design import Designer
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.excitation.motion_page import _expected
+from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.prediction import predict_instants
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
@@ -89,3 +92,19 @@ def test_distances_of_a_long_motion_are_looked_at_less_often(course):
     np.testing.assert_array_equal(few.t, t[::7])
     np.testing.assert_array_equal(few.values, values[:, ::7])
     assert len(found.thinned.t) == len(found.t)
+
+
+def test_the_least_certain_base_parameters_have_their_own_names(ur5):
+    mapping = structural_mapping(ur5)
+    error = np.full(len(mapping.base_names), 0.01)
+    error[[7, 30]] = 0.9, 0.7
+    preview = SimpleNamespace(
+        expected=SimpleNamespace(mapping=mapping, model=ur5, sources=("data", "prior")),
+        noise=SimpleNamespace(std=np.ones(6), origins=("stated",)),
+        base_error=error, plausible=np.ones(len(error)), words="30 s",
+    )  # fmt: skip
+    first, second = (mapping.base_names[k] for k in (7, 30))
+    assert mapping.names[7] != first
+    assert f"The least certain, as shares of that: {first} 90 %, {second} 70 %." in _expected(
+        preview
+    )

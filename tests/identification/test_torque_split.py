@@ -20,6 +20,7 @@ from robotid.identification.torque_split import (
     joint_torques,
     split_torque,
 )
+from robotid.identification.why_pictures import why_charts
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process
 from robotid.regressor.memory import remember
@@ -229,6 +230,27 @@ def test_what_a_residual_follows_is_found_with_its_share(name, rng):
     else:
         assert f"follows the {name}, which explains" in said
     assert ("at low speed" in said) == (name == "speed")
+
+
+def test_the_residual_against_time_is_drawn_as_time_is_asked_of_it(rng):
+    v, q, load = motion(rng)
+    drift = 0.3 * np.linspace(-1, 1, len(v))
+    found = torque(2.0 * q + drift + 0.1 * rng.standard_normal(len(v)), v, q, load)
+    residual, less = found.against_time
+    assert less == "position"
+    left = found.residual - np.interp(q, *_bins(found, "position"))
+    np.testing.assert_allclose(residual, left)
+    time = found.follows[-1]
+    assert time.name == "time"
+    chart = why_charts(found)["time"]
+    assert "less its mean over position against time" in chart.title
+    assert chart.series[0].y.std() < 0.6  # drift and noise; the plain residual is far larger
+    assert why_charts(found)["position"].series[0].y.std() > 1.0
+
+
+def _bins(found, name):
+    (dependence,) = [d for d in found.follows if d.name == name]
+    return dependence.centres, dependence.means
 
 
 def test_noise_of_any_colour_follows_nothing():
