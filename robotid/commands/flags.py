@@ -35,6 +35,16 @@ def _pairs(words: Sequence[str], flag: str) -> dict[str, float]:
     return pairs
 
 
+def _of_all_or_pairs(words: Sequence[str], flag: str) -> float | dict[str, float]:
+    """Return one number for all joints, or numbers by joint."""
+    if len(words) > 1 or "=" in words[0]:
+        return _pairs(words, flag)
+    try:
+        return float(words[0])
+    except ValueError as error:
+        raise SettingsError(f"{flag} {words[0]!r}: wanted NUMBER or JOINT=NUMBER") from error
+
+
 def _cutoff(word: str, flag: str) -> float | bool:
     try:
         return False if word == "false" else float(word)
@@ -45,8 +55,8 @@ def _cutoff(word: str, flag: str) -> float | bool:
 #: Key of the job file that each flag states, and what argparse is told of it.
 _FLAGS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "--estimator": ("estimator.name", {"metavar": "NAME"}),
-    "--kp": ("controller.kp", {"metavar": "N_M_PER_RAD", "type": float}),
-    "--kd": ("controller.kd", {"metavar": "N_M_S_PER_RAD", "type": float}),
+    "--kp": ("controller.kp", {"metavar": "[JOINT=]N_M_PER_RAD", "action": "append"}),
+    "--kd": ("controller.kd", {"metavar": "[JOINT=]N_M_S_PER_RAD", "action": "append"}),
     "--joints": ("joints", {"metavar": "A,B,..."}),
     "--lock": ("locked", {"metavar": "JOINT=POSITION", "action": "append"}),
     "--snap-angles": ("snap_angles", {"action": "store_const", "const": True}),
@@ -78,6 +88,8 @@ _READ: Mapping[str, Callable[[Any, str], Any]] = {
     "--joints": lambda word, _: word.split(","),
     "--lock": _pairs,
     "--gain": _pairs,
+    "--kp": _of_all_or_pairs,
+    "--kd": _of_all_or_pairs,
     "--cutoff": _cutoff,
 }
 _FIT = ("--estimator", "--kp", "--kd")
@@ -508,7 +520,9 @@ def job_from_flags(options: argparse.Namespace, *, needs_logs: bool = True) -> "
             )
         return read_job(options.source)
     if not options.logs and needs_logs:
-        raise SettingsError("no log was given; wanted URDF LOG [LOG ...], or JOB.toml")
+        kind = "motion" if hasattr(options, "given") else "log"  # of preview
+        one = kind.upper()
+        raise SettingsError(f"no {kind} was given; wanted URDF {one} [{one} ...], or JOB.toml")
     kept = getattr(options, "validate", None) or ()
     table = {
         "urdf": options.source,

@@ -106,6 +106,21 @@ class FrictionCurve:
     std: Array
     load: float
 
+    def __str__(self) -> str:
+        rows = zip(self.v.tolist(), self.torque.tolist(), self.half_width.tolist(), strict=True)
+        return "\n".join(
+            [
+                f"friction and offset against speed, gear loaded by {self.load:.3g}",
+                f"{'speed':>10} {'torque':>10} {'95 %':>9}",
+                *(f"{v:10.4g} {torque:10.4g} +-{half:7.2g}" for v, torque, half in rows),
+            ]
+        )
+
+    def __repr__(self) -> str:
+        if not len(self.v):
+            return "<FrictionCurve: no speeds>"
+        return f"<FrictionCurve: {len(self.v)} speeds, {self.v.min():.4g} to {self.v.max():.4g}>"
+
     @property
     def half_width(self) -> Array:
         """Half the width of the 95 % band about the torque, shape (k,) [N m or N]."""

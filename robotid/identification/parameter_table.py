@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 __all__ = ["HEADERS", "ParameterRows", "parameter_entries", "parameter_table"]
 
 #: What a row says: link or drive, parameter, the URDF's value, the identified one, its standard
-#: error, what determined it, unit.
-HEADERS = ("part", "parameter", "urdf", "value", "std_error", "source", "unit")
+#: error, its 95 % interval, what determined it, unit.
+HEADERS = ("part", "parameter", "urdf", "value", "std_error", "low", "high", "source", "unit")
+_NUMBERS = HEADERS[2:7]
 
 
 class ParameterRows(list[dict[str, Any]]):
@@ -25,7 +26,7 @@ class ParameterRows(list[dict[str, Any]]):
             [
                 code(row["part"]),
                 code(row["parameter"]),
-                *(number(row[key]) for key in ("urdf", "value", "std_error")),
+                *(number(row[key]) for key in _NUMBERS),
                 text(row["source"]),
                 text(row["unit"]),
             ]
@@ -41,12 +42,13 @@ def parameter_entries(found: "Identification") -> tuple[list[dict[str, Any]], li
         found: The identification.
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
-    errors = found.standard_error
+    errors, ends = found.standard_error, found.standard_interval
     entries = [
         {
             "name": name,
             "value": float(found.standard[i]),
-            "std_error": float(errors[i]) if math.isfinite(errors[i]) else None,
+            "std_error": _finite(errors[i]),
+            "interval_95": [_finite(end) for end in ends[i]],
             "unit": layout.units[i],
             "prior": float(found.prior[i]),
             "source": sources[i],
@@ -75,7 +77,8 @@ def parameter_table(
     rows = ParameterRows()
     for entry in entries:
         part, _, parameter = entry["name"].rpartition(".")
-        values = [entry.get("prior"), entry["value"], entry.get("std_error")]
+        low, high = entry.get("interval_95", (None, None))  # of results that lack it
+        values = [entry.get("prior"), entry["value"], entry.get("std_error"), low, high]
         row = (part, parameter, *values, entry.get("source", ""), entry["unit"])
         rows.append(dict(zip(HEADERS, row, strict=True)))
     if find_spec("pandas") is None:
@@ -83,4 +86,8 @@ def parameter_table(
     import pandas
 
     frame = pandas.DataFrame(rows, columns=list(HEADERS))
-    return frame.astype(dict.fromkeys(("urdf", "value", "std_error"), float))
+    return frame.astype(dict.fromkeys(_NUMBERS, float))
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from robotid.estimators.stretches import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
+from robotid.identification.pipeline import robot_of
 from robotid.identification.recordings import Recordings
 from robotid.identification.survey import hold_log
 from robotid.logs.read import Readable, read_logs
@@ -82,6 +84,23 @@ class Payload:
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia_at_link.tolist()
         return np.array([self.mass, *(self.mass * self.com), xx, xy, yy, xz, yz, zz])
 
+    def lines(self) -> list[str]:
+        """Return the payload in words: mass, centre of mass and inertia, or why they are open."""
+        low, high = self.mass_interval.tolist()
+        known = "known" if self.mass_std_error == 0 else f"95 %: [{low:.4g}, {high:.4g}]"
+        said = [f"{self.link}: {self.mass:.4g} +- {self.mass_std_error:.2g} kg, {known}"]
+        shown = (
+            ("com", "centre of mass", "m", self.com, self.com_std_error),
+            ("inertia", "inertia about it, diagonal", "kg m^2",
+             np.diag(self.inertia), np.diag(self.inertia_std_error)),
+        )  # fmt: skip
+        for key, words, unit, values, errors in shown:
+            pairs = zip(values.tolist(), errors.tolist(), strict=True)
+            figures = ", ".join(f"{x:.3g} +- {error:.2g}" for x, error in pairs)
+            why = self.reasons.get(key)
+            said.append(f"  {words}: {f'{figures} {unit}' if why is None else why}")
+        return said
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values; what is not determined is None."""
         values = {
@@ -139,6 +158,21 @@ class PayloadFit:
     base_error: Array
     unexplained: Array
 
+    def __str__(self) -> str:
+        every = [line for payload in self.payloads for line in payload.lines()]
+        every += [
+            f"gain of {joint}: {gain.value:.4g} +- {gain.std_error:.2g} "
+            f"[{gain.interval[0]:.4g}, {gain.interval[1]:.4g}]"
+            for joint, gain in self.gains.items()
+        ]
+        left = zip(self.model.row_names, 100 * self.unexplained, strict=True)
+        every.append(f"torque left [%]: {', '.join(f'{j} {x:.1f}' for j, x in left)}")
+        return "\n".join(every)
+
+    def __repr__(self) -> str:
+        every = (f"{p.link} {p.mass:.4g} +- {p.mass_std_error:.2g} kg" for p in self.payloads)
+        return f"<PayloadFit of {self.model.name}: {', '.join(every)}>"
+
     def __getitem__(self, link: str) -> Payload:
         return next(payload for payload in self.payloads if payload.link == link)
 
@@ -164,7 +198,7 @@ class PayloadFit:
 
 
 def identify_payload(
-    model: RobotModel,
+    model: RobotModel | str | Path,
     logs: Readable | Sequence[Readable],
     reference: Readable | Sequence[Readable],
     *,
@@ -179,7 +213,7 @@ def identify_payload(
     friction and offsets of the drives, which change with load and temperature.
 
     Args:
-        model: The robot, from its URDF.
+        model: The robot; or the path of its URDF, all of whose joints move.
         logs: Recordings with the payloads: a ``Log``, the path of a file, a DataFrame, or several.
         reference: Recordings without them, likewise; whatever both have counts to the robot.
         links: Links that the payloads hang on, which may be fixed to a moving one; the last
@@ -194,10 +228,11 @@ def identify_payload(
 
     Raises:
         DataError: If a log cannot be used, or the motion does not show a mass.
-        ModelError: If a link is not in the URDF.
+        ModelError: If the model is no robot, or a link is not in the URDF.
         SettingsError: If links or gains do not fit the robot.
         NotConvergedError: If a solver fails.
     """
+    model = robot_of(model, logs)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     loaded, without = (
         Recordings(model, mapping, [hold_log(model, log, settings) for log in some])

@@ -27,6 +27,7 @@ from robotid.exceptions import (
 )
 from robotid.findings import Finding, listed
 from robotid.identification.bands import (
+    REACH,
     FrictionCurve,
     TorqueBand,
     fitted_moments,
@@ -107,12 +108,14 @@ __all__ = [
     "Identification",
     "conclude",
     "identify",
+    "robot_of",
     "with_drives",
 ]
 
 #: What may have determined a standard parameter.
 SOURCES = ("data", "mixed", "prior", "bound")
 
+_ROBOTS = (".urdf", ".xml", ".xacro")  # suffixes of files that describe robots
 _FROM_DATA = 0.3  # a parameter whose spread the data shrink below this share is theirs
 _KNOWN = 1e-300  # the spread of what was known exactly
 _FROM_PRIOR = 0.9  # ... and above this share, the prior's, if it stayed there
@@ -267,9 +270,10 @@ class Identification:
 
         Returns:
             A pandas DataFrame if pandas is installed, else a list of dictionaries. Columns:
-            "part" (link or drive), "parameter", "urdf", "value", "std_error", "source" (as of
-            ``sources``), "unit". A URDF has no value of drives that is used, and a parameter at
-            its bound no standard error: None, or NaN in a DataFrame.
+            "part" (link or drive), "parameter", "urdf", "value", "std_error", "low" and "high"
+            (95 % interval), "source" (as of ``sources``), "unit". A URDF has no value of drives
+            that is used, and a parameter at its bound no standard error: None, or NaN in a
+            DataFrame.
         """
         return parameter_table(*parameter_entries(self))
 
@@ -455,6 +459,17 @@ class Identification:
         return tuple(names.tolist())
 
     @property
+    def standard_interval(self) -> Array:
+        """95 % interval of each standard parameter, shape (p, 2), by the prior; infinite at bounds.
+
+        The quantile is that of the base parameter, of those it is part of, whose standard error has
+        the fewest degrees of freedom.
+        """
+        own = np.where(self.mapping.K != 0.0, self.errors.reach[:, None], REACH)  # (b, p)
+        half = own.max(axis=0) * self.standard_error
+        return np.column_stack([self.standard - half, self.standard + half])
+
+    @property
     def base_interval(self) -> Array:
         """95 % interval of each base parameter, shape (b, 2); infinite where it is open.
 
@@ -566,11 +581,7 @@ def identify(
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()
     report_stage(progress, "reading logs")
-    if not isinstance(model, RobotModel):
-        if not isinstance(model, str | Path):
-            kind = type(model).__name__
-            raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
-        model = RobotModel.from_urdf(model)
+    model = robot_of(model, logs)
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic)
         for some in (logs, validation)
@@ -582,6 +593,32 @@ def identify(
     found = diagnose(model, first, second, settings) if doctor else ()
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
     return conclude(recordings, choice, found, ignore, friction=friction, progress=progress)
+
+
+def robot_of(model: RobotModel | str | Path, logs: object) -> RobotModel:
+    """Return the robot that a user gives, read if it is the path of a URDF.
+
+    Args:
+        model: The robot; or the path of its URDF, all of whose joints move.
+        logs: What is given as the logs, to see whether the two are swapped.
+
+    Raises:
+        ModelError: If it is no robot, or the two are swapped.
+    """
+    if isinstance(model, RobotModel):
+        return model
+    kind, is_robot = type(model).__name__, isinstance(logs, RobotModel)
+    is_path = isinstance(model, str | Path)
+    suffixes = [Path(x).suffix.lower() if isinstance(x, str | Path) else "" for x in (model, logs)]
+    if is_robot or (suffixes[1] in _ROBOTS and suffixes[0] not in _ROBOTS):
+        what = f"the file {Path(str(model)).name}" if is_path else f"a {kind}"
+        raise ModelError(
+            f"model is {what}, and the robot is given as the logs; wanted the robot first, then "
+            "the logs: swap the two"
+        )
+    if not is_path:
+        raise ModelError(f"model is a {kind}, wanted a RobotModel or the path of a URDF")
+    return RobotModel.from_urdf(model)
 
 
 def conclude(

@@ -145,6 +145,15 @@ def _of_joints(log: Log, joints: Sequence[str], needs: Needs) -> Log:
         )
     absent = [joint for joint in joints if joint not in log.joints]
     if absent:
+        alike = {joint.lower(): joint for joint in absent}
+        renamed = [alike.get(joint.lower(), joint) for joint in log.joints]
+        pairs = [(x, y) for x, y in zip(log.joints, renamed, strict=True) if x != y]
+        if pairs:
+            logged, spelt = (listed(names) for names in zip(*pairs, strict=True))
+            raise DataError(
+                f"{log.name} has the joints {logged}, which the model spells {spelt}; rename them: "
+                f"dataclasses.replace(log, joints={tuple(renamed)})"
+            )
         held = ", ".join(f"{joint!r}: 0.0" for joint in absent)
         raise DataError(
             f"{log.name} has the joints {listed(log.joints)}, but not {listed(absent)}, which the "

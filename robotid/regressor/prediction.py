@@ -83,8 +83,13 @@ def predict_instants(
     """
     q = np.asarray(q, dtype=float)
     wanted = (*q.shape[:-1], model.n_rows)
-    if q.ndim not in (1, 2):
-        raise DataError(f"q has shape {q.shape}, wanted ({model.n_rows},) or (N, {model.n_rows})")
+    width = len(model.joints) + 7 * model.free_flyer
+    if q.ndim not in (1, 2) or q.shape[-1] != width:
+        raise DataError(
+            f"q has shape {q.shape}, wanted ({width},) or (N, {width}): "
+            f"{'the pose of the base, then ' if model.free_flyer else ''}a column for each of "
+            f"{listed(model.joints)}"
+        )
     given = [np.zeros(wanted) if x is None else np.asarray(x, dtype=float) for x in (v, a)]
     for name, x in zip("va", given, strict=True):
         if x.shape != wanted:

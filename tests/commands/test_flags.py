@@ -37,6 +37,24 @@ def test_a_flag_that_a_command_has_no_use_for_is_not_there(capsys):
     assert job("track", "--min-velocity", "0.1").signals.min_velocity == 0.1
 
 
+def test_gains_are_stated_for_all_joints_or_by_joint():
+    fit = ("--estimator", "simulation")
+    found = job("identify", *fit, "--kp", "pan=18", "--kp", "lift=25", "--kd", "0.5").controller
+    assert (found.kp, found.kd) == ({"pan": 18.0, "lift": 25.0}, 0.5)
+    assert job("identify", *fit, "--kp", "18").controller.kp == 18.0
+    for words in (("--kp", "stiff"), ("--kd", "pan=soft"), ("--kp", "18", "--kp", "19")):
+        with pytest.raises(SettingsError, match=rf"{words[0]} '.*': wanted (NUMBER or )?JOINT="):
+            job("identify", *fit, *words)
+
+
+@pytest.mark.parametrize(("command", "wanted"), [("identify", "URDF LOG"), ("preview", "URDF MOT")])
+def test_a_command_without_a_log_names_what_it_wants(command, wanted):
+    parser = argparse.ArgumentParser()
+    add_flags(parser, command)
+    with pytest.raises(SettingsError, match=f"no .* was given; wanted {wanted}"):
+        job_from_flags(parser.parse_args(["robot.urdf"]))
+
+
 def test_a_flag_of_zero_is_a_flag_beside_a_job_file(tmp_path):
     parser = argparse.ArgumentParser()
     add_flags(parser, "identify")

@@ -30,7 +30,28 @@ def test_a_data_frame_has_a_row_for_each_parameter(identified, written, of):
     np.testing.assert_array_equal(frame["std_error"], np.where(np.isfinite(errors), errors, np.nan))
     assert tuple(frame["source"]) == identified.sources
     assert tuple(frame["unit"]) == identified.model.layout.units
-    assert frame["value"].dtype == frame["std_error"].dtype == float
+    assert frame["value"].dtype == frame["std_error"].dtype == frame["high"].dtype == float
+    low, high = identified.standard_interval.T
+    known = np.isfinite(errors)
+    np.testing.assert_array_equal(frame["low"], np.where(known, low, np.nan))
+    np.testing.assert_array_equal(frame["high"], np.where(known, high, np.nan))
+
+
+def test_the_interval_of_a_parameter_that_is_a_base_parameter_is_that_of_it(identified):
+    mapping, own = identified.mapping, identified.standard_interval
+    checked = 0
+    for b, row in enumerate(mapping.K):
+        (columns,) = np.nonzero(row)
+        if len(columns) == 1 and np.isfinite(own[columns[0], 0]):
+            assert row[columns[0]] == 1.0
+            half = np.diff(identified.base_interval[b])
+            assert np.diff(own[columns[0]]) == pytest.approx(half, rel=1e-6)
+            checked += 1
+    assert checked > 12
+    errors = identified.standard_error
+    known = np.isfinite(errors) & (errors > 0)
+    reach = np.diff(own[known], axis=1)[:, 0] / (2.0 * errors[known])
+    assert (reach >= 1.95).all()
 
 
 def test_without_pandas_it_is_a_list_that_a_notebook_shows(identified, monkeypatch):
@@ -44,6 +65,8 @@ def test_without_pandas_it_is_a_list_that_a_notebook_shows(identified, monkeypat
         "urdf": identified.prior[k],
         "value": identified.standard[k],
         "std_error": identified.standard_error[k],
+        "low": identified.standard_interval[k, 0],
+        "high": identified.standard_interval[k, 1],
         "source": identified.sources[k],
         "unit": "kg",
     }

@@ -17,6 +17,7 @@ from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import FAMILIES
+from robotid.robot.examples import example_urdf
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 MASS, COM = 2.0, np.array([0.02, 0.03, 0.08])
@@ -70,6 +71,20 @@ def test_a_payload_on_a_link_that_is_fixed_to_a_moving_one_is_exact(ur5, rng):
     at_link = INERTIA + MASS * (COM @ COM * np.eye(3) - np.outer(COM, COM))
     np.testing.assert_allclose(payload.inertia_at_link, at_link, atol=1e-6)
     assert payload.determined == ("mass", "com", "inertia")
+    urdf = example_urdf("ur5_robot.urdf")
+    found = identify_payload(urdf, [log], [without], links=["tool0"], signals=EXACT)
+    assert found["tool0"].mass == payload.mass
+    said = str(found).splitlines()
+    low, high = payload.mass_interval
+    assert said[0].startswith("tool0: 2 +- ")
+    assert said[0].endswith(f" kg, 95 %: [{low:.4g}, {high:.4g}]")
+    assert [float(x.split(" +-")[0]) for x in said[1].partition(": ")[2].split(", ")] == (
+        pytest.approx(COM, rel=1e-3)
+    )
+    assert [float(x.split(" +-")[0]) for x in said[2].partition(": ")[2].split(", ")] == (
+        pytest.approx(np.diag(INERTIA), rel=1e-3)
+    )
+    assert repr(found).startswith("<PayloadFit of ur5: tool0 2 +- ")
 
 
 def test_two_payloads_at_once(panda, rng):

@@ -83,6 +83,28 @@ def test_a_friction_curve_is_that_of_the_speeds_fitted_under_the_usual_load(foun
         np.testing.assert_array_equal(getattr(again, name), getattr(curve, name))
 
 
+def test_positions_of_other_joints_are_refused_with_their_own_shape(found):
+    with pytest.raises(
+        DataError, match=r"q has shape \(4000, 2\), wanted \(3,\) or \(N, 3\): a col"
+    ):
+        found.predict(np.zeros((4000, 2)))
+    with pytest.raises(DataError, match=r"q has shape \(5,\), wanted \(3,\) or"):
+        found.predict(np.zeros(5))
+
+
+def test_a_curve_shows_its_speeds_torques_and_band(found):
+    curve = found.friction(ELBOW, [0.5, 1.0], load=2.0)
+    head, _, *rows = str(curve).splitlines()
+    assert "loaded by 2" in head
+    for k, row in enumerate(rows):
+        v, torque, half = row.replace("+-", " ").split()
+        assert float(v) == pytest.approx(curve.v[k])
+        assert float(torque) == pytest.approx(curve.torque[k], rel=1e-3)
+        assert float(half) == pytest.approx(curve.half_width[k], rel=0.06)
+    assert len(rows) == 2
+    assert repr(curve) == "<FrictionCurve: 2 speeds, 0.5 to 1>"
+
+
 def test_another_joint_is_refused_by_name(found, loaded):
     with pytest.raises(DataError, match=r"'elbow' is no drive of ur5.*; drives: shoulder_lift_joi"):
         found.friction("elbow")

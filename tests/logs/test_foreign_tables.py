@@ -1,6 +1,9 @@
 """Logs that others named: PlotJuggler's exports, DataFrames, and lists of logs of every kind."""
 
+import dataclasses
 import re
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -15,6 +18,7 @@ from robotid.logs.formats import open_table
 from robotid.logs.read import read_log, read_logs, write_log
 from robotid.logs.settings import LogSource
 from robotid.logs.table import Place
+from robotid.robot.examples import example_urdf
 
 JOINTS = ("shoulder", "elbow")
 T = np.arange(60) / 50
@@ -188,6 +192,40 @@ def test_identify_takes_paths_and_frames_and_finds_what_it_finds_in_logs(ur5, tm
         robotid.identify(ur5, [])
     with pytest.raises(ModelError, match="model is a NoneType, wanted a RobotModel or the path"):
         robotid.identify(None, first)
+
+
+def test_swapped_arguments_are_named(ur5, rng, tmp_path):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    urdf = example_urdf("ur5_robot.urdf")
+    table = tmp_path / "run.csv"
+    robotid.write_log(log, table)
+    for given, robot, what in (
+        (log, ur5, "a Log"),
+        ([log], urdf, "a list"),
+        (table, ur5, "the file run.csv"),
+        (str(table), str(urdf), "the file run.csv"),
+    ):
+        for call in (robotid.identify, partial(robotid.identify_payload, reference=[log])):
+            with pytest.raises(ModelError, match=rf"model is {what}, and .*: swap the two"):
+                call(given, robot)
+    with pytest.raises(ModelError, match="model is a Log, wanted a RobotModel or the path"):
+        robotid.identify(log, log)
+
+
+def test_names_that_differ_in_case_alone_are_to_be_renamed(ur5, rng):
+    log = exact_log(ur5, truth(ur5), rng, samples=100)
+    names = tuple(name.upper() for name in ur5.joints[:2]) + ur5.joints[2:]
+    other = replace(log, joints=names)
+    with pytest.raises(DataError) as refusal:
+        read_logs(other, ur5.joints)
+    said = str(refusal.value)
+    assert said.startswith(
+        "log has the joints SHOULDER_PAN_JOINT, SHOULDER_LIFT_JOINT, which the model spells "
+        "shoulder_pan_joint, shoulder_lift_joint; rename them: dataclasses.replace(log, joints="
+    )
+    renamed = eval(said.rpartition("rename them: ")[2], {"dataclasses": dataclasses, "log": other})
+    (back,) = read_logs(renamed, ur5.joints)
+    np.testing.assert_array_equal(back.q, log.q)
 
 
 def test_a_log_is_taken_by_the_names_of_its_joints(ur5, rng):
