@@ -69,6 +69,7 @@ def test_each_format_is_written_and_what_it_does_not_state_is_said(result, tmp_p
         "format": "mjcf",
         "files": [str(tmp_path / "a.xml")],
         "not_stated": ["meshes left out, not found or of a kind that MJCF has not: no.dae"],
+        "projected": {},
     }
     robot = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
     np.testing.assert_allclose(robot.body_mass[-2:], masses, rtol=1e-12)
