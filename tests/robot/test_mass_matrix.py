@@ -78,14 +78,16 @@ def test_the_result_states_it_and_a_finding_says_if_it_fails(ur5, rng):
 
 def test_the_second_solver_and_active_bounds_are_reported(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, noise=NOISE)
-    settings = EstimatorSettings(check=True, constraints={"mass": {"forearm_link": [12.0, 20.0]}})
+    settings = EstimatorSettings(
+        check=True, prior_weight=100.0, constraints={"mass": {"forearm_link": [9.0, 20.0]}}
+    )
     found = identify(ur5, [log], signals=EXACT, estimator=settings)
     check = found.estimate.details["check"]
     assert check["solver"] == "scs"
     assert check["torque_difference"] < 1e-4
     assert abs(check["objective_difference"]) < 1e-5
     (finding,) = consistency_findings(found)
-    # 12 kg find no room in the forearm's box; 3 kg do, and no motion shows a single mass
+    # 9 kg find no room in the forearm's box; 3 kg do, and no motion shows a single mass
     assert (finding.code, finding.severity) == ("bound_binds", "warning")
     assert "bounds mass forearm_link bind: the data push against them at elbow" in finding.message
     settings = EstimatorSettings(constraints={"mass": {"forearm_link": [3.0, 20.0]}})
