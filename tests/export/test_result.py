@@ -112,6 +112,9 @@ def test_standard_and_drive_parameters_have_value_error_prior_and_source(result,
             "std_error": None
             if entry["at_bound"]
             else pytest.approx(np.sqrt(identified.standard_covariance[i, i])),
+            "interval_95": [None, None]
+            if entry["at_bound"]
+            else list(identified.standard_interval[i]),
             "unit": layout.units[i],
             "prior": identified.prior[i],
             "source": identified.sources[i],
