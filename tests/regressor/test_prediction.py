@@ -128,7 +128,7 @@ def test_instants_of_another_shape_are_refused(ur5):
     pi = ur5.standard_parameters()
     with pytest.raises(DataError, match=r"v has shape \(5,\), wanted \(6,\), as q is \(6,\): a"):
         predict_instants(ur5, pi, np.zeros(6), np.zeros(5))
-    with pytest.raises(DataError, match=r"q has shape \(1, 5\), wanted \(N, 6\)"):
+    with pytest.raises(DataError, match=r"q has shape \(5,\), wanted \(6,\) or \(N, 6\)"):
         predict_instants(ur5, pi, np.zeros(5), np.zeros(6))
     with pytest.raises(DataError, match=r"q has shape \(1, 2, 6\), wanted \(6,\) or \(N, 6\)"):
         predict_instants(ur5, pi, np.zeros((1, 2, 6)))
