@@ -1,13 +1,20 @@
 """What a user should know of logs, of a robot or of a result."""
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["Cause", "Finding", "by_severity", "grouped", "listed", "log_finding"]
+__all__ = ["Cause", "Finding", "by_severity", "grouped", "listed", "log_finding", "toml_key"]
 
 _RANK = {"error": 0, "warning": 1, "note": 2}
 _NUMBER = r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\w)"
+_RANGE = rf"{_NUMBER}(?: to {_NUMBER})?"
+#: What a user types: a flag with its value, or a key of a job file with its own.
+_TYPED = (
+    r"--[a-z][a-z-]* [^\s,;)]+"
+    r"|(?<![\w.])[\w.-]{3,} = (?:\[[^\]]*\]|\{[^}]*\}|\"[^\"]*\"|[-+]?\d[\d.]*(?:e[-+]?\d+)?)"
+)
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,16 @@ def listed(names: Iterable[object], limit: int | None = None) -> str:
     return (", ".join(shown) or "none") + more
 
 
+def toml_key(name: str) -> str:
+    """Return a name as a key of a job file, in quotes where it needs them.
+
+    Args:
+        name: The name, as of a joint.
+    """
+    is_bare = re.fullmatch(r"[A-Za-z0-9_-]+", name) is not None
+    return name if is_bare else json.dumps(name, ensure_ascii=False)
+
+
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings with the errors first, then warnings, then notes.
 
@@ -127,11 +144,15 @@ def _joints_of(finding: Finding, joints: Sequence[str]) -> set[str]:
 
 
 def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the messages, one for all that differ in names of joints and logs, and figures."""
+    """Return the messages, one for all that differ in names of joints and logs, and figures.
+
+    What is to be typed keeps one value: a range of values cannot be typed.
+    """
     logs = {finding.where.rpartition(": ")[0] or finding.where for finding in findings}
     names = sorted({name for name in (*joints, *logs) if name}, key=len, reverse=True)
     named = "|".join(rf"'{x}'|(?<!\w){x}(?!\w)" for x in map(re.escape, names))
-    slot = re.compile(f"({named}|{_NUMBER})" if named else f"({_NUMBER})")
+    slots = "|".join([_TYPED, *([named] if named else []), _RANGE])
+    slot = re.compile(f"({slots})")
     alike: dict[tuple[str, ...], list[list[str]]] = {}
     for finding in findings:
         parts = slot.split(finding.message)  # text, slot, text, slot, ..., text
@@ -144,7 +165,24 @@ def _merged(findings: Sequence[Finding], joints: Sequence[str]) -> tuple[str, ..
 
 
 def _in_one(values: list[str]) -> str:
-    """Return names with commas, or the range of numbers."""
-    if len(values) == 1 or not all(re.fullmatch(_NUMBER, value) for value in values):
+    """Return names with commas, the range of numbers, or what is typed for all of them."""
+    if len(values) == 1:
+        return values[0]
+    if all(re.fullmatch(_TYPED, value) for value in values):
+        return _typed_once(values)
+    if not all(re.fullmatch(_RANGE, value) for value in values):
         return ", ".join(values)
-    return f"{min(values, key=float)} to {max(values, key=float)}"
+    numbers = [number for value in values for number in value.split(" to ")]
+    return f"{min(numbers, key=float)} to {max(numbers, key=float)}"
+
+
+def _typed_once(values: list[str]) -> str:
+    """Return settings, of those that differ in their figures only the middle one."""
+    alike: dict[str, list[str]] = {}
+    for value in values:
+        alike.setdefault(re.sub(_NUMBER, "", value), []).append(value)
+    middle = [
+        sorted(own, key=lambda x: [float(y) for y in re.findall(_NUMBER, x)])[(len(own) - 1) // 2]
+        for own in alike.values()
+    ]
+    return (" " if middle[0].startswith("--") else ", ").join(middle)

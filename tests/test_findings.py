@@ -1,4 +1,6 @@
-from robotid.findings import Finding, by_severity, grouped, listed
+import tomllib
+
+from robotid.findings import Finding, by_severity, grouped, listed, toml_key
 
 
 def test_names_stand_in_a_sentence_and_a_long_list_is_cut():
@@ -37,6 +39,45 @@ def test_findings_of_one_code_are_one_cause_and_say_what_they_share_once():
     assert bent.messages == ("arm_1: bent in 2 places", "arm_1: bent throughout")
     assert (bent.severity, bent.joints) == ("warning", ("arm_1",))
     assert (old.severity, old.joints, old.messages) == ("note", (), ("the URDF is of 2020",))
+
+
+def late(log, seconds, rows="4"):
+    message = (
+        f"{log}: {1e3 * seconds:.1f} ms late, held for {rows} rows; set torque_delay = "
+        f"{seconds:.4f} (--torque-delay {seconds:.4f})"
+    )
+    return Finding("late", "warning", log, message)
+
+
+def test_what_is_typed_keeps_one_value_and_ranges_of_ranges_are_one_range():
+    findings = [late("c", 0.0201, "4 to 6"), late("a", 0.0199), late("b", 0.02, "1 to 4")]
+    (cause,) = grouped(findings)
+    assert cause.messages == (
+        "c, a, b: 19.9 to 20.1 ms late, held for 1 to 6 rows; set torque_delay = 0.0200 "
+        "(--torque-delay 0.0200)",
+    )
+    (cause,) = grouped(findings[:2])
+    assert "torque_delay = 0.0199 (--torque-delay 0.0199)" in cause.messages[0]
+
+
+def test_what_is_typed_for_several_joints_is_typed_for_each():
+    todo = "{0} stands at {1}; state locked = {{ {0} = {1} }} (--lock {0}={1})"
+    places = (("a", "j6", 0.1824), ("b", "j6", 0.1825), ("a", "j7", 1.0))
+    findings = [
+        Finding("locked", "error", f"{log}: {joint}", todo.format(joint, at))
+        for log, joint, at in places
+    ]
+    (cause,) = grouped(findings, ["j6", "j7"])
+    assert cause.messages == (
+        "j6, j7 stands at 0.1824 to 1.0; state locked = { j6 = 0.1824 }, locked = { j7 = 1.0 } "
+        "(--lock j6=0.1824 --lock j7=1.0)",
+    )
+
+
+def test_a_name_is_quoted_as_a_key_where_it_needs_it():
+    for name in ("arm_1-x", "a.b", 'say "x"', "", "gel\u00e4nk"):
+        assert tomllib.loads(f"{toml_key(name)} = 1") == {name: 1}
+    assert toml_key("arm_1-x") == "arm_1-x"
 
 
 def test_quoted_names_are_quoted_one_by_one():

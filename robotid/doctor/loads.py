@@ -5,7 +5,7 @@ of any size in the last link, drives of any size, and torques known to 5 %.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,16 @@ from robotid._typing import Array
 from robotid.doctor.hypotheses import compensated, own_share
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
+from robotid.robot.drives import COUNTERBALANCE, drive_line, spring_family
 
-__all__ = ["NO_GRAVITY", "LoadModel", "check_loads", "load_model"]
+__all__ = [
+    "NO_GRAVITY",
+    "LoadModel",
+    "check_loads",
+    "counterbalance",
+    "holds_gravity",
+    "load_model",
+]
 
 #: What is said of torques without gravity.
 NO_GRAVITY = (
@@ -34,8 +42,13 @@ _ALIKE = 1.6  # factors that differ by less are one: they are sought in steps of
 _GAIN = 20.0  # drop of the misfit that makes another torque scale believable
 _OTHER_SCALE = 3.0  # a torque scale farther from 1 than this is no error of masses
 _OTHER_UNIT = 30.0  # ... and one of all torques farther than this is another unit, no gain
+_CLEARER = 5.0  # drop of the misfit that a counterbalance has over another scale of one torque
 _SCALES = np.logspace(-3, 3, 61)
 _HEAVY = 0.08  # payload over the arm's mass that is surely more than the links' errors
+_FLOOR = 1e-3  # an unexplained share below this is as good as none
+_FOLLOWED = 0.5  # times the unexplained share falls with gravity of a torque that follows it
+_LIFTS = 0.1  # of the largest gravity torque: a joint with less has no counterbalance
+_CANCELS, _MOST_CANCELLED = 0.2, 1.6  # of its gravity, between which a counterbalance takes
 _MISMATCH = 7.5  # sum of squares of the links' errors, in standard deviations, that is too much
 
 
@@ -177,13 +190,96 @@ def _holds_no_gravity(probe: Probe) -> bool:
 
     Both are judged alike: to the size of the torques as logged, without a load on the last link.
     """
-    if not probe.gravity.any():
+    if not probe.gravity.any() or holds_gravity(probe):
         return False
     readings = [(probe, own_share(probe)), compensated(probe)]
     models = [load_model(reading, share, probe.tau.std(axis=0)) for reading, share in readings]
     ones = np.ones(probe.tau.shape[1])
     logged, mended = (_is_this_robot(model, *model.fit(ones)[:2]) for model in models)
     return mended and not logged
+
+
+def holds_gravity(probe: Probe) -> bool:
+    """Return whether the torque of some joint follows the gravity that the URDF loads it with.
+
+    Args:
+        probe: The motion.
+    """
+    with_gravity, without = own_share(probe), own_share(probe, np.zeros(3))
+    followed = (with_gravity + _FLOOR < _FOLLOWED * (without + _FLOOR)) & (without < 1.0)
+    return bool(followed.any())
+
+
+def counterbalance(probe: Probe, name: str) -> tuple[Probe, tuple[Finding, ...]]:
+    """Return a motion whose counterbalanced joint, if there is one, is known, and the finding.
+
+    The torques do not fit the URDF's masses as they are; with one torque more, a cosine and a sine
+    of the position of one joint, they do, and that torque opposes gravity.
+
+    Args:
+        probe: The motion; signs and order must be right.
+        name: What the log is called.
+    """
+    if not probe.gravity.any():
+        return probe, ()
+    share, ones = own_share(probe, any_load=True), np.ones(len(probe.model.joints))
+    whole = load_model(probe, share)
+    if share.max() < _EXPLAINED and _is_this_robot(whole, *whole.fit(ones)[:2]):
+        return probe, ()
+    found: list[tuple[float, int, float, Probe]] = []
+    for j in _lifting(probe):
+        other = replace(probe, balanced=(j,))
+        share = own_share(other, any_load=True)
+        model = load_model(other, share)
+        chi, theta, _ = model.fit(ones)
+        cancelled = _cancelled(other, j, theta)
+        if share.max() < _EXPLAINED and _is_this_robot(model, chi, theta) and cancelled > _CANCELS:
+            found.append((chi, j, cancelled, other))
+    if not found:
+        return probe, ()
+    chi, j, cancelled, other = min(found, key=lambda x: x[0])
+    if not cancelled < _MOST_CANCELLED or _scaled_fit(whole) < chi + _CLEARER:
+        return probe, ()
+    return other, (_balanced(other, j, cancelled, name),)
+
+
+def _lifting(probe: Probe) -> list[int]:
+    """Return the revolute joints that the URDF's gravity loads, those it loads most first."""
+    load = np.abs((probe.loads() - probe.loads(np.zeros(3))).sum(axis=2)).mean(axis=0)  # (n,)
+    slides = np.isin(probe.model.joints, list(probe.model.layout.prismatic))
+    return [int(j) for j in np.argsort(-load) if load[j] > _LIFTS * load.max() and not slides[j]]
+
+
+def _cancelled(probe: Probe, j: int, theta: Array) -> float:
+    """Return which share of a joint's gravity its counterbalance takes, by fitted links [-]."""
+    Y = np.concatenate([probe.loads()[:, j], probe.regressor()[:, j, -10:-6]], axis=1)
+    swing = probe.swing(j)
+    X = np.hstack([probe.drive(j)[:, :4], swing])
+    size = np.linalg.norm(X, axis=0)
+    x = np.linalg.lstsq(X / size, probe.tau[:, j] - Y @ theta)[0] / size
+    gravity = (probe.loads() - probe.loads(np.zeros(3)))[:, j].sum(axis=1)
+    gravity, own = (y - y.mean() for y in (gravity, swing @ x[4:]))  # the offset is not known
+    return -float(gravity @ own) / float(gravity @ gravity)
+
+
+def _scaled_fit(model: LoadModel) -> float:
+    """Return the misfit with torques in other scales, if the links weigh as stated then."""
+    scale = _torque_scales(model)
+    chi, theta, _ = model.fit(scale)
+    is_other = np.abs(np.log(scale)).max() > np.log(_OTHER_SCALE)
+    return chi if is_other and _is_this_robot(model, chi, theta) else np.inf
+
+
+def _balanced(probe: Probe, j: int, cancelled: float, name: str) -> Finding:
+    joint, turned = probe.model.joints[j], float(np.ptp(probe.motion.q[:, j]))
+    family = spring_family(turned, COUNTERBALANCE)
+    message = (
+        f"{joint}: a torque that follows its own position cancels {100 * cancelled:.0f} % of the "
+        "gravity that the URDF loads it with, and the other joints hold theirs: a counterbalance "
+        f"or a spring. Add it to the model: {drive_line(joint, family)} in [drives]"
+    )
+    evidence = {"cancelled_pct": 100 * cancelled, "turned": turned}
+    return log_finding(name, "counterbalance", "warning", message, joint, **evidence)
 
 
 def _error_of_links(theta: Array) -> float:

@@ -58,6 +58,7 @@ class Probe:
         a: Accelerations, shape (N, n).
         tau: Torques, shape (N, n) [N m or N].
         regressors: The regressors of these instants.
+        balanced: Joints whose torque may also follow their own position, as a counterbalance's.
     """
 
     model: RobotModel
@@ -68,6 +69,7 @@ class Probe:
     a: Array
     tau: Array
     regressors: _Regressors
+    balanced: tuple[int, ...] = ()
 
     @property
     def gravity(self) -> Array:
@@ -118,7 +120,8 @@ class Probe:
             j: Index of the joint.
 
         Returns:
-            Columns a, v, sign v, 1, -1 and those of coupled drives, shape (N, 5 + k).
+            Columns a, v, sign v, 1, -1 and those of coupled drives and of a counterbalance, shape
+            (N, 5 + k).
         """
         v, one = self.v[:, j], np.ones(len(self.v))
         least = _STILL * float(self.model.layout.drive_speeds[j])
@@ -126,7 +129,16 @@ class Probe:
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
         layout = self.model.layout
         drives = self.regressors.whole[:, j, layout.n_inertial :]
-        return np.hstack([own, drives[:, layout.is_coupled]])
+        swing = self.swing(j) if j in self.balanced else np.empty((len(v), 0))
+        return np.hstack([own, drives[:, layout.is_coupled], swing, -swing])
+
+    def swing(self, j: int) -> Array:
+        """Return what follows the position of a revolute joint, as a counterbalance does, (N, 2).
+
+        Args:
+            j: Index of the joint.
+        """
+        return np.column_stack([np.cos(self.q[:, j]), np.sin(self.q[:, j])])
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion, computed anew.
@@ -134,7 +146,7 @@ class Probe:
         Args:
             rows: Rows of the motion, shape (N,), int.
         """
-        return _probe_at(self.model, self.motion, rows)
+        return replace(_probe_at(self.model, self.motion, rows), balanced=self.balanced)
 
     def with_motion(self, state: tuple[Array, Array, Array]) -> "Probe":
         """Return the probe with another motion, torques as they are, computed anew.
@@ -142,7 +154,8 @@ class Probe:
         Args:
             state: Positions, velocities and accelerations, each of shape (N, n).
         """
-        return _probe(self.model, self.motion, self.rows, state)
+        moved = _probe(self.model, self.motion, self.rows, state)
+        return replace(moved, balanced=self.balanced)
 
 
 def smooth_motion(model: RobotModel, log: Log, settings: SignalSettings) -> Trajectory:

@@ -7,7 +7,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.doctor.hypotheses import Explanation, explanations
-from robotid.doctor.loads import NO_GRAVITY, check_loads
+from robotid.doctor.loads import NO_GRAVITY, check_loads, counterbalance, holds_gravity
 from robotid.doctor.mounted import check_unmounted_parts
 from robotid.doctor.sample import Probe
 from robotid.findings import Finding, listed, log_finding
@@ -68,8 +68,11 @@ def check_torques(probe: Probe, name: str) -> Iterator[Finding]:
     Yields:
         Errors "torque_sign", "unsigned_torque", "torque_order", "joint_order", "joint_axis",
         "position_order", "position_sign", "position_offset", "gravity" or "gravity_compensated",
-        or else what ``check_unmounted_parts`` or ``check_loads`` yields; and "unexplained_torque".
+        or else what ``check_unmounted_parts`` or ``check_loads`` yields; and "unexplained_torque";
+        beside these a warning "counterbalance".
     """
+    probe, balanced = counterbalance(probe, name)
+    yield from balanced
     stated, loaded, others = explanations(probe)
     best = min(others, key=lambda e: e.misfit)
     if best.kind not in ("torque_sign", "unsigned_torque") and loaded.misfit < best.misfit:
@@ -164,7 +167,7 @@ def _gravity(reading: _Reading) -> Iterator[Finding]:
     g, believed, gain = np.array(reading.best.values), reading.probe.gravity, reading.gain
     size = float(np.linalg.norm(believed))
     if not g.any():
-        if size > 0 and reading.is_certain:
+        if size > 0 and reading.is_certain and not holds_gravity(reading.probe):
             code = "gravity_compensated"
             yield log_finding(reading.log, code, "error", NO_GRAVITY, gain=gain)
         return

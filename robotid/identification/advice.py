@@ -6,10 +6,13 @@ import json
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
-from robotid.findings import Cause, grouped, listed
+from robotid.findings import Cause, grouped, listed, toml_key
+from robotid.identification.misfit import setting_of, with_entries
 from robotid.identification.verdict import GOOD, is_beaten
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, spring_family
 
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
@@ -19,6 +22,7 @@ __all__ = ["Origin", "Step", "next_steps"]
 _MOST = 3  # steps
 _NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
+_APPENDED = ("--validate",)  # flags that add to what was stated before
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Origin:
             flags: Flags to put behind it.
         """
         out = ["--out", self.folder] if self.folder else []
-        return shlex.join(["robotid", "identify", *self.source, *flags, *out])
+        return shlex.join(["robotid", "identify", *_without(self.source, flags), *flags, *out])
 
     def stating(self, table: str, line: str, *flags: str) -> tuple[str, ...]:
         """Return what to do to identify again with another setting.
@@ -83,6 +87,27 @@ class Origin:
         return (shlex.join(["robotid", command, *words]),) if self.folder else ()
 
 
+def _without(source: Sequence[str], flags: Sequence[str]) -> list[str]:
+    """Return the words of a command without what other flags state anew."""
+    anew = {_key(*pair) for pair in pairwise(flags) if pair[0] not in _APPENDED}
+    words, kept = [*source, ""], []
+    skip = False
+    for word, following in pairwise(words):
+        flag, sign, value = word.partition("=")
+        is_apart = word.startswith("--") and not sign
+        if not skip and _key(flag, value if sign else following) not in anew:
+            kept.append(word)
+            continue
+        skip = is_apart and not skip
+    return kept
+
+
+def _key(flag: str, value: str) -> tuple[str, str]:
+    """Return what two flags have in common that state the same: of J=VALUE the joint, too."""
+    name, sign, _ = value.partition("=")
+    return flag, name if sign else ""
+
+
 def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
     """Return what to do next, the most urgent first: three steps at most.
 
@@ -93,7 +118,16 @@ def next_steps(found: Identification, origin: Origin) -> tuple[Step, ...]:
         origin: Where it came from.
     """
     asked: dict[int, list[Cause]] = {}
-    for cause in (*grouped(found.findings, found.model.joints), *_of_verdict(found)):
+    causes = (*grouped(found.findings, found.model.joints), *_of_verdict(found))
+    named = {
+        j for c in causes if c.severity != "note" and c.code in _NAMED_CAUSES for j in c.joints
+    }
+    for cause in causes:
+        if cause.code in _UNNAMED and named.intersection(cause.joints):
+            # what is wrong with these has a step of its own
+            cause = replace(cause, joints=tuple(j for j in cause.joints if j not in named))
+            if not cause.joints:
+                continue
         number = _step_for(cause)
         if cause.severity != "note" and number is not None:
             asked.setdefault(number, []).append(cause)
@@ -164,7 +198,7 @@ def _gains(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         f"State the gain of {listed(joints or ['the joints'], _NAMED)} in N m per A (N per A if it "
         "slides), if the column is a current: the torque fits the URDF in another scale only."
     )
-    line = "\n".join(f"{joint} = GAIN" for joint in joints or ["JOINT"])
+    line = "\n".join(f"{toml_key(joint)} = GAIN" for joint in joints or ["JOINT"])
     flags = [x for joint in joints or ["JOINT"] for x in ("--gain", f"{joint}=GAIN")]
     return Step(words, origin.stating("[torque.gains]", line, *flags))
 
@@ -182,9 +216,16 @@ def _delay(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
 
 def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
     joints = list(found.model.locked)
-    words = f"State where the locked joints {listed(joints, _NAMED)} truly stood."
-    flags = [x for joint in joints for x in ("--lock", f"{joint}=POSITION")]
-    line = "\n".join(f"{joint} = POSITION" for joint in joints)
+    places = {
+        finding.where.rpartition(": ")[2]: f"{finding.evidence['median']:.4g}"
+        for cause in causes
+        for finding in cause.findings
+        if "median" in finding.evidence
+    }
+    asked = places or dict.fromkeys(joints, "POSITION")
+    words = f"State where the locked joints {listed(asked, _NAMED)} truly stood."
+    flags = [x for joint, place in asked.items() for x in ("--lock", f"{joint}={place}")]
+    line = "\n".join(f"{toml_key(joint)} = {place}" for joint, place in asked.items())
     return Step(words, origin.stating("[locked]", line, *flags))
 
 
@@ -206,6 +247,76 @@ def _pin(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step
     )
     line = f"pinned = {json.dumps(links, ensure_ascii=False)}"
     return Step(words, origin.stating("[estimator.constraints]", line))
+
+
+def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    """Return what adds the terms to the model that drives lack."""
+    codes = {cause.code for cause in causes}
+    entries: dict[str, list[str | DriveTerm]] = {}
+    for joint, turned in _balanced(causes):
+        entries[joint] = [spring_family(turned, COUNTERBALANCE)]
+    couplings: dict[frozenset[str], str] = {}
+    for misfit in found.misfits:
+        term = misfit.term
+        if term.code in codes and term.coupled:
+            couplings.setdefault(frozenset((misfit.joint, term.coupled)), setting_of(misfit, found))
+        elif term.code in codes and misfit.entries:
+            own = entries.setdefault(misfit.joint, [])
+            own += [entry for entry in misfit.entries if entry not in own]
+    lines = [with_entries(found, joint, own) for joint, own in entries.items()]
+    blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
+    what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
+    words = f"Add to the model of {_named(causes)} what its drive lacks: {what}."
+    if not blocks:
+        words = (
+            f"Leave out the rows in which {_named(causes)} shows what no term of the model is "
+            f"like, or record other motion: {what}."
+        )
+    return Step(words, (*blocks, *((origin.again(),) if origin.job and blocks else ())))
+
+
+def _balanced(causes: Sequence[Cause]) -> list[tuple[str, float]]:
+    """Return the joints with a counterbalance, and how far they turned [rad]."""
+    found = [finding for cause in causes for finding in cause.findings]
+    return [
+        (finding.where.rpartition(": ")[2], finding.evidence["turned"])
+        for finding in found
+        if finding.code == "counterbalance" and "turned" in finding.evidence
+    ]
+
+
+def _payload(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    logs = [x for x in found.validation if not x.is_refitted] or list(found.fitted)
+    log = str(logs[0].recording.log.path)
+    words = (
+        "Validate with the load of the fitted logs: this log has another one. The load itself is "
+        "what robotid payload finds."
+    )
+    words_of = (str(found.model.tree.path), log, "--reference", f"{origin.folder}/result.json")
+    return Step(words, origin.using("payload", *words_of))
+
+
+def _unclipped(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    words = (
+        f"Record a slower motion, or one with less load: the torque of {_named(causes)} reaches "
+        "its limit, and what lies beyond is not in the log."
+    )
+    return Step(words, _another_log(origin))
+
+
+def _zeros(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    sizes = [f for cause in causes for f in cause.findings if "size" in f.evidence]
+    by = "".join(f"; of {f.where} by {-f.evidence['size']:.3g}" for f in sizes)
+    words = (
+        f"Correct the zero of the position of {_named(causes)}, in the log or by the joint's "
+        f"origin in the URDF{by}."
+    )
+    return Step(words, (shlex.join(["robotid", "inspect", str(found.model.tree.path)]),))
+
+
+def _as_found(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
+    """Return what the findings say themselves, which name a cause and its remedy."""
+    return Step(" ".join(f"{m[0].upper()}{m[1:]}." for cause in causes for m in cause.messages[:1]))
 
 
 def _possible(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -232,12 +343,16 @@ def _richer(found: Identification, origin: Origin, causes: Sequence[Cause]) -> S
         f"Record a richer motion, with more speed and wider poses, and fit it as well: the data "
         f"leave {count} base parameters open."
     )
-    logs = (origin.again(),) if origin.job else ()
+    return Step(words, _another_log(origin))
+
+
+def _another_log(origin: Origin) -> tuple[str, ...]:
+    """Return what identifies again with one more log."""
     if not origin.job and origin.source:
         urdf, *others = origin.source
-        more = Origin((urdf, _NEW, *others), origin.folder)
-        return Step(words, (more.again(),))
-    return Step(words, (f'[[identification]]\nlog = "{_NEW}"', *logs))
+        return (Origin((urdf, _NEW, *others), origin.folder).again(),)
+    logs = (origin.again(),) if origin.job else ()
+    return (f'[[identification]]\nlog = "{_NEW}"', *logs)
 
 
 def _inspect(found: Identification, origin: Origin, causes: Sequence[Cause]) -> Step:
@@ -278,6 +393,30 @@ def _replay(found: Identification, origin: Origin) -> tuple[str, ...]:
     return origin.using("replay", str(found.model.tree.path), log, origin.folder)
 
 
+#: Terms that drives may have and the model lacks, by the code of the finding, in words.
+_CAUSES = {
+    "backlash": "backlash or windup",
+    "counterbalance": "a counterbalance",
+    "coupling": "a coupling with another joint",
+    "friction_shape": "friction of another shape",
+    "load_friction": "friction that grows with the load",
+    "position_periodic": "a torque that repeats with the position",
+    "spring": "a spring",
+}
+#: What names a cause but has nothing to type: its message says what to do.
+_AS_FOUND = (
+    "angle_scale",
+    "drift",
+    "gravity",
+    "held_torque",
+    "joint_origin",
+    "payload",
+    "time_scale",
+    "unmounted_part",
+)
+#: Codes that name what is wrong with a joint, and those that only say that something is.
+_NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")
+_UNNAMED = ("missed", "unexplained_torque", "constraint_costs")
 #: The steps, the most telling first, each with the codes of what asks for it.
 _STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
     (_doctor, ()),
@@ -285,9 +424,14 @@ _STEPS: Sequence[tuple[_Maker, tuple[str, ...]]] = (
     (_gains, ("current_for_torque", "torque_scale")),
     (_delay, ("torque_delay",)),
     (_locks, ("locked_at_zero", "locked_position")),
+    (_zeros, ("position_offset",)),
+    (_payload, ("payload_change",)),
+    (_unclipped, ("clipped",)),
+    (_terms, tuple(_CAUSES)),
+    (_as_found, _AS_FOUND),
     (_keep, ("unseen", "repeated_motion", "validation_was_fitted")),
     (_possible, ("impossible",)),
-    (_watch, ("missed", "unexplained_torque", "constraint_costs", "outliers", "spikes")),
+    (_watch, (*_UNNAMED, "outliers", "spikes")),
     (_pin, ("beaten",)),
     (_richer, ("undetermined", "excitation", "faint_parameters", "no_motion")),
     (

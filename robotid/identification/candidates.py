@@ -7,11 +7,14 @@ from functools import partial
 import numpy as np
 
 from robotid._typing import Array
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, Harmonic
 
-__all__ = ["CANDIDATES", "Candidate", "JointMotion", "couplings"]
+__all__ = ["CANDIDATES", "Candidate", "JointMotion", "couplings", "ripples"]
 
 _HARMONICS = 4  # of a torque that is periodic in the position
-_RIPPLES = range(5, 33)  # times a turn that it may repeat beyond; at 1.5 rad/s more pass 8 Hz
+_RIPPLES = np.arange(5, 241)  # times a turn that it may repeat beyond: 200 of a gear of 100 : 1
+_PEAKS = 6  # of them are tried, those at which the residual is most periodic
+_STEEP = 8  # twice the order of the filter, which runs both ways
 _STRIBECK = (0.05, 0.2)  # of the usual speed, over which friction falls from its value at rest
 _PRESLIDING = (0.03, 0.15)  # of the usual speed, over which friction changes its sign
 _WINDUP = (0.02, 0.1)  # of the usual way between two reversals, on which a torque is taken up
@@ -30,6 +33,7 @@ class JointMotion:
         load: Torque of the rigid bodies by the estimate, shape (N,) [N m or N].
         travelled: Way since v last changed its sign, shape (N,) [rad or m].
         time: Time since the recording began, over the longest recording's, shape (N,).
+        passes: Cut-off of the filter of torques [Hz]; infinite without one.
         others: The joints before and after it, by name.
     """
 
@@ -40,7 +44,20 @@ class JointMotion:
     load: Array
     travelled: Array
     time: Array
+    passes: float = np.inf
     others: dict[str, "JointMotion"] = field(default_factory=dict)
+
+    def at(self, rows: slice) -> "JointMotion":
+        """Return the motion in some of the rows, without the other joints.
+
+        Args:
+            rows: The rows.
+        """
+        q, v, a, direction, load = (
+            x[rows] for x in (self.q, self.v, self.a, self.direction, self.load)
+        )
+        travelled, time = self.travelled[rows], self.time[rows]
+        return JointMotion(q, v, a, direction, load, travelled, time, self.passes)
 
 
 @dataclass(frozen=True)
@@ -53,12 +70,16 @@ class Candidate:
         columns: What its c parameters multiply in N rows, shape (N, c). Scales in it are those of
             the motion given, so that all rows are to be asked for at once.
         meaning: What it is, in words of a finding.
-        advice: What the user can do, with {joint} for the joint; empty if nothing.
-        family: Friction of a job that has it, see ``FAMILIES``; empty if none has.
+        advice: What the user can do beside adding it to the model; empty if nothing.
+        families: Friction of a job that has it, see ``FAMILIES``; advised is the first for which
+            the joint turned far enough.
+        terms: Terms of a job's [drives] that are it, if no family is.
         units: Unit of the parameter of a joint that turns, and of one that slides; None: the size
             is the torque of the term, root mean square.
         turns: Whether only a joint that turns has it.
         coupled: The other joint of a coupling; empty for none.
+        ratio: Its ratio beside 1 of the joint's own.
+        tried: How many such terms it was selected from by the residual.
         is_imitated: Whether a drive that sticks at its reversals looks like it behind a filter: it
             is no more than a note then.
     """
@@ -70,8 +91,11 @@ class Candidate:
     advice: str = ""
     units: tuple[str, str] | None = None
     turns: bool = False
-    family: str = ""
+    families: tuple[str, ...] = ()
+    terms: tuple[DriveTerm, ...] = ()
+    tried: int = 1
     coupled: str = ""
+    ratio: float = 0.0
     is_imitated: bool = False
 
 
@@ -97,7 +121,42 @@ def _periodic(m: JointMotion, harmonics: int = _HARMONICS) -> Array:
 
 
 def _ripple(m: JointMotion, count: int) -> Array:
-    return np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+    """Return cosine and sine of many times the position, as the filter of torques passes them."""
+    passed = _passed(m, np.array([count]))
+    columns: Array = passed * np.column_stack([np.cos(count * m.q), np.sin(count * m.q)])
+    return columns
+
+
+def _passed(m: JointMotion, counts: Array) -> Array:
+    """Return what the filter leaves of torques that repeat so often a turn, shape (N, k)."""
+    hertz = np.abs(np.outer(m.v, counts)) / (2 * np.pi)
+    passed: Array = 1.0 / (1.0 + (hertz / m.passes) ** _STEEP)
+    return passed
+
+
+def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
+    """Return candidates of a torque that repeats many times a turn, from the residual's spectrum.
+
+    Args:
+        m: The joint's motion, N rows.
+        weight: What torques of the rows are multiplied by, 0 where they are not used, shape (N,).
+        r: The residual, likewise multiplied, shape (N,).
+    """
+    X = weight[:, None] * _passed(m, _RIPPLES) * np.exp(1j * np.outer(m.q, _RIPPLES))
+    power = np.sum(np.abs(X) ** 2, axis=0)
+    explained = np.abs(r @ X) ** 2 / np.where(power > 0, power, np.inf)
+    counts = _RIPPLES[np.sort(np.argsort(-explained)[:_PEAKS])]
+    return tuple(
+        Candidate(
+            f"ripple {count}", "position_periodic", partial(_ripple, count=count),
+            f"a torque that repeats {count} times a turn (teeth of a gear, poles of a motor, "
+            "a harmonic drive)",
+            turns=True,
+            terms=(Harmonic(order=float(count)), Harmonic(order=float(count), is_sine=True)),
+            tried=len(_RIPPLES),
+        )
+        for count in counts.tolist()
+    )  # fmt: skip
 
 
 def _windup(m: JointMotion) -> Array:
@@ -128,46 +187,52 @@ CANDIDATES = (
         "stribeck", "friction_shape", _stribeck,
         f"{_FRICTION} but rises towards standstill (Stribeck)",
         "Raise min_velocity to leave the slow rows out",
-        family="stribeck",
+        families=("stribeck",),
     ),
     Candidate(
         "presliding", "friction_shape", _presliding,
         f"{_FRICTION} but sets in with speed, or a drive that sticks",
         "Set friction_band, or raise min_velocity to leave the slow rows out",
         is_imitated=True,
-        family="tanh",
+        families=("tanh",),
     ),
     Candidate(
         "power", "friction_shape", lambda m: (m.direction * np.cbrt(np.abs(m.v)))[:, None],
         f"{_FRICTION} but bends with speed, as |v|^(1/3) does",
-        family="power",
+        families=("power",),
     ),
     Candidate(
         "cubic", "friction_shape", lambda m: m.v[:, None] ** 3,
         f"{_FRICTION} but bends with speed, as v^3 does",
-        family="cubic",
+        families=("cubic",),
+    ),
+    Candidate(
+        "asymmetric", "friction_shape", lambda m: np.abs(m.v)[:, None],
+        "viscous friction that differs by direction",
+        units=("N m s/rad", "N s/m"),
+        families=("asymmetric",),
     ),
     Candidate(
         "load", "load_friction", lambda m: (m.direction * np.abs(m.load))[:, None],
         "friction that grows with the load",
         units=("N m per N m of load", "N per N of load"),
-        family="load",
+        families=("load",),
     ),
     Candidate(
         "periodic", "position_periodic", _periodic,
         "a torque that repeats with the joint's position (cogging, an eccentric gear)",
         turns=True,
-        family="harmonics4",
+        families=("harmonics4",),
     ),
     Candidate(
         "linear spring", "spring", lambda m: m.q[:, None], "a spring on the joint",
         units=("N m/rad", "N/m"),
-        family="spring",
+        families=("spring",),
     ),
     Candidate(
         "counterbalance", "spring", lambda m: _periodic(m, 2),
         "a spring or counterbalance that follows the joint's position", turns=True,
-        family="harmonics2",
+        families=("harmonics2", COUNTERBALANCE, "spring"),
     ),
     Candidate(
         "windup", "backlash", _windup,
@@ -179,14 +244,6 @@ CANDIDATES = (
         "drift", "drift", _drift,
         "friction or an offset that drifts with time (a drive that warms up)",
         "Warm the robot up before recording, or cut the log with start",
-    ),
-    *(
-        Candidate(
-            f"ripple {count}", "position_periodic", partial(_ripple, count=count),
-            f"a torque that repeats {count} times a turn (teeth of a gear, poles of a motor)",
-            turns=True,
-        )
-        for count in _RIPPLES
     ),
 )  # fmt: skip
 
@@ -202,10 +259,8 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
             f"coupling {ratio:+g} {name}", "coupling",
             partial(_coupled, other=other, ratio=ratio),
             f"a drive that turns with {name}, too",
-            "Add [[coupling]] to the job with ratios = "
-            f"{{{{ {{joint}} = 1.0, {name} = {ratio} }}}}, the size of the second from the data "
-            "sheet",
             coupled=name,
+            ratio=ratio,
         )
         for name, other in motion.others.items()
         for ratio in (1.0, -1.0)

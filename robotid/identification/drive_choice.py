@@ -26,10 +26,13 @@ from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, DriveTerm, Family,
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["DriveChoice", "FoundShape", "Tried", "choose_drives", "wanted_families"]
+__all__ = ["TENFOLD", "DriveChoice", "FoundShape", "Tried", "choose_drives", "wanted_families"]
 
+#: Times that terms may make the standard error of another parameter grow, unreported.
+TENFOLD = 10.0
 _OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms of the model
 _GRID = 6  # sizes of a shape that are tried, over its bounds
+_SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
 _FAMILIES = 4  # chosen for a joint, at most
 _CHANCE = 0.015  # that a family is chosen that is not there, each time that one is tried
 _LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
@@ -97,6 +100,8 @@ class DriveChoice:
         shape_covariance: Their covariance, row by row.
         sizes: Shapes of each family.
         seen: Ranges of position "q" and of the size of speed "v" that the fit has seen.
+        grown: How many times larger the terms make the standard errors of the drive's armature,
+            viscous and Coulomb friction and offset, by name.
         doubted: Terms that held-out stretches favour, but not beyond chance: they were not taken,
             and errors count what they would move.
         shape_moves: By how much each shape moves standard parameters, shape (p, k).
@@ -110,6 +115,7 @@ class DriveChoice:
     shape_covariance: tuple[tuple[float, ...], ...] = ()
     sizes: tuple[tuple[float, ...], ...] = ()
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    grown: Mapping[str, float] = field(default_factory=dict)
     doubted: tuple[DriveTerm, ...] = ()
     shape_moves: Array | None = field(default=None, compare=False, repr=False)
 
@@ -171,6 +177,7 @@ class _Drive:
     motions: tuple[DriveMotion, ...]  # of each recording, all its rows
     taken: tuple[Array, ...]  # rows of each recording in the sample
     seen: Seen
+    plain: Mapping[str, Array]  # what of x is each of its plain parameters, U^T x, by name
 
     def columns(self, terms: Sequence[DriveTerm]) -> Array:
         """Return what terms multiply in the sampled rows, shape (N, c)."""
@@ -217,7 +224,9 @@ def wanted_families(
 
 
 def choose_drives(
-    identification: "Identification", wanted: Mapping[str, Sequence[str] | None]
+    identification: "Identification",
+    wanted: Mapping[str, Sequence[str] | None],
+    balanced: Mapping[str, str] | None = None,
 ) -> tuple[DriveChoice, ...]:
     """Return the terms of each joint's drive.
 
@@ -225,6 +234,7 @@ def choose_drives(
         identification: What was found with viscous and Coulomb friction alone.
         wanted: Families that joints are to have, by name; None: those that held-out stretches of
             the fitted logs ask for; see ``wanted_families``.
+        balanced: Family of the counterbalance of joints whose families are to be chosen.
 
     Returns:
         A choice per joint; none where a joint hardly moved, or the logs are too short to judge.
@@ -244,8 +254,15 @@ def choose_drives(
             continue
         own = tuple(motion.of(j) for motion in motions)
         seen = _seen(own, sample.taken, used[:, j])
-        drive = _Drive(j, bool(sample.slides[j]), own, sample.taken, seen)
-        choices.append(_auto(sample, drive) if names is None else _fixed(sample, drive, names))
+        plain = {
+            name: sample.U[:, k]
+            for k, name in enumerate(identification.mapping.base_names)
+            if name.startswith(f"{joint}.")
+        }
+        drive = _Drive(j, bool(sample.slides[j]), own, sample.taken, seen, plain)
+        first = [own for own in [(balanced or {}).get(joint)] if own is not None]
+        chosen = _auto(sample, drive, first) if names is None else _fixed(sample, drive, names)
+        choices.append(chosen)
     return tuple(choices)
 
 
@@ -269,8 +286,14 @@ def _candidates(drive: _Drive, families: Sequence[Family]) -> Iterator[tuple[Fam
             continue
         if not all(0.0 < low < high for low, high in bounds):  # it hardly moved
             continue
-        grids = [np.geomspace(*pair, _GRID) for pair in bounds]
+        grids = [_sizes(*pair) for pair in bounds]
         yield from ((family, [float(x) for x in sizes]) for sizes in product(*grids))
+
+
+def _sizes(low: float, high: float) -> Array:
+    """Return the sizes of a shape that are tried."""
+    own = np.geomspace(low, min(high, _SPAN * low), _GRID)
+    return own if own[-1] >= high else np.append(own, high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,38 +352,62 @@ def _reach(drive: _Drive, term: DriveTerm) -> float:
     return float(np.abs(term.column(DriveMotion(none, v, none, one, none, none))).max()) + _NOTHING
 
 
-def _auto(sample: Sample, drive: _Drive) -> DriveChoice:
-    """Return the fewest families that held-out stretches ask for."""
+def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoice:
+    """Return the fewest families that held-out segments require beside the first ones."""
     grid = list(_candidates(drive, [f for f in FAMILIES.values() if f.is_automatic]))
-    every = _Trials.of(sample, drive, grid)
-    torque = float(sample.torque[drive.j])
-    chosen: list[int] = []
+    known = list(_candidates(drive, [FAMILIES[name] for name in first]))
+    start = _weighed_anew(sample, drive, known)
+    every = _Trials.of(start, drive, [*known, *grid])
+    torque = float(start.torque[drive.j])
+    chosen = list(range(len(known)))
     doubted: list[tuple[Family, list[float]]] = []
-    before = every.left([])
-    tried = [Tried((), _percent(before, torque), 1.0, True)]
+    before = every.left(chosen)
+    names = tuple(family.name for family, _ in known)
+    tried = [Tried(names, _percent(before, torque), 1.0, True)]
     for _ in range(_FAMILIES):
-        groups = {every.own[i][0].name.rstrip("0123456789") for i in chosen}
+        beside = _beside(every, chosen, len(known))
         left = {
-            i: every.left([*chosen, i])
-            for i, (family, _) in enumerate(every.own)
-            if family.name.rstrip("0123456789") not in groups and every.is_possible([*chosen, i])
+            i: every.left([*others, i])
+            for i, others in beside.items()
+            if every.is_possible([*others, i])
         }
         best = _best(every, left, before, torque)
-        names = [every.own[i][0].name for i in chosen]
-        tried += list(_told(every, left, before, torque, names, best))
-        if best is None:
+        found = None
+        if best is not None:
+            found = _conditioned(sample, drive, every, left, beside, before, best)
+            best = found.number
+        tried += list(_told(every, left, before, torque, beside, best))
+        if found is None or best is None:
             nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
             if nearest is not None and left[nearest].sum() < before.sum():
                 doubted = [every.own[nearest]]
             break
-        # between the sizes of the grid, or the next family would make up for that
-        own = _refined(sample, drive, [every.own[i] for i in (*chosen, best)])
+        own = found.own
+        known = known if set(chosen) <= set(beside[best]) else []
         anew = _weighed_anew(sample, drive, own)
         every, torque = _Trials.of(anew, drive, [*own, *grid]), float(anew.torque[drive.j])
         chosen = list(range(len(own)))
         before = every.left(chosen)
     choice = _found(sample, drive, [every.own[i] for i in chosen], tuple(tried))
     return replace(choice, doubted=_terms(drive, doubted))
+
+
+def _beside(every: _Trials, chosen: Sequence[int], known: int) -> dict[int, list[int]]:
+    """Return what stays of the chosen candidates beside each other one that may join them.
+
+    A joint has one family of each kind; only those it was given before the choice are replaced.
+    """
+    groups = [_group(every.own[k][0]) for k in chosen]
+    return {
+        i: [k for k, group in zip(chosen, groups, strict=True) if group != _group(family)]
+        for i, (family, _) in enumerate(every.own)
+        if i not in chosen and _group(family) not in groups[known:]
+    }
+
+
+def _group(family: Family) -> str:
+    """Return what families of one kind have in common, of which a joint has one."""
+    return family.name.rstrip("0123456789")
 
 
 def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: float) -> int | None:
@@ -373,12 +420,67 @@ def _best(every: _Trials, left: Mapping[int, Array], before: Array, torque: floa
         if gain > _LEAST * whole and gain > _SEEN**2 * torque and _chance(before, left[i]) < _CHANCE
     }
     alike = [i for i, gain in sure.items() if gain >= max(sure.values()) - _ALIKE * whole]
-    order = list(FAMILIES)
-    return min(
-        alike,
-        key=lambda i: (len(every.place[i]), order.index(every.own[i][0].name), -sure[i]),
-        default=None,
-    )
+    return min(alike, key=lambda i: (*_simplicity(every, i), -sure[i]), default=None)
+
+
+def _simplicity(every: _Trials, i: int) -> tuple[int, int]:
+    """Return how many columns a candidate has, and where its family is in the order of them."""
+    return len(every.place[i]), list(FAMILIES).index(every.own[i][0].name)
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A candidate beside those chosen, with shapes between the sizes of the grid."""
+
+    number: int
+    own: list[tuple[Family, list[float]]]  # of those chosen and of itself
+    faults: tuple[bool, bool]  # a shape is at its bound, a standard error grows tenfold
+
+
+def _conditioned(
+    sample: Sample,
+    drive: _Drive,
+    every: _Trials,
+    left: Mapping[int, Array],
+    beside: Mapping[int, Sequence[int]],
+    before: Array,
+    best: int,
+) -> _Refined:
+    """Return the best candidate, or one of another family that is as good and better conditioned.
+
+    As good: it leaves no more of held-out segments than the best, within the standard error of the
+    difference. Better conditioned: no shape is at its bound, or no term makes the standard error of
+    another parameter of the drive grow tenfold, where the best has that.
+    """
+
+    def refined(i: int) -> _Refined:
+        own = _refined(sample, drive, [every.own[k] for k in (*beside[i], i)])
+        grown = _grown(_weighed_anew(sample, drive, own), drive, own)
+        is_grown = max(grown.values(), default=1.0) > TENFOLD
+        return _Refined(i, own, (bool(_at_bound(drive, own).any()), is_grown))
+
+    def left_of(other: _Refined) -> Array:
+        return _Trials.of(sample, drive, other.own).left(range(len(other.own)))
+
+    first = refined(best)
+    if not any(first.faults):
+        return first
+    by_family: dict[str, int] = {}
+    for i in sorted(left, key=lambda i: float(left[i].sum())):
+        by_family.setdefault(every.own[i][0].name, i)
+    by_family.pop(every.own[best][0].name)
+    others = [refined(i) for i in by_family.values() if left[i].sum() < before.sum()]
+    better = [other for other in others if other.faults < first.faults]
+    least, slack = left_of(first), _ALIKE * float(before.sum())
+    alike = [other for other in better if _is_alike(least, left_of(other), slack)]
+    return min((first, *alike), key=lambda x: (x.faults, *_simplicity(every, x.number)))
+
+
+def _is_alike(best: Array, other: Array, slack: float) -> bool:
+    """Return whether segments are left as small, within a slack or the difference's scatter."""
+    more = other - best
+    scatter = np.sqrt(len(more)) * float(np.std(more, ddof=1))
+    return bool(float(more.sum()) <= max(slack, scatter))
 
 
 def _chance(before: Array, after: Array) -> float:
@@ -400,7 +502,7 @@ def _told(
     left: Mapping[int, Array],
     before: Array,
     torque: float,
-    names: Sequence[str],
+    beside: Mapping[int, Sequence[int]],
     best: int | None,
 ) -> Iterator[Tried]:
     """Yield what each family would leave, at its best shape."""
@@ -413,6 +515,7 @@ def _told(
             by_family[name] = i
     for name, i in by_family.items():
         chance = _chance(before, left[i])
+        names = [every.own[k][0].name for k in beside[i]]
         yield Tried((*names, name), _percent(left[i], torque), chance, i == best)
 
 
@@ -453,11 +556,9 @@ def _found(
     """Return the choice with its shapes refined."""
     refined = _refined(sample, drive, chosen)
     families = [family for family, _ in refined]
-    flat = np.array([size for _, own in refined for size in own])
+    flat = _flat(refined)
     shapes = [(family, shape) for family in families for shape in family.shapes]
-    bounds = _log_bounds(drive, families)
-    margin = _EDGE * np.ptp(bounds, axis=1)
-    is_at_bound = np.min(np.abs(np.log(flat)[:, None] - bounds), axis=1) < margin
+    is_at_bound = _at_bound(drive, refined)
     anew = _weighed_anew(sample, drive, refined)
     covariance = _shape_covariance(anew, drive, families, flat)
     return DriveChoice(
@@ -480,7 +581,42 @@ def _found(
         shape_covariance=tuple(tuple(row) for row in covariance.tolist()),
         sizes=tuple(tuple(own) for _, own in refined),
         seen=drive.seen,
+        grown=_grown(anew, drive, refined),
     )
+
+
+def _flat(chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+    """Return all shapes of families in a row, shape (k,)."""
+    return np.array([size for _, own in chosen for size in own])
+
+
+def _at_bound(drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]) -> Array:
+    """Return which shapes are at the end of the range in which they are sought, shape (k,)."""
+    bounds = _log_bounds(drive, [family for family, _ in chosen])
+    margin = _EDGE * np.ptp(bounds, axis=1)
+    is_near: Array = np.min(np.abs(np.log(_flat(chosen))[:, None] - bounds), axis=1) < margin
+    return is_near
+
+
+def _grown(
+    sample: Sample, drive: _Drive, chosen: Sequence[tuple[Family, Sequence[float]]]
+) -> dict[str, float]:
+    """Return how many times larger terms make the standard error of each plain drive parameter.
+
+    With X the columns of terms and shapes, M = 1 - W (W^T W + 1)^-1 W^T and T = (W^T W + 1)^-1 W^T
+    X, the covariance (W^T W + 1)^-1 of the base parameters becomes that plus T (X^T M X)^-1 T^T.
+    """
+    families = [family for family, _ in chosen]
+    if not families:
+        return {}
+    _, trial = _with_slopes(sample, drive, families, _flat(chosen))
+    T, S = trial.T[:, :-1], trial.S[:-1, :-1]
+    _, before = sample.whole
+    grown = {}
+    for name, u in drive.plain.items():
+        more = u @ T @ np.linalg.solve(S, T.T @ u)
+        grown[name] = float(np.sqrt(1.0 + max(more, 0.0) / (u @ before @ u)))
+    return grown
 
 
 def _weighed_anew(
@@ -540,7 +676,7 @@ def _refined(
     from scipy.optimize import minimize
 
     families = [family for family, _ in chosen]
-    start = np.log([size for _, own in chosen for size in own])
+    start = np.log(_flat(chosen))
 
     def left(log_sizes: Array) -> float:
         Z = drive.columns(_terms(drive, _with_shapes(families, np.exp(log_sizes))))
@@ -562,6 +698,16 @@ def _shape_covariance(
     """Return the covariance of shapes: that of the columns d(torque)/d(shape) beside all."""
     if not len(flat):
         return np.empty((0, 0))
+    count, beside = _with_slopes(sample, drive, families, flat)
+    _, every = beside.estimate(list(range(count + len(flat))), sample.fitted)
+    covariance: Array = every[count:, count:]
+    return covariance
+
+
+def _with_slopes(
+    sample: Sample, drive: _Drive, families: Sequence[Family], flat: Array
+) -> tuple[int, Trial]:
+    """Return the number c of columns of terms, and a trial of them and of d(torque)/d(shape)."""
     Z = drive.columns(_terms(drive, _with_shapes(families, flat)))
     _, whole = trials(sample, slice(drive.j, drive.j + 1), Z[:, None], _ROUNDING)
     theta = whole.parameters(list(range(Z.shape[1])))
@@ -570,9 +716,6 @@ def _shape_covariance(
         larger = flat + h * (np.arange(len(flat)) == k)
         moved = drive.columns(_terms(drive, _with_shapes(families, larger)))
         slopes[:, k] = (moved - Z) @ theta / h
-    _, beside = trials(
-        sample, slice(drive.j, drive.j + 1), np.hstack([Z, slopes])[:, None], _ROUNDING
-    )
-    _, every = beside.estimate(list(range(Z.shape[1] + len(flat))), sample.fitted)
-    covariance: Array = every[Z.shape[1] :, Z.shape[1] :]
-    return covariance
+    columns = np.hstack([Z, slopes])[:, None]
+    _, beside = trials(sample, slice(drive.j, drive.j + 1), columns, _ROUNDING)
+    return Z.shape[1], beside

@@ -14,6 +14,7 @@ from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
 from robotid.identification.discrepancies import discrepancy_findings
+from robotid.identification.drive_choice import TENFOLD, DriveChoice
 from robotid.identification.misfit import Sample, misfit_findings
 from robotid.identification.regressor_noise import encoder_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
@@ -148,7 +149,8 @@ def _drive_findings(identification: Identification) -> list[Finding]:
                     "bends; record slower and faster motion of this joint to tell"
                 )
                 findings.append(Finding("shape_at_bound", "note", choice.joint, message))
-        guards = {term.guards for term in choice.terms if term.guards}
+        findings += _correlated(identification, choice)
+        guards = {term.guards for term in choice.terms if np.isfinite(term.seen).all()} - {""}
         j = model.joints.index(choice.joint)
         for evaluation in identification.validation:
             motion, mask = evaluation.recording.trajectory, evaluation.recording.mask
@@ -167,6 +169,29 @@ def _drive_findings(identification: Identification) -> list[Finding]:
                     evidence = {"share_pct": 100 * share}
                     findings.append(Finding("beyond_seen", "note", choice.joint, message, evidence))
     return findings
+
+
+def _correlated(identification: Identification, choice: DriveChoice) -> list[Finding]:
+    """Return a note on the pair of drive parameters that only their sum determines, if any."""
+    if max(choice.grown.values(), default=1.0) <= TENFOLD:
+        return []
+    name = max(choice.grown, key=lambda name: choice.grown[name])
+    names, C = identification.model.layout.names, identification.standard_covariance
+    own = [k for k, other in enumerate(names) if other.startswith(f"{choice.joint}.") and C[k, k]]
+    i = names.index(name)
+    r = {k: float(C[i, k] / np.sqrt(C[i, i] * C[k, k])) for k in own if k != i and C[i, i] > 0}
+    if not r:
+        return []
+    k = max(r, key=lambda k: abs(r[k]))
+    first, second = (x.removeprefix(f"{choice.joint}.") for x in (name, names[k]))
+    message = (
+        f"{choice.joint}: {first} and {second} are strongly correlated (r = {r[k]:.3f}): "
+        f"{listed(choice.families)} makes the standard error of {first} {choice.grown[name]:.0f} "
+        "times as large. The friction curve is determined, the single values are not: use the "
+        "curve"
+    )
+    evidence = {"r": r[k], "grown": choice.grown[name]}
+    return [Finding("correlated_terms", "note", choice.joint, message, evidence)]
 
 
 def unwritten(identification: Identification, alarms: Sequence[Finding]) -> list[Finding]:

@@ -9,6 +9,7 @@ so that what base parameters can explain does not count (Frisch, Waugh 1933); C 
 before the data. What a term explains of the stretches left out, it explains beyond chance.
 """
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -20,13 +21,20 @@ import numpy as np
 from scipy.special import stdtr
 
 from robotid._typing import Array
-from robotid.findings import Finding, listed
-from robotid.identification.candidates import CANDIDATES, Candidate, JointMotion, couplings
+from robotid.findings import Finding, listed, toml_key
+from robotid.identification.candidates import (
+    CANDIDATES,
+    Candidate,
+    JointMotion,
+    couplings,
+    ripples,
+)
 from robotid.identification.evaluation import Evaluation, Recording
 from robotid.logs.data import Trajectory
 from robotid.regressor.columns import friction_directions
 from robotid.regressor.torque import trajectory_regressor
 from robotid.regressor.used_rows import independent_share
+from robotid.robot.drives import COUNTERBALANCE, DriveTerm, drive_line, has_turned, spring_family
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -37,11 +45,15 @@ __all__ = [
     "Sample",
     "Trial",
     "chance",
+    "counterbalanced",
     "find_misfits",
     "misfit_findings",
+    "setting_of",
     "settled",
     "take_sample",
     "trials",
+    "with_entries",
+    "with_known_springs",
 ]
 
 _ROWS = 3000  # of all fitted logs, and of all kept ones, that are read
@@ -60,7 +72,9 @@ _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
 _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
 _OF_POSITION = ("position_periodic", "spring")
-_OF_MASSES = ("current_for_torque", "urdf_mismatch")
+_OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
+_SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
+_DIGITS = "0123456789"
 _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
@@ -84,6 +98,7 @@ class Misfit:
         unit: Unit of the size.
         error: Residual that base parameters leave without the term, over the torque [-].
         shift: By how much it would move base parameters over their spread, shape (b,).
+        entries: What a job's [drives] says of the joint to add it; none if nothing does.
     """
 
     joint: str
@@ -96,6 +111,7 @@ class Misfit:
     unit: str
     error: float
     shift: Array
+    entries: tuple[str | DriveTerm, ...] = ()
 
     @property
     def matters(self) -> bool:
@@ -112,7 +128,45 @@ def misfit_findings(identification: "Identification") -> list[Finding]:
     Args:
         identification: What was found.
     """
-    return [_finding(misfit, identification.on_misfit) for misfit in identification.misfits]
+    return [_finding(misfit, identification) for misfit in identification.misfits]
+
+
+def setting_of(misfit: Misfit, identification: "Identification") -> str:
+    """Return what to write into a job file to add a term to the model; empty if nothing does.
+
+    A line of [drives], which has what the joint's drive has already, or a table [[coupling]].
+
+    Args:
+        misfit: The term.
+        identification: What was found without it.
+    """
+    joint, other = misfit.joint, misfit.term.coupled
+    if other:
+        ratios = f"{toml_key(joint)} = 1.0, {toml_key(other)} = {misfit.term.ratio}"
+        return f"[[coupling]]\nname = {json.dumps(f'{joint}_{other}')}\nratios = {{ {ratios} }}"
+    if not misfit.entries:
+        return ""
+    return f"[drives]\n{with_entries(identification, joint, misfit.entries)}"
+
+
+def with_entries(
+    identification: "Identification", joint: str, entries: Sequence[str | DriveTerm]
+) -> str:
+    """Return the line of a job's [drives] that adds entries to what a joint's drive has.
+
+    Args:
+        identification: What was found without them.
+        joint: The joint.
+        entries: Names of families, or terms.
+    """
+    (families, chosen), *_ = [
+        *((c.families, c.terms) for c in identification.drives if c.joint == joint),
+        ((), ()),
+    ]
+    stated = [t for t in identification.model.layout.own.get(joint, ()) if t not in chosen]
+    kinds = {entry.rstrip(_DIGITS) for entry in entries if isinstance(entry, str)}
+    others = [name for name in families if name.rstrip(_DIGITS) not in kinds]
+    return drive_line(joint, *stated, *others, *entries)
 
 
 def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
@@ -130,6 +184,42 @@ def find_misfits(sample: "Sample | None") -> tuple[Misfit, ...]:
         m for m in found
         if not m.term.coupled or m.share > _ONE_SIDED or (m.term.coupled, m.joint) in coupled
     )  # fmt: skip
+
+
+def counterbalanced(found: Sequence[Finding], logs: Sequence[str]) -> dict[str, str]:
+    """Return the family of the counterbalance of each joint that the fitted logs show one of.
+
+    Args:
+        found: What was found before the fit.
+        logs: Names of the fitted logs.
+    """
+    joints = {}
+    for finding in found:
+        log, _, joint = finding.where.rpartition(": ")
+        if finding.code == "counterbalance" and log in logs:
+            joints[joint] = spring_family(finding.evidence["turned"], COUNTERBALANCE)
+    return joints
+
+
+def with_known_springs(found: Sequence[Finding], fit: "Identification") -> list[Finding]:
+    """Return what was found before a fit, a counterbalance that its model has as a note.
+
+    Args:
+        found: What was found before the fit.
+        fit: The fit, whose drives have their terms.
+    """
+    own = fit.model.layout.own
+    springs = {joint for joint, terms in own.items() if any(t.part in _SPRINGS for t in terms)}
+
+    def as_known(finding: Finding) -> Finding:
+        joint = finding.where.rpartition(": ")[2]
+        if finding.code != "counterbalance" or joint not in springs:
+            return finding
+        names = listed(term.name for term in own[joint] if term.part in _SPRINGS)
+        message = f"{finding.message.partition('. Add')[0]}. The model has it: {names} of {joint}"
+        return replace(finding, severity="note", message=message)
+
+    return [as_known(finding) for finding in found]
 
 
 def settled(found: Sequence[Finding], of_fit: Sequence[Finding]) -> list[Finding]:
@@ -263,7 +353,7 @@ def take_sample(identification: "Identification", *, is_steady: bool = True) -> 
     return Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
-        motions=_joint_motions([e.recording.trajectory for e, _ in parts], rows, load, model),
+        motions=_joint_motions([e.recording for e, _ in parts], rows, load, model),
         at=tuple(motion),
         taken=tuple(rows),
         weight=weight,
@@ -317,9 +407,11 @@ def _usual_size(r: Array, used: Array) -> Array:
 
 
 def _joint_motions(
-    motions: Sequence[Trajectory], rows: Sequence[Array], load: Array, model: RobotModel
+    recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
 ) -> tuple[JointMotion, ...]:
     """Return how each joint moves in the rows, with its neighbours."""
+    motions = [recording.trajectory for recording in recordings]
+    passes = max(recording.signals.cutoff or np.inf for recording in recordings)
     longest = max(float(np.ptp(m.t)) for m in motions)
 
     def joined(of: Callable[[Trajectory], Array]) -> Array:
@@ -330,7 +422,7 @@ def _joint_motions(
     way = joined(_travelled)
     time = joined(lambda m: (m.t - m.t[0]) / (longest or 1.0))
     alone = [
-        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time)
+        JointMotion(q[:, j], v[:, j], a[:, j], signs[:, j], load[:, j], way[:, j], time, passes)
         for j in range(len(model.joints))
     ]
     beside = [[k for k in (j - 1, j + 1) if 0 <= k < len(alone)] for j in range(len(alone))]
@@ -470,7 +562,10 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
     motion = sample.motions[j]
     if not sample.weight[: sample.rows, j].any():
         return
-    own = [c for c in (*CANDIDATES, *couplings(motion)) if not (c.turns and sample.slides[j])]
+    fitted = slice(sample.rows)
+    periodic = ripples(motion.at(fitted), sample.weight[fitted, j], sample.r[fitted, j])
+    every = (*CANDIDATES, *couplings(motion), *periodic)
+    own = [c for c in every if not (c.turns and sample.slides[j])]
     columns = [candidate.columns(motion) for candidate in own]
     ends = np.cumsum([x.shape[1] for x in columns]).tolist()
     place = {
@@ -505,9 +600,17 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 unit=unit,
                 error=error,
                 shift=_shift(whole, chosen, place[best]),
+                entries=_entries(sample, j, best),
             )
         chosen += place[best]
         before, own = left[best], [c for c in own if c.code != best.code]
+
+
+def _entries(sample: Sample, j: int, term: Candidate) -> tuple[str | DriveTerm, ...]:
+    """Return what a job's [drives] says of a joint to add a term to it; none if nothing does."""
+    turned = 0.0 if sample.slides[j] else float(np.ptp(sample.motions[j].q[: sample.rows]))
+    families = [name for name in term.families if has_turned(name, turned)]
+    return tuple(families[:1]) or term.terms
 
 
 def _best(
@@ -523,7 +626,7 @@ def _best(
     sure = {
         candidate: gain
         for candidate, gain in gains.items()
-        if gain > _LEAST and chance(before, left[candidate], fitted) < _CHANCE
+        if gain > _LEAST and candidate.tried * chance(before, left[candidate], fitted) < _CHANCE
     }
     alike = [c for c, gain in sure.items() if gain > max(sure.values()) - _ALIKE]
     return min(alike, key=lambda c: (len(place[c]), -sure[c]), default=None)
@@ -571,15 +674,24 @@ def _size(
     return size, error, ("N m rms", "N rms")[int(sample.slides[j])]
 
 
-def _finding(misfit: Misfit, on_misfit: Sequence[str]) -> Finding:
+def _advice(term: Candidate, setting: str) -> str:
+    """Return in words what the user can do about a term that the model lacks."""
+    if not setting:
+        return term.advice
+    table, *lines = setting.split("\n")
+    if term.coupled:
+        size = "the size of the second from the data sheet"
+        return f"Add {table} to the job with {' and '.join(lines)}, {size}"
+    added = f"state {lines[0]} in {table} to add it to the model"
+    return f"{term.advice}, or {added}" if term.advice else f"{added[0].upper()}{added[1:]}"
+
+
+def _finding(misfit: Misfit, found: "Identification") -> Finding:
     term, kept = misfit.term, misfit.confirmed
-    wide = [name for name in on_misfit if name.startswith(f"{misfit.joint}.")]
+    wide = [name for name in found.on_misfit if name.startswith(f"{misfit.joint}.")]
     stands = f"; {listed(wide)} stand on this misfit, and their intervals count it" if wide else ""
     confirmed = "" if kept is None else f" ({100 * max(kept, 0.0):.0f} % on the validation logs)"
-    done = term.advice.format(joint=misfit.joint)
-    if term.family:
-        added = f"state {misfit.joint} = [{term.family!r}] in [drives] to add it to the model"
-        done = f"{done}, or {added}" if done else f"{added[0].upper()}{added[1:]}"
+    done = _advice(term, setting_of(misfit, found))
     message = (
         f"{misfit.joint}: {term.meaning}: {misfit.size:.3g} +- {misfit.std_error:.2g} "
         f"{misfit.unit}. It would explain {100 * misfit.share:.0f} % of the squared residual"

@@ -40,7 +40,14 @@ from robotid.identification.evaluation import Evaluation, evaluate_logs, hidden_
 from robotid.identification.findings import fit_findings, log_findings, unwritten
 from robotid.identification.fitting import Known, consistent_fit, make_estimator
 from robotid.identification.metrics import Metrics
-from robotid.identification.misfit import Misfit, find_misfits, settled, take_sample
+from robotid.identification.misfit import (
+    Misfit,
+    counterbalanced,
+    find_misfits,
+    settled,
+    take_sample,
+    with_known_springs,
+)
 from robotid.identification.model_error import settled_shapes, with_model_error
 from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
@@ -646,13 +653,15 @@ def conclude(
         )
     report_stage(progress, "fitting")
     with _explained(found):
-        fit = with_drives(recordings, choice, wanted, progress=progress)
+        balanced = counterbalanced(found, [log.head.name for log in recordings.fitted])
+        fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
     fit = with_model_error(fit, sample, find_misfits(sample))
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
-    told = refuted(settled(told, fit_findings(fit, sample)), fit.predictions, fit.witness)
+    told = settled(with_known_springs(told, fit), fit_findings(fit, sample))
+    told = refuted(told, fit.predictions, fit.witness)
     alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]
     findings = [*log_findings(heads), *impossible_inertials(model), *told, *unwritten(fit, alarms)]
@@ -683,6 +692,7 @@ def with_drives(
     recordings: Recordings,
     choice: EstimatorSettings,
     wanted: Mapping[str, Sequence[str] | None],
+    balanced: Mapping[str, str] | None = None,
     *,
     progress: ProgressCallback | None = None,
 ) -> Identification:
@@ -692,6 +702,7 @@ def with_drives(
         recordings: The recordings.
         choice: Which estimator.
         wanted: Friction of each joint, as of ``wanted_families``.
+        balanced: As of ``choose_drives``.
         progress: Called with "fits", those done, those in all as far as is known, and "fits".
 
     Raises:
@@ -700,7 +711,7 @@ def with_drives(
     report = progress or ignore_progress
     report("fits", 0, 1, "fits")
     fit = _fitted(recordings, choice)
-    drives = choose_drives(fit, wanted)
+    drives = choose_drives(fit, wanted, balanced)
     if not any(drive.terms for drive in drives):
         return replace(fit, drives=drives)
     rough = _rough(choice)

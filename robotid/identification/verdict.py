@@ -52,6 +52,8 @@ _WORDS = {
     "constant_torque": "the torque never changes: the channel is dead",
     "constraint_costs": "{error_pct:.1f} % of the torque is missed where it was fitted, "
     "{wls_error_pct:.1f} % without constraints: physics and data disagree",
+    "counterbalance": "a counterbalance or spring takes {cancelled_pct:.0f} % of its gravity: the "
+    "model of its drive lacks it",
     "current_for_torque": "the torque fits the URDF in another scale only: if it is a current or "
     "in another unit, masses and inertias are wrong in the same proportion",
     "density": "its mass makes {density:.2g} kg/m^3 of the box around its geometry",

@@ -8,6 +8,7 @@ The columns of many terms are guarded: beyond the speeds or positions that the f
 stay as they were at the end of that range, for no data say how they go on.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
@@ -17,10 +18,11 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.findings import listed
+from robotid.findings import listed, toml_key
 
 __all__ = [
     "AUTO",
+    "COUNTERBALANCE",
     "DRIVE_TERMS",
     "FAMILIES",
     "TERMS",
@@ -31,6 +33,9 @@ __all__ = [
     "Lag",
     "LoadFriction",
     "Shape",
+    "drive_line",
+    "has_turned",
+    "spring_family",
     "term_from_dict",
 ]
 
@@ -522,6 +527,9 @@ DRIVE_TERMS = tuple(TERMS)
 #: What ``friction`` says to have the families of each joint chosen.
 AUTO = "auto"
 
+#: Family of a counterbalance that opposes gravity.
+COUNTERBALANCE = "harmonics1"
+
 Seen = Mapping[str, tuple[float, float]]
 
 
@@ -577,8 +585,10 @@ class Family:
 
 
 _SPEED = Shape("speed", ("rad/s", "m/s"), (0.005, 0.5), "v")
+_RISE = Shape("speed", ("rad/s", "m/s"), (0.005, 1.0), "v")
 _WAY = Shape("displacement", ("rad", "m"), (0.0005, 0.015), "q")
 _KNOTS = 4  # of a piecewise-linear curve of friction
+_SPARE = 1.1  # times what a family needs of the position, from which it is advised
 _TABLE = 8  # entries of a tabulated spring
 
 
@@ -614,6 +624,11 @@ def _harmonics(highest: int) -> Callable[[Seen], tuple[DriveTerm, ...]]:
     return make
 
 
+def _once_a_turn() -> tuple[DriveTerm, ...]:
+    """Return cosine and sine of the position: gravity has a part of them, beyond the range, too."""
+    return (Harmonic(), Harmonic(is_sine=True))
+
+
 def _by_position(seen: Seen) -> tuple[DriveTerm, ...]:
     centre = 0.5 * (seen["q"][0] + seen["q"][1])
     return tuple(PositionCoulomb(seen=seen["q"], order=k, centre=centre) for k in (1, 2))
@@ -629,18 +644,20 @@ FAMILIES: dict[str, Family] = {
                lambda seen, speed: (Stribeck(seen=seen["v"], speed=speed),), (_SPEED,),
                is_automatic=True),
         Family("tanh", "friction that sets in with speed",
-               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_SPEED,),
+               lambda seen, speed: (Tanh(seen=seen["v"], speed=speed),), (_RISE,),
                is_automatic=True),
         Family("presliding", "friction that is taken up after each reversal",
                lambda seen, way: (Presliding(displacement=way),), (_WAY,), is_automatic=True),
         Family("lag", "a torque that comes late (a delay, an elastic gear)",
                lambda seen: (Lag(),), is_automatic=True),
+        Family(COUNTERBALANCE, "a torque that repeats once a turn, as a counterbalance's",
+               lambda seen: _once_a_turn(), needs=0.1),
         Family("harmonics2", "a torque that repeats once and twice a turn", _harmonics(2),
                needs=0.5, is_automatic=True),
         Family("harmonics4", "a torque that repeats one to four times a turn", _harmonics(4),
                needs=0.5, is_automatic=True),
         Family("asymmetric", "viscous friction that differs by direction",
-               lambda seen: (Asymmetric(),)),
+               lambda seen: (Asymmetric(),), is_automatic=True),
         Family("power", "friction that bends with speed",
                lambda seen, exponent: (Power(seen=seen["v"], exponent=exponent),),
                (Shape("exponent", ("-", "-"), (0.1, 0.9)),)),
@@ -664,6 +681,43 @@ _CLASSES: dict[str, type[DriveTerm]] = {
         Presliding, LuGre, Spring, Hat, Counterbalance, Lag,
     )
 }  # fmt: skip
+
+
+def spring_family(turned: float, *families: str) -> str:
+    """Return the first family of a spring that a joint turned far enough for.
+
+    Args:
+        turned: Range of its positions [rad].
+        families: Names of families, those that need most first; "spring" needs nothing.
+    """
+    return next((name for name in families if has_turned(name, turned)), "spring")
+
+
+def has_turned(family: str, turned: float) -> bool:
+    """Return whether a joint turned as far as a family of its torque needs, with room to spare.
+
+    Args:
+        family: Its name.
+        turned: Range of the joint's positions [rad]; 0 of a prismatic joint.
+    """
+    return _SPARE * FAMILIES[family].needs * 2 * np.pi <= turned
+
+
+def drive_line(joint: str, *entries: str | DriveTerm) -> str:
+    """Return the line of a job's [drives] that gives a joint families or terms.
+
+    Args:
+        joint: The joint.
+        entries: Names of families, or terms.
+    """
+    return f"{toml_key(joint)} = [{', '.join(map(_toml_entry, entries))}]"
+
+
+def _toml_entry(entry: str | DriveTerm) -> str:
+    if isinstance(entry, str):
+        return json.dumps(entry)
+    table = {key: value for key, value in entry.to_dict().items() if key != "seen"}
+    return "{ " + ", ".join(f"{key} = {json.dumps(x)}" for key, x in table.items()) + " }"
 
 
 def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:

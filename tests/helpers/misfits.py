@@ -39,6 +39,15 @@ def _ripple(t, q, v, load, usual):
     return 0.15 * usual * np.cos(13 * q + 0.4)
 
 
+def _harmonic_drive(t, q, v, load, usual):
+    return 0.15 * usual * np.cos(40 * q + 0.4)
+
+
+def _balancing(t, q, v, load, usual):
+    """A counterbalance that takes 40 N m of the lift of a UR5 with its arm stretched out."""
+    return 40.0 * np.cos(q + 0.1)
+
+
 def _spring(t, q, v, load, usual):
     return 0.3 * usual * (q - 0.2)
 
@@ -68,11 +77,14 @@ EFFECTS = {
     "load": Effect("load_friction", _load),
     "periodic": Effect("position_periodic", _periodic),
     "ripple": Effect("position_periodic", _ripple),
+    "harmonic drive": Effect("position_periodic", _harmonic_drive),
     "spring": Effect("spring", _spring),
     "counterbalance": Effect("spring", _counterbalance),
     "windup": Effect("backlash", _windup),
     "drift": Effect("drift", _drift),
 }
+#: What the doctor names before a fit.
+BALANCING = {"balancing": Effect("counterbalance", _balancing)}
 
 
 def coloured(rng, shape, memory):
@@ -118,7 +130,9 @@ def log_with(
     if effect is not None:
         load = Y[:, joint, : truth.layout.n_inertial] @ pi[: truth.layout.n_inertial]
         usual = np.sqrt(np.mean(tau[:, joint] ** 2))
-        added[:, joint] = size * EFFECTS[effect].torque(t, q[:, joint], v[:, joint], load, usual)
+        added[:, joint] = size * (EFFECTS | BALANCING)[effect].torque(
+            t, q[:, joint], v[:, joint], load, usual
+        )
     level = noise * np.sqrt(np.mean(tau**2, axis=0))
     return Log(
         t=t, q=q + 2e-5 * rng.standard_normal(q.shape), v=v + 2e-4 * rng.standard_normal(q.shape),

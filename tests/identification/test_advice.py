@@ -1,13 +1,20 @@
 """What to do next: the cause of trouble first, in words and commands that the program takes."""
 
 import shlex
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from robotid.cli import _parser
+from robotid.commands.job import job_from_settings
 from robotid.findings import Finding
 from robotid.identification.advice import Origin, next_steps
+from robotid.identification.candidates import CANDIDATES, JointMotion, couplings, ripples
+from robotid.identification.misfit import Misfit, misfit_findings, setting_of
+from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
 FLAGS = Origin(("arm.urdf", "first.csv", "--cutoff", "8"), "out")
@@ -27,7 +34,7 @@ def words(steps):
 
 def test_every_command_is_one_that_the_program_takes(identified):
     codes = ["current_for_torque", "torque_delay", "unexplained_torque", "undetermined"]
-    codes += ["zero_mass", "repeated_motion", "spikes"]
+    codes += ["zero_mass", "repeated_motion", "spikes", *NAMED, "locked_position"]
     typed = 0
     for origin in (JOB, FLAGS):
         for found in (
@@ -36,10 +43,137 @@ def test_every_command_is_one_that_the_program_takes(identified):
         ):
             for step in next_steps(found, origin):
                 for block in step.blocks:
-                    if block.startswith("robotid"):
+                    if not block.startswith("robotid"):
+                        read(block)
+                    else:
                         _parser(shlex.split(block)[1:]).parse_args(shlex.split(block)[1:])
                         typed += 1
     assert typed > 30
+
+
+#: Codes that name what is wrong with a joint, and the first words of their steps.
+NAMED = {
+    "backlash": "Leave out the rows",
+    "clipped": "Record a slower motion",
+    "counterbalance": "Add to the model of elbow_joint",
+    "coupling": "Add to the model of elbow_joint",
+    "drift": "Drift is so; do something",
+    "friction_shape": "Add to the model of elbow_joint",
+    "load_friction": "Add to the model of elbow_joint",
+    "payload_change": "Validate with the load",
+    "position_offset": "Correct the zero",
+    "position_periodic": "Add to the model of elbow_joint",
+    "spring": "Add to the model of elbow_joint",
+}
+
+
+def read(block):
+    """Return the job of a block, as it stands in a file with a robot and a log."""
+    for blank in ("GAIN", "POSITION", "KG"):
+        block = block.replace(f"= {blank}", "= 1.5")
+    table = tomllib.loads(block)
+    table.setdefault("identification", [{"log": "a.csv"}])
+    return job_from_settings(
+        {"urdf": str(example_urdf("ur5_robot.urdf")), **table}, "job", Path.cwd()
+    )
+
+
+def lacking(joint, term, entries=()):
+    return Misfit(joint, term, 0.9, 1e-9, 0.9, 1.0, 0.1, "N m rms", 0.1, np.zeros(1), entries)
+
+
+def motion_of(joint, other, rng):
+    x = rng.standard_normal((7, 40))
+    alone = JointMotion(*x)
+    return replace(alone, others={other: alone})
+
+
+def candidates(joint, other, rng):
+    motion = motion_of(joint, other, rng)
+    found = ripples(motion, np.ones(40), rng.standard_normal(40))
+    return (*CANDIDATES, *couplings(motion), *found)
+
+
+@pytest.mark.parametrize("joint", ["elbow_joint", 'odd "j".1'])
+def test_every_setting_that_is_advised_for_a_term_is_read(identified, joint, rng):
+    """Each term that a drive may lack, with each family that it may be given."""
+    other, seen = "b c", set()
+    for term in candidates(joint, other, rng):
+        for entries in ((name,) for name in term.families) if term.families else (term.terms,):
+            found = told(identified, misfits=(lacking(joint, term, entries),))
+            setting = setting_of(found.misfits[0], found)
+            (finding,) = misfit_findings(found)
+            if not setting:
+                assert term.name in ("coulomb", "windup", "drift")
+                assert finding.message.endswith(term.advice)
+                continue
+            job = read(setting)
+            assert all(line in finding.message for line in setting.split("\n"))
+            if term.coupled:
+                (made,) = job.couplings
+                assert dict(made.ratios) == {joint: 1.0, other: term.ratio}
+            else:
+                assert job.drives == {joint: entries}
+            seen.add(term.name.split()[0])
+    assert seen == {
+        "stribeck", "presliding", "power", "cubic", "asymmetric", "load", "periodic", "linear",
+        "counterbalance", "ripple", "coupling",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("code", NAMED)
+def test_a_named_cause_has_its_step_and_no_guess_beside_it(identified, code, rng):
+    """A joint that is also badly predicted is not said to have a spring or a round gear."""
+    joint = "elbow_joint"
+    own = [c for c in candidates(joint, "wrist_1_joint", rng) if c.code == code]
+    entries = {c.name: c.families[:1] or c.terms for c in own}
+    lacks = [lacking(joint, c, entries[c.name]) for c in own[:2]]
+    evidence = {"turned": 2.0} if code == "counterbalance" else {}
+    found = told(
+        identified, warning("unexplained_torque"), warning(code, **evidence), misfits=tuple(lacks)
+    )
+    steps = next_steps(found, JOB)
+    assert not any(_guesses(step, joint) for step in steps)
+    assert sum(step.words.startswith(NAMED[code]) for step in steps) == 1
+    blocks = [block for step in steps for block in step.blocks]
+    if code in ("counterbalance", "friction_shape", "spring"):
+        (drives,) = [block for block in blocks if block.startswith("[drives]")]
+        wanted = {
+            "counterbalance": ("harmonics1",),
+            "friction_shape": ("stribeck",),
+            "spring": ("spring", "harmonics2"),
+        }
+        assert read(drives).drives == {joint: wanted[code]}
+    if code == "coupling":
+        (made,) = read(blocks[0]).couplings
+        assert set(dict(made.ratios)) == {joint, "wrist_1_joint"}
+    alone = told(identified, warning("unexplained_torque"))
+    assert any(_guesses(step, joint) for step in next_steps(alone, JOB))
+
+
+def _guesses(step, joint):
+    return "gear that is not round" in step.words and joint in step.words
+
+
+def test_a_flag_that_was_given_is_stated_anew_and_not_twice():
+    origin = Origin(
+        ("arm.urdf", "a.csv", "--lock", "j6=0", "--lock=j7=1", "--torque-delay", "0.01",
+         "--validate", "b.csv"), "out",
+    )  # fmt: skip
+    again = origin.again("--lock", "j6=0.1824", "--torque-delay", "0.02", "--validate", "NEW.csv")
+    assert again == (
+        "robotid identify arm.urdf a.csv --lock=j7=1 --validate b.csv --lock j6=0.1824 "
+        "--torque-delay 0.02 --validate NEW.csv --out out"
+    )
+    assert "j7=1" not in origin.again("--lock", "j7=2").replace("j7=2", "")
+
+
+def test_a_locked_joint_is_stated_where_the_log_has_it(identified):
+    there = warning("locked_position", "a.csv: j6", median=0.18241, stated=0.0)
+    (step, *_) = next_steps(told(identified, there), FLAGS)
+    assert step.blocks == (
+        "robotid identify arm.urdf first.csv --cutoff 8 --lock j6=0.1824 --out out",
+    )
 
 
 def test_a_result_without_trouble_is_measured_used_and_played(identified):

@@ -1,5 +1,6 @@
 """Terms that a drive's model lacks are named on their joint, with their share; others are not."""
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,9 @@ from robotid.commands.logs import survey_logs
 from robotid.doctor.diagnosis import check_logs
 from robotid.findings import Finding
 from robotid.identification import misfit
+from robotid.identification.candidates import CANDIDATES
 from robotid.identification.findings import fit_findings
-from robotid.identification.misfit import find_misfits, misfit_findings, settled
+from robotid.identification.misfit import counterbalanced, find_misfits, misfit_findings, settled
 from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import Recordings
 from robotid.identification.settings import EstimatorSettings
@@ -22,6 +24,7 @@ from robotid.identification.verdict import doubts_of
 from robotid.logs.read import write_log
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.drives import Harmonic
 from robotid.robot.model import RobotModel
 
 PAN, LIFT, ELBOW = "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"
@@ -53,7 +56,8 @@ def rmse(found, joint):
 
 @pytest.mark.parametrize(
     ("effect", "joint"),
-    [("stribeck", 2), ("saturating", 0), ("load", 1), ("periodic", 3), ("ripple", 2), ("spring", 2),
+    [("stribeck", 2), ("saturating", 0), ("load", 1), ("periodic", 3), ("ripple", 2),
+     ("harmonic drive", 1), ("spring", 2),
      ("counterbalance", 4), ("windup", 1), ("drift", 5)],
 )  # fmt: skip
 def test_a_missing_term_is_named_first_on_its_joint_with_its_share(ur5, clean, effect, joint):
@@ -111,9 +115,104 @@ def test_coulomb_friction_that_was_left_out_is_asked_for(ur5):
         assert "Set friction = 'viscous+coulomb' in [model]" in finding.message
 
 
+def test_a_ripple_is_named_with_its_periods_a_turn_and_the_terms_that_predict_it(ur5, tmp_path):
+    paths = [tmp_path / name for name in ("fit.csv", "kept.csv")]
+    for k, path in enumerate(paths):
+        write_log(log_with(ur5, 2, "harmonic drive", 1, part=k), path)
+    table = {
+        "urdf": ur5.tree.path,
+        "identification": [{"log": str(paths[0])}],
+        "validation": [{"log": str(paths[1])}],
+        "output": {"report": False},
+    }
+
+    def run(drives):
+        job = job_from_settings(table | tomllib.loads(drives), "job", tmp_path)
+        found, _ = run_job(job, tmp_path / "out")
+        (metrics,) = found.predictions.values()
+        return found, metrics.per_joint[LIFT].relative_error_pct
+
+    found, error = run("")
+    named, *_ = found.misfits
+    assert (named.joint, named.term.name) == (LIFT, "ripple 40")
+    pasted = misfit.setting_of(named, found)
+    assert pasted == (
+        f'[drives]\n{LIFT} = [{{ term = "Harmonic", order = 40.0, is_sine = false }}, '
+        '{ term = "Harmonic", order = 40.0, is_sine = true }]'
+    )
+    better, less = run(pasted)
+    assert error > 10.0
+    assert less < 4.0  # the torque's noise is 2 %
+    assert better.misfits == ()
+
+
+def test_a_setting_keeps_what_the_drive_has_already(ur5):
+    friction = {ELBOW: "load+harmonics1", "*": "none"}
+    found = fitted(ur5, [log_with(ur5, 1, "load", 2, duration=12.0)], friction=friction)
+    stated = Harmonic(order=9.0)
+    own = {**found.model.layout.own, ELBOW: (*found.model.layout.own[ELBOW], stated)}
+    found = replace(found, model=found.model.with_terms(own))
+    line = misfit.with_entries(found, ELBOW, ["harmonics2", "stribeck"])
+    assert tomllib.loads(line)[ELBOW] == [
+        {"term": "Harmonic", "order": 9.0, "is_sine": False}, "load", "harmonics2", "stribeck",
+    ]  # fmt: skip
+    assert misfit.with_entries(found, LIFT, ["load"]) == f'{LIFT} = ["load"]'
+
+
+def test_a_family_is_advised_only_where_the_joint_turned_far_enough_for_it(ur5):
+    sample = misfit.take_sample(identified(ur5, 1, "spring", 2, duration=12.0))
+    (candidate,) = (c for c in CANDIDATES if c.name == "counterbalance")
+
+    def advised(turned, term=candidate):
+        q = np.linspace(0.0, turned, sample.rows)
+        rows = np.append(q, np.full(len(sample.motions[2].q) - sample.rows, 99.0))  # of others
+        motions = (*sample.motions[:2], replace(sample.motions[2], q=rows), *sample.motions[3:])
+        return misfit._entries(replace(sample, motions=motions), 2, term)
+
+    assert [advised(x) for x in (3.5, 3.4, 0.7, 0.6)] == [
+        ("harmonics2",), ("harmonics1",), ("harmonics1",), ("spring",)
+    ]  # fmt: skip
+    (periodic,) = (c for c in CANDIDATES if c.name == "periodic")
+    assert (advised(3.5, periodic), advised(3.0, periodic)) == (("harmonics4",), ())
+
+
 @pytest.mark.parametrize("memory", [0, 30, 100])
 def test_noise_of_any_colour_is_no_term(ur5, memory):
     assert misfits(identified(ur5, 5, noise=0.03, memory=memory)) == ()
+
+
+def test_a_counterbalance_is_named_taken_into_the_model_and_no_error(ur5):
+    """40 N m at the lift: gravity of the URDF's is held by the other joints."""
+    logs = [log_with(ur5, 3, "balancing", 1, part=k) for k in (0, 1)]
+    said = [f for f in check_logs(ur5, logs[:1], validation=logs[1:]) if f.severity != "note"]
+    assert {(f.code, f.severity) for f in said} == {("counterbalance", "warning")}
+    assert said[0].where == f"run0.csv: {LIFT}"
+    assert f'Add it to the model: {LIFT} = ["harmonics1"] in [drives]' in said[0].message
+    found = identify(ur5, logs[:1], validation=logs[1:])
+    (choice,) = (c for c in found.drives if c.families)
+    assert (choice.joint, choice.families) == (LIFT, ("harmonics1",))
+    known = [f for f in found.findings if f.code == "counterbalance"]
+    assert {f.severity for f in known} == {"note"}
+    assert "The model has it: cos1, sin1 of shoulder_lift_joint" in known[0].message
+    assert found.verdict.status == "good"
+    for name, size in (("cos1", 40.0 * np.cos(0.1)), ("sin1", -40.0 * np.sin(0.1))):
+        k = found.model.layout.names.index(f"{LIFT}.{name}")
+        assert abs(found.standard[k] - size) < 2.6 * found.standard_error[k], name
+        assert found.standard_error[k] < 8.0
+    stated = identify(ur5, logs[:1], validation=logs[1:], friction={LIFT: "load", "*": "none"})
+    (warned, _) = [f for f in stated.findings if f.code == "counterbalance"]
+    assert warned.severity == "warning"
+    assert stated.verdict.joints[LIFT].status == "usable"
+
+
+def test_a_counterbalance_of_a_validation_log_alone_has_no_part_in_the_model():
+    on_joint = [
+        Finding("counterbalance", "warning", f"{log}: {joint}", "", {"turned": turned})
+        for log, joint, turned in (("a.csv", LIFT, 2.0), ("b.csv", ELBOW, 2.0), ("a.csv", PAN, 0.3))
+    ]
+    other = Finding("spring", "warning", f"a.csv: {ELBOW}", "", {"turned": 2.0})
+    found = counterbalanced([*on_joint, other], ["a.csv"])
+    assert found == {LIFT: "harmonics1", PAN: "spring"}
 
 
 def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(ur5):
@@ -122,7 +221,7 @@ def test_a_coupling_is_named_on_both_joints_with_the_setting_to_copy(ur5):
     assert [(f.code, f.severity, f.where) for f in (one, other)] == [
         ("coupling", "warning", joint) for joint in pair
     ]
-    assert "Add [[coupling]] to the job with ratios" in one.message
+    assert 'Add [[coupling]] to the job with name = "wrist_2_joint_wrist_3_joint"' in one.message
     assert "ratios = { wrist_2_joint = 1.0, wrist_3_joint = 1.0 }" in one.message
     assert one.evidence["share_pct"] > 90
 
@@ -216,7 +315,7 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(ur5):
 
 @pytest.mark.parametrize(
     ("effect", "seed", "size", "guess"),
-    [("counterbalance", 5, 3.0, "current_for_torque"), ("periodic", 1, 2.0, "urdf_mismatch")],
+    [("counterbalance", 5, 3.0, "current_for_torque"), ("periodic", 1, 2.0, "counterbalance")],
 )
 def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, size, guess):
     logs = [log_with(ur5, seed, effect, 1, part=k, size=size) for k in (0, 1)]
@@ -229,7 +328,8 @@ def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, 
         if f.severity != "note"
     }
     assert EFFECTS[effect].code in said
-    assert not said & {"urdf_mismatch", "current_for_torque", "unexplained_torque"}
+    assert not said & {"counterbalance", "urdf_mismatch", "current_for_torque"}
+    assert "unexplained_torque" not in said
 
 
 def test_logs_in_files_are_judged_by_the_stretches_at_hand(ur5, tmp_path):
