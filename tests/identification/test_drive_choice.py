@@ -21,18 +21,19 @@ from robotid.commands.job import job_from_settings
 from robotid.commands.logs import survey_logs
 from robotid.exceptions import NotConvergedError, SettingsError
 from robotid.export.urdf import load_identified, write_urdf
-from robotid.identification import pipeline
+from robotid.identification import drive_choice, pipeline
 from robotid.identification.bands import friction_curve
-from robotid.identification.drive_choice import _chance, wanted_families
+from robotid.identification.drive_choice import _chance, choose_drives, wanted_families
+from robotid.identification.misfit import take_sample
 from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import Recordings
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.read import write_log
 from robotid.logs.signals import process
 from robotid.regressor.base_parameters import structural_mapping
-from robotid.regressor.memory import remember
+from robotid.regressor.memory import drive_motion_along, remember
 from robotid.regressor.prediction import predict
-from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck
+from robotid.robot.drives import AUTO, FAMILIES, DriveMotion, Harmonic, LoadFriction, Stribeck, Tanh
 
 SEED, REACH = 3, 1.5  # of the motion: the elbow turns more than half a turn
 SURE = 2.6  # standard errors, of a few hundred figures that are looked at
@@ -44,6 +45,7 @@ CASES = {
     "tanh": ((0.2,), (4.0,)),
     "presliding": ((0.02,), (4.0,)),
     "lag": ((), (0.01,)),
+    "harmonics1": ((), (2.0, 1.5)),
     "harmonics2": ((), (0.0, 0.0, 2.0, 1.5)),
     "harmonics4": ((), (0.0, 0.0, 2.0, 1.5, 1.0, -1.0, 0.5, -1.5)),
     "asymmetric": ((), (1.5,)),
@@ -151,6 +153,107 @@ def test_a_robot_of_viscous_and_coulomb_friction_gets_no_more(plain):
         assert [c.joint for c in found.drives] == list(JOINTS)
         assert chosen(found) == {}
         assert found.model.layout == plain.layout
+
+
+@pytest.fixture(scope="module")
+def rising(plain):
+    """Friction that sets in over most of the speeds: a hook of Stribeck's fits nearly as well."""
+    terms = [Tanh(speed=0.6 * SEEN["v"][1])]
+    true, pi = driven(plain, {ELBOW: terms}, {f"{ELBOW}.tanh": 14.0})
+    return found_in(plain, [driven_log(true, pi, SEED, reach=REACH, noise=0.03)])
+
+
+def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
+    assert chosen(rising) == {ELBOW: ("tanh",)}
+    (choice,) = (c for c in rising.drives if c.families)
+    last = {x.families[-1]: x for x in choice.tried if len(x.families) == 1}
+    assert last["tanh"].is_taken
+    assert not last["stribeck"].is_taken
+    # within 2 % of the squared residual
+    first = choice.tried[0].held_out_error_pct
+    shares = [(last[name].held_out_error_pct / first) ** 2 for name in ("tanh", "stribeck")]
+    assert abs(shares[0] - shares[1]) < 0.02
+    assert last["stribeck"].chance < 0.015
+    assert not any(shape.is_at_bound for shape in choice.shapes)
+    stated = found_in(plain, rising_logs(rising), friction={ELBOW: "stribeck", "*": "none"})
+    (other,) = (c for c in stated.drives if c.families)
+    assert other.shapes[0].is_at_bound
+    assert other.grown[f"{ELBOW}.coulomb"] > 10.0 > choice.grown[f"{ELBOW}.coulomb"]
+    (said,) = [f for f in stated.findings if f.code == "correlated_terms"]
+    assert (said.severity, said.where) == ("note", ELBOW)
+    assert "elbow_joint: coulomb and stribeck are strongly correlated (r = -0.9" in said.message
+    assert said.evidence["grown"] == max(other.grown.values())
+
+
+def rising_logs(found):
+    return [evaluation.recording.log for evaluation in found.fitted]
+
+
+def test_a_standard_error_grows_as_that_of_least_squares_does(plain, cases):
+    """Beside the columns of a term, and of its shape's derivative."""
+    found = found_in(plain, [cases("stribeck")[2]], friction="none")
+    sample = take_sample(found, is_steady=False)
+    j, speed = sample.joints.index(ELBOW), 0.1
+    own = [drive_motion_along(found.model, found.fitted[0].recording.trajectory).of(j)]
+    plain_parts = {
+        name: sample.U[:, k]
+        for k, name in enumerate(found.mapping.base_names)
+        if name.startswith(ELBOW)
+    }
+    drive = drive_choice._Drive(j, False, tuple(own), sample.taken, SEEN, plain_parts)
+    family = FAMILIES["stribeck"]
+    grown = drive_choice._grown(sample, drive, [(family, [speed])])
+    Z = [drive.columns([Stribeck(speed=speed * x, seen=SEEN["v"])]) for x in (1.0, 1.001)]
+    theta = 3.0  # about: it scales the derivative's column only
+    rows, b = sample.rows, sample.W.shape[-1]
+    columns = np.zeros((*sample.r.shape, 2))
+    columns[:, j] = sample.weight[:, [j]] * np.hstack([Z[0], theta * (Z[1] - Z[0])])
+    W = sample.W[:rows].reshape(-1, b)
+    X = np.hstack([W, columns[:rows].reshape(-1, 2)])
+    before = np.linalg.inv(W.T @ W + np.eye(b))
+    prior = np.diag(np.append(np.ones(b), np.zeros(2)))
+    after = np.linalg.inv(X.T @ X + prior)[:b, :b]
+    assert set(grown) == set(plain_parts)
+    for name, u in plain_parts.items():
+        wanted = np.sqrt((u @ after @ u) / (u @ before @ u))
+        assert grown[name] == pytest.approx(wanted, rel=0.02), name
+    assert grown[f"{ELBOW}.coulomb"] > 1.5
+
+
+def test_a_counterbalance_that_is_known_is_in_the_model_before_others_are_tried(plain, cases):
+    log = cases("load")[2]
+    fit = found_in(plain, [log], friction="none")
+    first = {ELBOW: "harmonics1"}
+    wanted = dict.fromkeys(JOINTS)
+    choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
+    assert choices[ELBOW].families == ("harmonics1", "load")
+    assert choices[ELBOW].tried[0].families == ("harmonics1",)
+    assert choices[ELBOW].tried[0].is_taken
+    assert choices[LIFT].families == ()
+    # what explains far more of the same kind replaces it
+    fit = found_in(plain, [cases("harmonics4")[2]], friction="none")
+    choices = {c.joint: c for c in choose_drives(fit, wanted, first)}
+    assert choices[ELBOW].families == ("harmonics4",)
+    assert [x.families for x in choices[ELBOW].tried if x.is_taken] == [
+        ("harmonics1",), ("harmonics4",)
+    ]  # fmt: skip
+    fixed = choose_drives(fit, {**wanted, ELBOW: ("load",)}, first)
+    assert {c.joint: c.families for c in fixed}[ELBOW] == ("load",)
+
+
+def test_segments_are_alike_within_a_slack_or_their_scatter():
+    best, other = np.array([1.0, 2.0, 3.0]), np.array([1.5, 2.0, 2.8])
+    more = np.sqrt(3) * np.std(other - best, ddof=1)
+    assert more > 0.3  # the sum of the differences
+    assert drive_choice._is_alike(best, other, 0.0)
+    assert not drive_choice._is_alike(best, best + 0.1, 0.29)
+    assert drive_choice._is_alike(best, best + 0.1, 0.31)
+
+
+def test_a_grid_of_a_wide_range_has_its_end_too():
+    np.testing.assert_allclose(drive_choice._sizes(0.01, 1.0), np.geomspace(0.01, 1.0, 6))
+    wide = drive_choice._sizes(0.01, 2.0)
+    np.testing.assert_allclose(wide, [*np.geomspace(0.01, 1.0, 6), 2.0])
 
 
 def test_harmonics_are_for_joints_that_turn_far_enough(plain):
