@@ -22,6 +22,7 @@ __all__ = ["Origin", "Step", "next_steps"]
 _MOST = 3  # steps
 _NAMED = 4  # joints that a step names
 _NEW = "NEW.csv"
+_PLAIN = "viscous+coulomb"
 _APPENDED = ("--validate",)  # flags that add to what was stated before
 
 
@@ -267,6 +268,8 @@ def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     blocks = [*couplings.values(), *(["\n".join(["[drives]", *lines])] if lines else [])]
     what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
     words = f"Add to the model of {_named(causes)} what its drive lacks: {what}."
+    if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
+        return Step(words, origin.stating("[model]", f'friction = "{_PLAIN}"', "--friction", _PLAIN))
     if not blocks:
         words = (
             f"Leave out the rows in which {_named(causes)} shows what no term of the model is "

@@ -34,7 +34,7 @@ _OF_MODEL = ("none", "viscous", "coulomb")  # named in ``friction``, and terms o
 _GRID = 6  # sizes of a shape that are tried, over its bounds
 _SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
 _FAMILIES = 4  # chosen for a joint, at most
-_CHANCE = 0.015  # that a family is chosen that is not there, each time that one is tried
+_CHANCE = 0.01  # that a family is chosen that is not there, each time that one is tried
 _LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
 _SEEN = 0.006  # of the torque: a gain that is smaller may be of how signs pass the filter
 _ALIKE = 0.02  # of the squared residual, within which two families explain alike
@@ -362,6 +362,8 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     chosen = list(range(len(known)))
     doubted: list[tuple[Family, list[float]]] = []
     before = every.left(chosen)
+    if known and not before.sum() < (1 - _LEAST) * every.left([]).sum():
+        return _auto(sample, drive)  # held-out segments do not show it
     names = tuple(family.name for family, _ in known)
     tried = [Tried(names, _percent(before, torque), 1.0, True)]
     for _ in range(_FAMILIES):

@@ -137,9 +137,13 @@ def test_a_result_names_recordings_with_their_windows_and_commands_that_work(arm
     assert "\nnote: " not in said
     assert said.count("\x1b") == 0
     commands = re.findall(r"^ {7}(robotid .*)$", said, re.MULTILINE)
-    (replay,) = [shlex.split(line) for line in commands if " replay " in line]
+    again, _ = [shlex.split(line) for line in commands]
+    assert again[again.index("--friction") + 1] == "viscous+coulomb"
+    assert main([*again[1:], "--no-report", "--out", str(out)]) == 0
+    assert "\nverdict: good" in capsys.readouterr().out
     page = arm_logs / "page.html"
-    assert main([*replay[1:], "--html", str(page)]) == 0
+    replay = ["replay", ARM, str(arm_logs / "keep.csv"), str(out), "--html", str(page)]
+    assert main(replay) == 0
     assert page.stat().st_size > 50_000
 
 
