@@ -47,7 +47,7 @@ _SCALES = np.logspace(-3, 3, 61)
 _HEAVY = 0.08  # payload over the arm's mass that is surely more than the links' errors
 _FLOOR = 1e-3  # an unexplained share below this is as good as none
 _FOLLOWED = 0.5  # times the unexplained share falls with gravity of a torque that follows it
-_LIFTS = 0.1  # of the largest gravity torque: a joint with less has no counterbalance
+_LIFTS = 0.3  # of the largest gravity torque: a joint with less has no counterbalance
 _CANCELS, _MOST_CANCELLED = 0.2, 1.6  # of its gravity, between which a counterbalance takes
 _MISMATCH = 7.5  # sum of squares of the links' errors, in standard deviations, that is too much
 

@@ -269,7 +269,9 @@ def _terms(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
     what = listed(dict.fromkeys(_CAUSES[cause.code] for cause in causes))
     words = f"Add to the model of {_named(causes)} what its drive lacks: {what}."
     if not blocks and any(m.term.name == "coulomb" and m.term.code in codes for m in found.misfits):
-        return Step(words, origin.stating("[model]", f'friction = "{_PLAIN}"', "--friction", _PLAIN))
+        return Step(
+            words, origin.stating("[model]", f'friction = "{_PLAIN}"', "--friction", _PLAIN)
+        )
     if not blocks:
         words = (
             f"Leave out the rows in which {_named(causes)} shows what no term of the model is "

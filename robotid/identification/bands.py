@@ -1,6 +1,7 @@
 """How far predicted torques can be trusted: their bands from the covariance of the parameters."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import ArrayLike
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.identification.model_error import shape_slope
+from robotid.identification.candidates import JointMotion
+from robotid.identification.model_error import open_torques
 from robotid.logs.data import Trajectory, suggestion
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.friction_projection import DriveMoments, drive_moments
@@ -19,20 +21,24 @@ from robotid.robot.drives import DriveMotion
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
+    from robotid.identification.evaluation import Evaluation
     from robotid.identification.pipeline import Identification
 
 __all__ = [
     "REACH",
     "FrictionCurve",
     "TorqueBand",
+    "expected_band",
     "fitted_moments",
     "friction_curve",
+    "recording_bands",
     "torque_band",
     "usual_friction",
 ]
 
 #: Standard deviations that a 95 % band reaches.
 REACH = 1.96
+_HELD = 0.95
 _SPEEDS = 20  # of a friction curve, either way
 _MOST = 500  # samples that a band is computed at, spread over the trajectory
 
@@ -44,7 +50,7 @@ class TorqueBand:
     Attributes:
         samples: Numbers of these samples, shape (k,), int.
         parameters: From the uncertainty of the parameters, shape (k, n_rows) [N m, N].
-        noise: From what the model leaves of the torque, shape (n_rows,) [N m, N].
+        noise: From what the model leaves of the torque beside it, shape (n_rows,) [N m, N].
     """
 
     samples: Array
@@ -71,9 +77,17 @@ class TorqueBand:
 
 
 def torque_band(
-    model: RobotModel, mapping: BaseMapping, trajectory: Trajectory, covariance: Array, noise: Array
+    model: RobotModel,
+    mapping: BaseMapping,
+    trajectory: Trajectory,
+    covariance: Array,
+    noise: Array,
+    errors: Callable[[Array], Sequence[tuple[Array, Array]]] = lambda rows: (),
 ) -> TorqueBand:
-    """Return the band of predicted torques, at up to 500 samples: the root of diag(W C W^T).
+    """Return the band of predicted torques, at up to 500 samples.
+
+    Its variance is diag(W C W^T) + sum (W x + z)^2 for what errs at once in base parameters, by x,
+    and in torque, by z.
 
     Args:
         model: The robot.
@@ -81,13 +95,71 @@ def torque_band(
         trajectory: N samples.
         covariance: Of the base parameters, shape (b, b), finite.
         noise: Standard deviation of the torque's residual, shape (n_rows,) [N m, N].
+        errors: Pairs x, shape (b,), and z, shape (k, n_rows), at k samples of the trajectory.
     """
     count = len(trajectory.t)
     samples = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int))
     W = trajectory_regressor(model, trajectory.at(samples))[:, mapping.independent]
     variance = np.einsum("ij,ij->i", W @ covariance, W)
+    for x, z in errors(samples):
+        variance += (W @ x + z.ravel()) ** 2
     std = np.sqrt(np.maximum(variance, 0.0)).reshape(len(samples), -1)
     return TorqueBand(samples, std, np.asarray(noise))
+
+
+def expected_band(found: "Identification", evaluation: "Evaluation") -> TorqueBand:
+    """Return the band of a recording's torque by the noise of the fit, without its residual.
+
+    Args:
+        found: The identification.
+        evaluation: The recording.
+    """
+    K, motion = found.mapping.K, evaluation.recording.trajectory
+    moves = np.array([term.moves for term in found.open_terms]).reshape(-1, K.shape[1])
+    covariance = K @ (found.standard_covariance - moves.T @ moves) @ K.T
+
+    def errors(rows: Array) -> list[tuple[Array, Array]]:
+        return list(zip(moves @ K.T, open_torques(found, evaluation, rows), strict=True))
+
+    sigma = found.estimate.sigma
+    return torque_band(found.model, found.mapping, motion, covariance, sigma, errors)
+
+
+def recording_bands(found: "Identification") -> tuple[TorqueBand, ...]:
+    """Return the band of each recording, fitted ones first, as their residuals show them.
+
+    Beside the parameters' part a band has the noise with which it holds 95 % of the torques of all
+    recordings of its kind, fitted or kept: of kept ones that is what the model misses of motion it
+    has not seen, and a new motion is held as these are (split conformal prediction, Lei et al.
+    2018, doi:10.1080/01621459.2017.1307116, with the parameters' part as the lower end).
+
+    Args:
+        found: The identification.
+    """
+    evaluations = (*found.fitted, *found.validation)
+    bands = [expected_band(found, evaluation) for evaluation in evaluations]
+    is_fitted = [k < len(found.fitted) or e.is_refitted for k, e in enumerate(evaluations)]
+    own: dict[bool, list[tuple[TorqueBand, Evaluation]]] = {True: [], False: []}
+    for kind, band, evaluation in zip(is_fitted, bands, evaluations, strict=True):
+        own[kind].append((band, evaluation))
+    noise = {kind: _residual_noise(pairs) for kind, pairs in own.items() if pairs}
+    pairs = zip(bands, is_fitted, strict=True)
+    return tuple(replace(band, noise=noise[kind]) for band, kind in pairs)
+
+
+def _residual_noise(own: Sequence[tuple[TorqueBand, "Evaluation"]]) -> Array:
+    """Return the noise with which bands hold 95 % of what they predict, shape (n_rows,)."""
+    noise = own[0][0].noise.copy()
+    rows = []
+    for band, e in own:
+        residual = e.recording.trajectory.tau - e.torques["estimate"]
+        rows.append((band.parameters, residual[band.samples], e.recording.mask[band.samples]))
+    std, residual, mask = (np.concatenate(part) for part in zip(*rows, strict=True))
+    needed = (residual / REACH) ** 2 - std**2
+    for j, used in enumerate(mask.T.astype(bool)):
+        if used.any():
+            noise[j] = np.sqrt(max(np.quantile(needed[used, j], _HELD), 0.0))
+    return noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,16 +291,13 @@ def friction_curve(
     ]
     X = np.column_stack([none, *(term.column(motion) for _, term in own)])[:, 1:]
     k = [k for k, _ in own]
-    variance = np.einsum("ij,jk,ik->i", X, found.standard_covariance[np.ix_(k, k)], X)
-    for choice in found.drives:
-        if choice.joint == joint and choice.shape_moves is not None:
-            # shapes bend the curve, too, beside moving its parameters
-            moved, C = X @ choice.shape_moves[k], np.array(choice.shape_covariance)
-            bent = moved + np.column_stack(
-                [shape_slope(found, choice, s, motion) for s in range(len(C))]
-            )
-            variance += np.einsum("ij,jk,ik->i", bent, C, bent)
-            variance -= np.einsum("ij,jk,ik->i", moved, C, moved)
+    moves = np.array([term.moves[k] for term in found.open_terms]).reshape(-1, len(k))
+    C = found.standard_covariance[np.ix_(k, k)] - moves.T @ moves
+    variance = np.einsum("ij,jk,ik->i", X, C, X)
+    for term, moved in zip(found.open_terms, moves @ X.T, strict=True):
+        if term.joint == joint:  # its own torque adds to what it moves
+            moved = moved + term.torque(motion, JointMotion.steady(motion))
+        variance += moved**2
     return FrictionCurve(v, X @ found.standard[k], np.sqrt(np.maximum(variance, 0.0)), load)
 
 

@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.robot.drives import COUNTERBALANCE, DriveTerm, Harmonic
+from robotid.robot.drives import COUNTERBALANCE, DriveMotion, DriveTerm, Harmonic
 
 __all__ = ["CANDIDATES", "Candidate", "JointMotion", "couplings", "ripples"]
 
@@ -35,6 +36,7 @@ class JointMotion:
         time: Time since the recording began, over the longest recording's, shape (N,).
         passes: Cut-off of the filter of torques [Hz]; infinite without one.
         others: The joints before and after it, by name.
+        scale: The motion whose usual speeds, ways and loads scale columns; None: this one.
     """
 
     q: Array
@@ -46,6 +48,18 @@ class JointMotion:
     time: Array
     passes: float = np.inf
     others: dict[str, "JointMotion"] = field(default_factory=dict)
+    scale: "JointMotion | None" = None
+
+    @classmethod
+    def steady(cls, motion: DriveMotion) -> "JointMotion":
+        """Return the motion of a joint that has moved steadily for long, the others at rest.
+
+        Args:
+            motion: How its drive moves, arrays of shape (N,).
+        """
+        none, far = np.zeros_like(motion.v), np.full_like(motion.v, np.inf)
+        m = motion
+        return cls(m.q, m.v, m.a, m.direction, m.load, travelled=far, time=none)
 
     def at(self, rows: slice) -> "JointMotion":
         """Return the motion in some of the rows, without the other joints.
@@ -68,7 +82,7 @@ class Candidate:
         name: Its name.
         code: Code of the finding that says it is missing.
         columns: What its c parameters multiply in N rows, shape (N, c). Scales in it are those of
-            the motion given, so that all rows are to be asked for at once.
+            the motion given, unless that names another.
         meaning: What it is, in words of a finding.
         advice: What the user can do beside adding it to the model; empty if nothing.
         families: Friction of a job that has it, see ``FAMILIES``; advised is the first for which
@@ -99,19 +113,19 @@ class Candidate:
     is_imitated: bool = False
 
 
-def _usual(x: Array) -> float:
-    """Return the root mean square of a signal, 1 if it is 0 throughout."""
-    return float(np.sqrt(np.mean(x**2))) or 1.0
+def _usual(m: JointMotion, of: Callable[[JointMotion], Array]) -> float:
+    """Return the root mean square of a signal of the motion that scales, 1 if it is 0 there."""
+    return float(np.sqrt(np.mean(of(m.scale or m) ** 2))) or 1.0
 
 
 def _stribeck(m: JointMotion) -> Array:
-    v = np.abs(m.v)[:, None] / (np.array(_STRIBECK) * _usual(m.v))
+    v = np.abs(m.v)[:, None] / (np.array(_STRIBECK) * _usual(m, attrgetter("v")))
     falling: Array = m.direction[:, None] * np.exp(-v)
     return falling
 
 
 def _presliding(m: JointMotion) -> Array:
-    setting_in: Array = np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m.v)))
+    setting_in: Array = np.tanh(m.v[:, None] / (np.array(_PRESLIDING) * _usual(m, attrgetter("v"))))
     return setting_in
 
 
@@ -160,9 +174,9 @@ def ripples(m: JointMotion, weight: Array, r: Array) -> tuple[Candidate, ...]:
 
 
 def _windup(m: JointMotion) -> Array:
-    way = m.travelled[:, None] / (np.array(_WINDUP) * _usual(m.travelled))
+    way = m.travelled[:, None] / (np.array(_WINDUP) * _usual(m, attrgetter("travelled")))
     taken_up = m.direction[:, None] * np.exp(-way)
-    return np.column_stack([taken_up, np.tanh(m.load / (_TURNED * _usual(m.load)))])
+    return np.column_stack([taken_up, np.tanh(m.load / (_TURNED * _usual(m, attrgetter("load"))))])
 
 
 def _drift(m: JointMotion) -> Array:
@@ -170,10 +184,17 @@ def _drift(m: JointMotion) -> Array:
     return drifting
 
 
-def _coupled(m: JointMotion, other: JointMotion, ratio: float) -> Array:
+def _coupled(m: JointMotion, other: str, ratio: float) -> Array:
     """Return what a drive that turns with both joints, w = v + ratio v', adds to the first."""
-    w = m.v + ratio * other.v
-    return np.column_stack([other.a, other.v, np.tanh(w / (_STRIBECK[0] * _usual(w)))])
+
+    def turned(motion: JointMotion) -> Array:
+        return motion.v + ratio * motion.others[other].v
+
+    if other not in m.others:  # it is at rest
+        none = np.zeros_like(m.v)
+        return np.column_stack([none, none, np.tanh(m.v / (_STRIBECK[0] * _usual(m, turned)))])
+    beside, w = m.others[other], turned(m)
+    return np.column_stack([beside.a, beside.v, np.tanh(w / (_STRIBECK[0] * _usual(m, turned)))])
 
 
 _FRICTION = "friction that is not viscous and Coulomb"
@@ -257,11 +278,11 @@ def couplings(motion: JointMotion) -> tuple[Candidate, ...]:
     return tuple(
         Candidate(
             f"coupling {ratio:+g} {name}", "coupling",
-            partial(_coupled, other=other, ratio=ratio),
+            partial(_coupled, other=name, ratio=ratio),
             f"a drive that turns with {name}, too",
             coupled=name,
             ratio=ratio,
         )
-        for name, other in motion.others.items()
+        for name in motion.others
         for ratio in (1.0, -1.0)
     )  # fmt: skip

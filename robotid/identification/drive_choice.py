@@ -104,7 +104,6 @@ class DriveChoice:
             viscous and Coulomb friction and offset, by name.
         doubted: Terms that held-out stretches favour, but not beyond chance: they were not taken,
             and errors count what they would move.
-        shape_moves: By how much each shape moves standard parameters, shape (p, k).
     """
 
     joint: str
@@ -117,7 +116,6 @@ class DriveChoice:
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     grown: Mapping[str, float] = field(default_factory=dict)
     doubted: tuple[DriveTerm, ...] = ()
-    shape_moves: Array | None = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what was tried, taken and found, as plain values."""
@@ -362,8 +360,6 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
     chosen = list(range(len(known)))
     doubted: list[tuple[Family, list[float]]] = []
     before = every.left(chosen)
-    if known and not before.sum() < (1 - _LEAST) * every.left([]).sum():
-        return _auto(sample, drive)  # held-out segments do not show it
     names = tuple(family.name for family, _ in known)
     tried = [Tried(names, _percent(before, torque), 1.0, True)]
     for _ in range(_FAMILIES):

@@ -47,6 +47,7 @@ __all__ = [
     "chance",
     "counterbalanced",
     "find_misfits",
+    "joint_motions",
     "misfit_findings",
     "setting_of",
     "settled",
@@ -98,6 +99,8 @@ class Misfit:
         unit: Unit of the size.
         error: Residual that base parameters leave without the term, over the torque [-].
         shift: By how much it would move base parameters over their spread, shape (b,).
+        theta: The parameters of its columns, shape (c,).
+        scale: The motion that scales its columns.
         entries: What a job's [drives] says of the joint to add it; none if nothing does.
     """
 
@@ -111,7 +114,18 @@ class Misfit:
     unit: str
     error: float
     shift: Array
+    theta: Array
+    scale: JointMotion
     entries: tuple[str | DriveTerm, ...] = ()
+
+    def torque(self, motion: JointMotion) -> Array:
+        """Return the torque of the term along a motion of the joint, shape (N,) [N m or N].
+
+        Args:
+            motion: The motion, N rows.
+        """
+        torque: Array = self.term.columns(replace(motion, scale=self.scale)) @ self.theta
+        return torque
 
     @property
     def matters(self) -> bool:
@@ -353,7 +367,7 @@ def take_sample(identification: "Identification", *, is_steady: bool = True) -> 
     return Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
-        motions=_joint_motions([e.recording for e, _ in parts], rows, load, model),
+        motions=joint_motions([e.recording for e, _ in parts], rows, load, model),
         at=tuple(motion),
         taken=tuple(rows),
         weight=weight,
@@ -406,10 +420,17 @@ def _usual_size(r: Array, used: Array) -> Array:
     return np.array([np.median(np.abs(x[k])) if k.any() else np.inf for x, k in columns])
 
 
-def _joint_motions(
+def joint_motions(
     recordings: Sequence[Recording], rows: Sequence[Array], load: Array, model: RobotModel
 ) -> tuple[JointMotion, ...]:
-    """Return how each joint moves in the rows, with its neighbours."""
+    """Return how each joint moves in some rows of recordings, with its neighbours.
+
+    Args:
+        recordings: The recordings.
+        rows: Which rows of each, N in all.
+        load: Torque of the bodies there, shape (N, n) [N m or N].
+        model: The robot.
+    """
     motions = [recording.trajectory for recording in recordings]
     passes = max(recording.signals.cutoff or np.inf for recording in recordings)
     longest = max(float(np.ptp(m.t)) for m in motions)
@@ -584,6 +605,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
         gain = (before - left[best])[: sample.fitted]
         share = float(gain.sum() / total[: sample.fitted].sum())
         size, std_error, unit = _size(sample, j, best, whole, chosen, place[best])
+        theta = whole.parameters([*chosen, *place[best]])[len(chosen) :]
         kept = [
             whole.left(which)[sample.fitted :].sum()
             for which in ([], chosen, [*chosen, *place[best]])
@@ -599,7 +621,9 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 std_error=std_error,
                 unit=unit,
                 error=error,
-                shift=_shift(whole, chosen, place[best]),
+                shift=-whole.T[:, place[best]] @ theta,
+                theta=theta,
+                scale=motion,
                 entries=_entries(sample, j, best),
             )
         chosen += place[best]
@@ -649,12 +673,6 @@ def chance(before: Array, after: Array, fitted: int) -> float:
         for x in (gain, gain[:fitted])
     ]
     return float(min(chances))
-
-
-def _shift(whole: Trial, before: list[int], new: list[int]) -> Array:
-    """Return how a term, beside those found before, moves base parameters, shape (b,)."""
-    theta = whole.parameters([*before, *new])[len(before) :]
-    return -np.asarray(whole.T[:, new] @ theta)
 
 
 def _size(

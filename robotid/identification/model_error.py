@@ -6,30 +6,59 @@ to their covariance; so does that of a term which was nearly chosen. A shape tha
 them has an error of its own, and so do they:
 
     C += sum_terms (T theta) (T theta)^T + sum_joints T C_s T^T,  T = (W^T W + C_0^-1)^-1 W^T z
+
+A prediction errs by what such a term moves and by its own torque at once, and the two cancel in
+part: W T theta - z theta. Hence each is kept as an ``OpenTerm``, beside what it adds to C.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotid._typing import Array
-from robotid.identification.misfit import Misfit, Sample, Trial, take_sample, trials
+from robotid.identification.candidates import JointMotion
+from robotid.identification.misfit import (
+    Misfit,
+    Sample,
+    Trial,
+    joint_motions,
+    take_sample,
+    trials,
+)
 from robotid.regressor.memory import drive_motion_along
-from robotid.robot.drives import DriveMotion
+from robotid.robot.drives import DriveMotion, DriveTerm
 
 if TYPE_CHECKING:
     from robotid.identification.drive_choice import DriveChoice
+    from robotid.identification.evaluation import Evaluation
     from robotid.identification.pipeline import Identification
 
-__all__ = ["settled_shapes", "shape_slope", "with_model_error"]
+__all__ = ["OpenTerm", "open_torques", "settled_shapes", "with_model_error"]
 
 _STEP = 1e-3  # relative, of a derivative
 _ROUNDING = 1e-10  # share of a column that is rounding
 _MOVES = 0.2  # standard errors by which a shape moves that is worth another fit
 _PINNED = 1e-6  # of the smallest spread: that of a parameter that is known
 _GROWN = 1.3  # times by which a standard error grows that stands on a misfit
+
+
+@dataclass(frozen=True, eq=False)
+class OpenTerm:
+    """What is open of a joint's drive: a term that it may have, or a shape.
+
+    Attributes:
+        joint: The joint.
+        moves: By how much it moves standard parameters, shape (p,).
+        torque: Its own torque along a motion of the drive, which the joint's is given beside,
+            shape (N,) [N m or N].
+    """
+
+    joint: str
+    moves: Array
+    torque: Callable[[DriveMotion, JointMotion], Array]
 
 
 def with_model_error(
@@ -44,9 +73,10 @@ def with_model_error(
     """
     if sample is None:
         return found
-    found = _with_shape_errors(found, sample)
-    found = _wider(found, sample, list(_of_doubts(found, sample)))
-    wider = _wider(found, sample, [misfit.shift for misfit in misfits])
+    motions = _motions(found) if found.drives else []
+    found = _wider(found, sample, list(_of_shapes(found, sample, motions)))
+    found = _wider(found, sample, list(_of_doubts(found, sample, motions)))
+    wider = _wider(found, sample, [_of_misfit(misfit) for misfit in misfits])
     before, after = found.standard_error, wider.standard_error
     drives = np.arange(len(before)) >= found.model.layout.n_inertial
     grown = np.flatnonzero(drives & np.isfinite(before) & (after > _GROWN * before))
@@ -54,17 +84,56 @@ def with_model_error(
     return replace(wider, misfits=tuple(misfits), on_misfit=names)
 
 
-def _wider(found: "Identification", sample: Sample, moved: Sequence[Array]) -> "Identification":
-    """Return an identification with what moves base parameters over their spread, (b,) each."""
+@dataclass(frozen=True, eq=False)
+class _Move:
+    """What is open of a drive, in the sample's units."""
+
+    joint: str
+    shift: Array  # of base parameters over their spread, (b,)
+    torque: Callable[[DriveMotion, JointMotion], Array]
+
+
+def _wider(found: "Identification", sample: Sample, moved: Sequence[_Move]) -> "Identification":
+    """Return an identification with what else is open of its drives."""
     if not moved:
         return found
-    X = sample.U.T @ np.column_stack(moved)  # (b, m), base parameters
+    X = sample.U.T @ np.column_stack([move.shift for move in moved])  # (b, m), base parameters
     GX = _gain(found) @ X
+    terms = [
+        OpenTerm(move.joint, moves, move.torque) for move, moves in zip(moved, GX.T, strict=True)
+    ]
     return replace(
         found,
         standard_covariance=found.standard_covariance + GX @ GX.T,
         base_error=np.sqrt(found.base_error**2 + np.sum(X**2, axis=1)),
+        open_terms=(*found.open_terms, *terms),
     )
+
+
+def open_torques(found: "Identification", evaluation: "Evaluation", rows: Array) -> list[Array]:
+    """Return the torque of each open term of the drives along a recording.
+
+    Args:
+        found: What was found.
+        evaluation: The recording.
+        rows: Which of its samples, shape (k,), int.
+
+    Returns:
+        For each of ``open_terms`` its torque, shape (k, n_rows) [N m or N].
+    """
+    if not found.open_terms:
+        return []
+    model, recording = found.model.with_reference(found.standard), evaluation.recording
+    joints, first = model.joints, model.n_rows - len(model.joints)
+    drives = drive_motion_along(model, recording.trajectory)
+    load, every = drives.load[: len(joints)].T, np.arange(len(recording.trajectory.t))
+    alone = joint_motions([recording], [every], load, model)
+    torques = []
+    for term in found.open_terms:
+        j, torque = joints.index(term.joint), np.zeros((len(rows), model.n_rows))
+        torque[:, first + j] = term.torque(drives.of(j), alone[j])[rows]
+        torques.append(torque)
+    return torques
 
 
 def _gain(found: "Identification") -> Array:
@@ -74,23 +143,41 @@ def _gain(found: "Identification") -> Array:
     return found.mapping.gain(np.maximum(spread, least))
 
 
-def _with_shape_errors(found: "Identification", sample: Sample) -> "Identification":
-    """Return an identification whose errors count those of shapes.
+def _of_shapes(
+    found: "Identification", sample: Sample, motions: Sequence[DriveMotion]
+) -> Iterator[_Move]:
+    """Yield what is open of shapes.
 
     Shapes of a joint err together: their covariance is C_s = L L^T, one move for each column of L.
     """
-    if not any(choice.shapes for choice in found.drives):
-        return found
-    motions, drives, moved = _motions(found), [], []
-    gain = _gain(found)
     for choice in found.drives:
         if choice.shapes:
             T = _shape_trial(found, choice, sample, motions).T[:, :-1]
             variance, axes = np.linalg.eigh(np.array(choice.shape_covariance))
-            moved += list(-(T @ (axes * np.sqrt(np.maximum(variance, 0.0)))).T)
-            choice = replace(choice, shape_moves=-gain @ sample.U.T @ T)
-        drives.append(choice)
-    return replace(_wider(found, sample, moved), drives=tuple(drives))
+            for axis in (axes * np.sqrt(np.maximum(variance, 0.0))).T:
+                bends = partial(_bent, found, choice, axis)
+                yield _Move(choice.joint, -(T @ axis), bends)
+
+
+def _bent(
+    found: "Identification",
+    choice: "DriveChoice",
+    axis: Array,
+    motion: DriveMotion,
+    alone: JointMotion,
+) -> Array:
+    """Return what shapes that are larger by an axis (k,) change in a drive's torque, shape (N,)."""
+    slopes = [shape_slope(found, choice, k, motion) for k in range(len(axis))]
+    return np.asarray(np.column_stack(slopes) @ axis)
+
+
+def _of_misfit(misfit: Misfit) -> _Move:
+    """Return what is open by a term that the model lacks."""
+
+    def torque(motion: DriveMotion, alone: JointMotion) -> Array:
+        return misfit.torque(alone)
+
+    return _Move(misfit.joint, misfit.shift, torque)
 
 
 def _shape_trial(
@@ -136,11 +223,10 @@ def settled_shapes(found: "Identification") -> "tuple[DriveChoice, ...] | None":
     return tuple(drives) if farthest > _MOVES else None
 
 
-def _of_doubts(found: "Identification", sample: Sample) -> Iterator[Array]:
-    """Yield by how much terms that were nearly taken would move base parameters, (b,) each."""
-    if not any(choice.doubted for choice in found.drives):
-        return
-    motions = _motions(found)
+def _of_doubts(
+    found: "Identification", sample: Sample, motions: Sequence[DriveMotion]
+) -> Iterator[_Move]:
+    """Yield what is open by terms that were nearly taken."""
     for choice in found.drives:
         if not choice.doubted:
             continue
@@ -149,15 +235,27 @@ def _of_doubts(found: "Identification", sample: Sample) -> Iterator[Array]:
             np.column_stack([term.column(motion.of(j)) for term in choice.doubted])[rows]
             for motion, rows in zip(motions, sample.taken, strict=True)
         ]
-        _, whole = trials(sample, slice(j, j + 1), np.concatenate(columns)[:, None])
-        yield -whole.T[:, :-1] @ whole.parameters(list(range(len(choice.doubted))))
+        Z = np.concatenate(columns)
+        _, whole = trials(sample, slice(j, j + 1), Z[:, None])
+        theta = whole.parameters(list(range(len(choice.doubted))))
+
+        torque = partial(_of_terms, choice.doubted, theta)
+        yield _Move(choice.joint, -whole.T[:, :-1] @ theta, torque)
+
+
+def _of_terms(
+    terms: Sequence[DriveTerm], theta: Array, motion: DriveMotion, alone: JointMotion
+) -> Array:
+    """Return the torque of terms of a drive, shape (N,)."""
+    return np.asarray(np.column_stack([term.column(motion) for term in terms]) @ theta)
 
 
 def _motions(found: "Identification") -> list[DriveMotion]:
     """Return how the drives move along each recording, as ``Sample.taken`` counts them."""
     kept = [e for e in found.validation if not e.is_refitted]
     recordings = [e.recording for e in (*found.fitted, *kept)]
-    return [drive_motion_along(found.model, x.trajectory) for x in recordings]
+    model = found.model.with_reference(found.standard)
+    return [drive_motion_along(model, x.trajectory) for x in recordings]
 
 
 def shape_slope(

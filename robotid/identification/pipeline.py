@@ -31,7 +31,7 @@ from robotid.identification.bands import (
     FrictionCurve,
     TorqueBand,
     fitted_moments,
-    torque_band,
+    recording_bands,
     usual_friction,
 )
 from robotid.identification.baselines import urdf_with_drives
@@ -48,7 +48,7 @@ from robotid.identification.misfit import (
     take_sample,
     with_known_springs,
 )
-from robotid.identification.model_error import settled_shapes, with_model_error
+from robotid.identification.model_error import OpenTerm, settled_shapes, with_model_error
 from robotid.identification.parameter_table import parameter_entries, parameter_table
 from robotid.identification.pictures import friction_chart, shown_evaluation, torque_charts
 from robotid.identification.recordings import Recordings
@@ -171,6 +171,7 @@ class Identification:
         doubts: Why it may be wrong however well it predicts, as the doctor and the fit found.
         report: File of the report, if one was written with the result.
         drives: What friction its joints have beside viscous and Coulomb's, and what was tried.
+        open_terms: What is open of its drives, which ``standard_covariance`` counts.
         misfits: Terms that the model of its drives still lacks.
         on_misfit: Names of drive parameters whose errors grew by these.
         asked: Signals, friction and findings to ignore, as they were asked for.
@@ -199,6 +200,7 @@ class Identification:
     doubts: tuple[Doubt, ...] = ()
     report: str = ""
     drives: tuple[DriveChoice, ...] = ()
+    open_terms: tuple[OpenTerm, ...] = ()
     misfits: tuple[Misfit, ...] = ()
     on_misfit: tuple[str, ...] = ()
     asked: Asked = field(default_factory=Asked)
@@ -484,9 +486,12 @@ class Identification:
         Args:
             evaluation: One of the recordings.
         """
-        mapping, motion = self.mapping, evaluation.recording.trajectory
-        covariance = mapping.K @ self.standard_covariance @ mapping.K.T
-        return torque_band(self.model, mapping, motion, covariance, self.estimate.sigma)
+        every = (*self.fitted, *self.validation)
+        return self._bands[next(k for k, e in enumerate(every) if e is evaluation)]
+
+    @cached_property
+    def _bands(self) -> tuple[TorqueBand, ...]:
+        return recording_bands(self)
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:

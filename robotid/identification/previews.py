@@ -25,7 +25,7 @@ from robotid.estimators.determination import base_spread, determine
 from robotid.estimators.stretches import FEWEST_STRETCHES, scatter
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
-from robotid.identification.bands import TorqueBand
+from robotid.identification.bands import TorqueBand, expected_band
 from robotid.identification.evaluation import evaluate_logs
 from robotid.identification.fitting import Known, consistent_fit
 from robotid.identification.pipeline import Identification
@@ -237,7 +237,7 @@ class Preview:
     @property
     def bands(self) -> tuple[TorqueBand, ...]:
         """How far each motion's predicted torques could be trusted."""
-        return tuple(self.expected.band(evaluation) for evaluation in self.expected.fitted)
+        return tuple(expected_band(self.expected, e) for e in self.expected.fitted)
 
     @property
     def words(self) -> str:

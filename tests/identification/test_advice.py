@@ -79,7 +79,10 @@ def read(block):
 
 
 def lacking(joint, term, entries=()):
-    return Misfit(joint, term, 0.9, 1e-9, 0.9, 1.0, 0.1, "N m rms", 0.1, np.zeros(1), entries)
+    none = np.zeros(1)
+    still = JointMotion(*[none] * 7)
+    size = (1.0, 0.1, "N m rms", 0.1)
+    return Misfit(joint, term, 0.9, 1e-9, 0.9, *size, none, none, still, entries)
 
 
 def motion_of(joint, other, rng):

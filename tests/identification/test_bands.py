@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.export.result import build_result
-from robotid.identification.bands import TorqueBand, torque_band
+from robotid.identification.bands import TorqueBand, expected_band, torque_band
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.torque import joint_torque_regressor
@@ -45,6 +47,28 @@ def test_bands_hold_95_percent_of_the_torques_of_a_new_motion(found):
     share = band.held(recording.trajectory.tau, evaluation.torques["estimate"], recording.mask)
     assert ((share > 0.91) & (share < 0.99)).all(), share
     np.testing.assert_allclose(band.noise, NOISE, rtol=0.1)
+
+
+def test_the_noise_of_a_band_is_what_recordings_of_its_kind_leave(ur5):
+    """Kept rows that miss by more than fitted ones widen their own bands, joint by joint."""
+    rng, pi = np.random.default_rng(4), truth(ur5)
+    logs = [exact_log(ur5, pi, rng, samples=600, noise=NOISE) for _ in range(3)]
+    worse = [
+        replace(log, tau=log.tau + rng.normal(0, [0, 4.0, 0, 0, 0, 0], log.tau.shape))
+        for log in logs[1:]
+    ]
+    settings = SignalSettings(cutoff=None, trim=0.0)
+    found = identify(ur5, logs[:1], validation=worse, signals=settings, estimator="wls")
+    fitted, *kept = (found.band(e) for e in (*found.fitted, *found.validation))
+    np.testing.assert_array_equal(kept[0].noise, kept[1].noise)
+    assert fitted.noise[1] == pytest.approx(NOISE[1], rel=0.15)
+    assert kept[0].noise[1] == pytest.approx(np.hypot(NOISE[1], 4.0), rel=0.1)
+    assert kept[0].noise[2] == pytest.approx(NOISE[2], rel=0.15)
+    for e in found.validation:
+        recording = e.recording
+        share = found.band(e).held(recording.trajectory.tau, e.torques["estimate"], recording.mask)
+        assert ((share > 0.93) & (share < 0.97)).all(), share
+    np.testing.assert_array_equal(expected_band(found, found.fitted[0]).noise, found.estimate.sigma)
 
 
 def test_intervals_hold_the_truth(found):

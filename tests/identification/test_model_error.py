@@ -4,14 +4,17 @@ The truth of a parameter is that of the robot that made the log: Coulomb frictio
 without load, whether the model that is fitted knows of load friction or not.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.driven import ELBOW, LIFT, arm, driven, driven_log, found_in
 
-from robotid.identification.bands import friction_curve
+from robotid.identification.bands import expected_band, friction_curve
 from robotid.identification.drive_choice import choose_drives
 from robotid.identification.misfit import find_misfits, take_sample
-from robotid.identification.model_error import with_model_error
+from robotid.identification.model_error import open_torques, with_model_error
+from robotid.regressor.torque import trajectory_regressor
 from robotid.robot.drives import LoadFriction, Stribeck
 
 REACH = 1.5
@@ -79,6 +82,45 @@ def test_what_a_misfit_moves_is_what_a_fit_with_the_term_finds(plain, loaded):
         assert (name in found.on_misfit) == is_wide
 
 
+@pytest.mark.parametrize(("robot", "family"), [("loaded", "load"), ("hooked", "stribeck")])
+def test_a_prediction_errs_by_what_a_missing_term_moves_and_by_its_torque(
+    plain, robot, family, request
+):
+    """The oracle: how much the prediction changes once the term is in the model."""
+    (_, log), joint = request.getfixturevalue(robot), plain.joints.index(ELBOW)
+    slower = replace(log, t=1.4 * log.t, v=None, a=None)  # at other speeds, other loads
+    found, better = (
+        found_in(plain, [log], validation=[slower], friction=friction, estimator="wls")
+        for friction in (PLAIN, {ELBOW: family, "*": "none"})
+    )
+    (term,) = (term for term in found.open_terms if term.joint == ELBOW)
+    pure = found.standard_covariance - sum(np.outer(x.moves, x.moves) for x in found.open_terms)
+    assert np.linalg.eigvalsh(pure).min() > -1e-9 * np.linalg.eigvalsh(pure).max()
+    for one, other in zip(
+        (*found.fitted, *found.validation), (*better.fitted, *better.validation), strict=True
+    ):
+        band = expected_band(found, one)
+        changed = (other.torques["estimate"] - one.torques["estimate"])[band.samples, joint]
+        W = trajectory_regressor(found.model, one.recording.trajectory.at(band.samples))
+        W = W.reshape(len(band.samples), -1, W.shape[1])[:, joint]
+        (torque,) = (
+            z
+            for x, z in zip(found.open_terms, open_torques(found, one, band.samples), strict=True)
+            if x is term
+        )
+        errs = W @ term.moves + torque[:, joint]
+        assert np.sqrt(np.mean((errs - changed) ** 2)) < 0.2 * np.sqrt(np.mean(changed**2))
+        assert not torque[:, :joint].any()
+        others = [x for x in found.open_terms if x is not term]
+        wanted = np.einsum("ij,jk,ik->i", W, pure, W) + errs**2
+        wanted += sum((W @ x.moves) ** 2 for x in others)
+        np.testing.assert_allclose(band.parameters[:, joint] ** 2, wanted, rtol=1e-6)
+    v = np.array([-1.0, -0.3, 0.3, 1.0])
+    curves = [friction_curve(x, ELBOW, v, load=20.0) for x in (found, better)]
+    changed = curves[1].torque - curves[0].torque
+    np.testing.assert_allclose(curves[0].std, np.abs(changed), atol=0.3 * np.abs(changed).max())
+
+
 def test_without_rows_to_judge_by_errors_stay_as_they_are(plain, loaded):
     found = found_in(plain, [loaded[1]], friction=PLAIN, estimator="wls")
     assert with_model_error(found, None, ()) is found
@@ -106,8 +148,8 @@ def test_an_error_of_a_shape_moves_parameters_as_refits_do(plain, hooked):
         moved = 0.5 * (high.standard[k] - low.standard[k])
         wanted = np.hypot(middle.standard_error[k], moved)
         assert found.standard_error[k] == pytest.approx(wanted, rel=0.05), term
-        per_unit = choice.shape_moves[k, 0]
-        assert per_unit * shape.std_error == pytest.approx(moved, rel=0.1), term
+        by_one_error = found.open_terms[0].moves[k]  # of either sign
+        assert abs(by_one_error) == pytest.approx(abs(moved), rel=0.1), term
         assert abs(found.standard[k] - true[f"{ELBOW}.{term}"]) < 2.6 * found.standard_error[k]
     k = at(found, f"{ELBOW}.stribeck")
     assert found.standard_error[k] > 1.1 * middle.standard_error[k]
