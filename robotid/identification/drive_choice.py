@@ -35,6 +35,7 @@ _GRID = 6  # sizes of a shape that are tried, over its bounds
 _SPAN = 100.0  # from the smallest of them to the largest; a bound beyond is tried, too
 _FAMILIES = 4  # chosen for a joint, at most
 _CHANCE = 0.01  # that a family is chosen that is not there, each time that one is tried
+_DOUBTED = 0.25  # that a family is counted as open, which is likelier by chance than one taken
 _LEAST = 0.05  # of the squared residual that is left, from which a family is worth its parameters
 _SEEN = 0.006  # of the torque: a gain that is smaller may be of how signs pass the filter
 _ALIKE = 0.02  # of the squared residual, within which two families explain alike
@@ -377,7 +378,7 @@ def _auto(sample: Sample, drive: _Drive, first: Sequence[str] = ()) -> DriveChoi
         tried += list(_told(every, left, before, torque, beside, best))
         if found is None or best is None:
             nearest = min(left, key=lambda i: float(left[i].sum()), default=None)
-            if nearest is not None and left[nearest].sum() < before.sum():
+            if nearest is not None and _chance(before, left[nearest]) < _DOUBTED:
                 doubted = [every.own[nearest]]
             break
         own = found.own
