@@ -14,8 +14,9 @@ from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
 from robotid.identification.discrepancies import discrepancy_findings
-from robotid.identification.drive_choice import TENFOLD, DriveChoice
+from robotid.identification.drive_choice import TENFOLD
 from robotid.identification.misfit import Sample, misfit_findings
+from robotid.identification.parameter_table import correlated_parameters
 from robotid.identification.regressor_noise import encoder_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
 from robotid.logs.data import Log
@@ -75,7 +76,7 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
     findings += _dense_bodies(identification)
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
-    findings += _drive_findings(identification)
+    findings += [*_drive_findings(identification), *_correlated(identification)]
     findings += discrepancy_findings(identification, sample)
     findings += encoder_findings(identification)
     for evaluation in identification.refitted:
@@ -149,7 +150,6 @@ def _drive_findings(identification: Identification) -> list[Finding]:
                     "bends; record slower and faster motion of this joint to tell"
                 )
                 findings.append(Finding("shape_at_bound", "note", choice.joint, message))
-        findings += _correlated(identification, choice)
         guards = {term.guards for term in choice.terms if np.isfinite(term.seen).all()} - {""}
         j = model.joints.index(choice.joint)
         for evaluation in identification.validation:
@@ -171,27 +171,46 @@ def _drive_findings(identification: Identification) -> list[Finding]:
     return findings
 
 
-def _correlated(identification: Identification, choice: DriveChoice) -> list[Finding]:
-    """Return a note on the pair of drive parameters that only their sum determines, if any."""
-    if max(choice.grown.values(), default=1.0) <= TENFOLD:
-        return []
-    name = max(choice.grown, key=lambda name: choice.grown[name])
-    names, C = identification.model.layout.names, identification.standard_covariance
-    own = [k for k, other in enumerate(names) if other.startswith(f"{choice.joint}.") and C[k, k]]
-    i = names.index(name)
-    r = {k: float(C[i, k] / np.sqrt(C[i, i] * C[k, k])) for k in own if k != i and C[i, i] > 0}
-    if not r:
-        return []
-    k = max(r, key=lambda k: abs(r[k]))
-    first, second = (x.removeprefix(f"{choice.joint}.") for x in (name, names[k]))
-    message = (
-        f"{choice.joint}: {first} and {second} are strongly correlated (r = {r[k]:.3f}): "
-        f"{listed(choice.families)} makes the standard error of {first} {choice.grown[name]:.0f} "
-        "times as large. The friction curve is determined, the single values are not: use the "
-        "curve"
-    )
-    evidence = {"r": r[k], "grown": choice.grown[name]}
-    return [Finding("correlated_terms", "note", choice.joint, message, evidence)]
+def _correlated(found: Identification) -> list[Finding]:
+    """Return a note on each drive with a pair of parameters of which only the sum is known."""
+    names, pairs, findings = found.model.layout.names, correlated_parameters(found), []
+    for joint in dict.fromkeys(names[i].rpartition(".")[0] for i in pairs):
+        own = [(i, *pair) for i, pair in pairs.items() if names[i].rpartition(".")[0] == joint]
+        i, k, r = max(own, key=lambda pair: abs(pair[2]))
+        single = [
+            f"{names[m].rpartition('.')[2]} {found.standard[m]:.3g} +- "
+            f"{found.standard_error[m]:.2g}"
+            for m in sorted((i, k))
+        ]
+        curve = found.friction(joint)
+        slowest = len(curve.v) // 2
+        sums = [
+            f"{curve.torque[m]:.3g} +- {curve.std[m]:.2g} at {curve.v[m]:.3g}"
+            for m in (slowest, -1)
+        ]
+        speed = "m/s" if joint in found.model.layout.prismatic else "rad/s"
+        message = (
+            f"{joint}: {listed(single)} are strongly correlated (r = {r:.3f}): use their sum; "
+            f"friction and offset are {' and '.join(sums)} {speed}"
+        )
+        findings.append(Finding("correlated_terms", "note", joint, message, {"r": r}))
+    return [*findings, *_grown(found, {finding.where for finding in findings})]
+
+
+def _grown(found: Identification, said: Collection[str]) -> list[Finding]:
+    """Return notes on terms that make the standard error of another parameter grow tenfold."""
+    findings = []
+    for choice in found.drives:
+        name = max(choice.grown, key=lambda name: choice.grown[name], default="")
+        if choice.joint not in said and choice.grown.get(name, 1.0) > TENFOLD:
+            grown = choice.grown[name]
+            message = (
+                f"{choice.joint}: {listed(choice.families)} makes the standard error of {name} "
+                f"{grown:.0f} times as large; the friction curve is known better than its terms"
+            )
+            evidence = {"grown": grown}
+            findings.append(Finding("correlated_terms", "note", choice.joint, message, evidence))
+    return findings
 
 
 def unwritten(identification: Identification, alarms: Sequence[Finding]) -> list[Finding]:

@@ -5,12 +5,22 @@ from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from robotid.pages.html import code, number, table, text
 
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["HEADERS", "ParameterRows", "parameter_entries", "parameter_table"]
+__all__ = [
+    "HEADERS",
+    "ParameterRows",
+    "correlated_parameters",
+    "parameter_entries",
+    "parameter_table",
+]
+
+_CORRELATED = 0.95  # from which two parameters of a drive are known as their sum alone
 
 #: What a row says: link or drive, parameter, the URDF's value, the identified one, its standard
 #: error, its 95 % interval, what determined it, unit.
@@ -35,6 +45,33 @@ class ParameterRows(list[dict[str, Any]]):
         return table("Parameters", HEADERS, cells)
 
 
+def correlated_parameters(found: "Identification") -> dict[int, tuple[int, float]]:
+    """Return drive parameters whose errors are strongly correlated with another's of the drive.
+
+    Args:
+        found: The identification.
+
+    Returns:
+        By number of the standard parameter, that of the other one and their correlation, of which
+        the size is above 0.95.
+    """
+    layout, C, at_bound = found.model.layout, found.standard_covariance, found.at_bound
+    pairs = {}
+    for drive in range(len(layout.drives)):
+        own = [
+            k
+            for k, (d, _) in enumerate(layout.drive_parameters, start=layout.n_inertial)
+            if d == drive and C[k, k] > 0 and not at_bound[k]
+        ]
+        error = np.sqrt(np.diag(C)[own])
+        R = C[np.ix_(own, own)] / np.outer(error, error) - np.eye(len(own))
+        for i, row in zip(own, R, strict=True):
+            k = int(np.argmax(np.abs(row)))
+            if abs(row[k]) > _CORRELATED:
+                pairs[i] = own[k], float(row[k])
+    return pairs
+
+
 def parameter_entries(found: "Identification") -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return the parameters of the bodies and those of the drives, as result.json has them.
 
@@ -43,6 +80,7 @@ def parameter_entries(found: "Identification") -> tuple[list[dict[str, Any]], li
     """
     layout, sources, at_bound = found.model.layout, found.sources, found.at_bound
     errors, ends = found.standard_error, found.standard_interval
+    pairs = correlated_parameters(found)
     entries = [
         {
             "name": name,
@@ -53,6 +91,7 @@ def parameter_entries(found: "Identification") -> tuple[list[dict[str, Any]], li
             "prior": float(found.prior[i]),
             "source": sources[i],
             "at_bound": bool(at_bound[i]),
+            **({"correlated_with": layout.names[pairs[i][0]]} if i in pairs else {}),
         }
         for i, name in enumerate(layout.names)
     ]

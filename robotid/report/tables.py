@@ -12,6 +12,7 @@ from robotid._files import file_sha256
 from robotid.export.urdf import urdf_changes
 from robotid.findings import listed
 from robotid.identification.evaluation import Recording
+from robotid.identification.parameter_table import correlated_parameters
 from robotid.identification.pipeline import SOURCES, Identification
 from robotid.pages.html import Cell, code, number, percent, table, text, with_error
 from robotid.report.summary_screen import DETERMINED
@@ -52,7 +53,7 @@ def tables(found: Identification) -> dict[str, str]:
 def _parameter_table(found: Identification) -> str:
     """Return every parameter of the links and drives: before, after, and what determined it."""
     layout, prior, error = found.model.layout, found.prior, found.standard_error
-    rows = []
+    rows, pairs = [], correlated_parameters(found)
     for i, (name, source) in enumerate(zip(layout.names, found.sources, strict=True)):
         owner, term = name.rsplit(".", 1)
         value, uncertain = with_error(found.standard[i], error[i])
@@ -60,6 +61,9 @@ def _parameter_table(found: Identification) -> str:
         if not set("123456789") & set(change.html):
             change = replace(change, html="0")
         words = DETERMINED[source] + (", on a misfit" if name in found.on_misfit else "")
+        if i in pairs:
+            other, r = pairs[i]
+            words += f", with {layout.names[other].rpartition('.')[2]} (r = {r:.3f})"
         rows.append(
             [
                 code(owner),
@@ -78,7 +82,8 @@ def _parameter_table(found: Identification) -> str:
         "<p>One of many sets with the same torque: the data fix the base parameters only, the "
         "rest follows the URDF. ±: one standard error. Determined by motion, where it is below "
         "30 % of the spread assumed before the fit; by the prior, above 90 %, which is the URDF; "
-        "at its bound, where physics allows no more.</p>\n"
+        "at its bound, where physics allows no more; with another (r), where the errors of "
+        "both cancel: the torque of the two together is known far better than each.</p>\n"
         + table("Parameters of links and drives", headers, rows, is_data=True)
     )
 

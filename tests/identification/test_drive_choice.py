@@ -1,6 +1,7 @@
 """Friction that the drives of a known robot have is chosen, sized and guarded; no other is."""
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from robotid.identification import drive_choice, pipeline
 from robotid.identification.bands import friction_curve
 from robotid.identification.drive_choice import _chance, choose_drives, wanted_families
 from robotid.identification.misfit import take_sample
+from robotid.identification.parameter_table import parameter_entries
 from robotid.identification.pipeline import conclude, identify
 from robotid.identification.recordings import Recordings
 from robotid.identification.settings import EstimatorSettings
@@ -181,8 +183,19 @@ def test_of_families_alike_the_better_conditioned_is_chosen(plain, rising):
     assert other.grown[f"{ELBOW}.coulomb"] > 10.0 > choice.grown[f"{ELBOW}.coulomb"]
     (said,) = [f for f in stated.findings if f.code == "correlated_terms"]
     assert (said.severity, said.where) == ("note", ELBOW)
-    assert "elbow_joint: coulomb and stribeck are strongly correlated (r = -0.9" in said.message
-    assert said.evidence["grown"] == max(other.grown.values())
+    assert re.match(
+        r"elbow_joint: coulomb \S+ \+- \S+, stribeck \S+ \+- \S+ are strongly correlated "
+        r"\(r = -0\.9\d+\): use their sum; friction and offset are \S+ \+- \S+ at \S+ and ",
+        said.message,
+    )
+    names, C = stated.model.layout.names, stated.standard_covariance
+    i, k = (names.index(f"{ELBOW}.{term}") for term in ("coulomb", "stribeck"))
+    assert said.evidence["r"] == pytest.approx(C[i, k] / np.sqrt(C[i, i] * C[k, k]))
+    _, drives = parameter_entries(stated)
+    partner = {entry["name"]: entry.get("correlated_with") for entry in drives}
+    assert partner[f"{ELBOW}.coulomb"] == f"{ELBOW}.stribeck"
+    assert partner[f"{ELBOW}.stribeck"] == f"{ELBOW}.coulomb"
+    assert partner[f"{LIFT}.coulomb"] is None
 
 
 def rising_logs(found):
