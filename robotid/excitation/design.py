@@ -595,7 +595,7 @@ class Designer:
         for kind, joint in np.argwhere((used > 1.0).any(axis=1)).tolist():
             own = used[kind, :, joint]
             least = (
-                f"{names[joint]} needs {100 * own.min():.0f} % of its {LIMITS[kind]} limit at the "
+                f"{names[joint]} needs {_percent(own.min())} % of its {LIMITS[kind]} limit at the "
                 "least; state the limits that the robot has, or the load that it carries"
             )
             some = f"{names[joint]} needs more than its {LIMITS[kind]} limit"
@@ -723,6 +723,11 @@ def _gravity(model: RobotModel) -> Array:
     q = np.random.default_rng(0).uniform(low, high, (_TRIED, len(reach)))
     torque: Array = np.abs(predict_instants(model, model.standard_parameters(), q)).max(axis=0)
     return torque
+
+
+def _percent(share: float) -> str:
+    """Return a share in per cent, in few digits however large it is."""
+    return f"{100 * share:.0f}" if share < 1e4 else f"{100 * share:.2g}"
 
 
 class _OutOfTime(Exception):
