@@ -206,7 +206,7 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
         )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
-        for required in ("log", "name", "ratios", "matrix"):
+        for required in ("log", "name", "ratios", "joints", "matrix"):
             if required in schema and required not in item:
                 raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
 

@@ -14,7 +14,11 @@ from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
 from robotid.findings import Finding, listed
-from robotid.regressor.base_parameters import BaseMapping, structural_mapping
+from robotid.regressor.base_parameters import (
+    BaseMapping,
+    independent_parts,
+    structural_mapping,
+)
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
@@ -138,7 +142,13 @@ def _condition(model: RobotModel, mapping: BaseMapping) -> float:
     columns = len(mapping.names)
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
-    return float(np.linalg.cond(np.linalg.qr(W / np.linalg.norm(W, axis=0), mode="r")))
+    unit, n = W / np.linalg.norm(W, axis=0), model.n_rows
+    sizes = [
+        np.linalg.svd(np.linalg.qr(part.reshape(-1, len(kept)), mode="r"), compute_uv=False)
+        for rows, kept in independent_parts(unit, n)
+        for part in [unit.reshape(-1, n, unit.shape[1])[:, rows][:, :, kept]]
+    ]
+    return float(max(s[0] for s in sizes) / min(s[-1] for s in sizes))
 
 
 def _numbers(robot: ET.Element) -> Iterator[Finding]:

@@ -382,7 +382,10 @@ def _check_known(
                 "link among them"
             )
         if not 0 < mass < 1e6:
-            raise SettingsError(f"the mass of the payload on {link} is {mass:g} kg, wanted > 0")
+            raise SettingsError(
+                f"the mass of the payload on {link} is {mass:g} kg, wanted more than 0 and less "
+                "than 1e6"
+            )
     unknown = [joint for joint in gains if joint not in model.joints]
     if unknown:
         raise SettingsError(

@@ -18,7 +18,13 @@ from robotid.regressor.problem import Problem
 from robotid.regressor.torque import random_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping", "structural_mapping"]
+__all__ = [
+    "RANK_TOLERANCE",
+    "BaseMapping",
+    "base_mapping",
+    "independent_parts",
+    "structural_mapping",
+]
 
 #: Pivots below this share of the largest are no structure. Over example-robot-data, every pivot
 #: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
@@ -154,6 +160,7 @@ def base_mapping(
     scales: Array | None = None,
     preference: Array | None = None,
     rtol: float = RANK_TOLERANCE,
+    n_rows: int = 1,
 ) -> BaseMapping:
     """Return the base parameters of a regressor taken at random states.
 
@@ -169,6 +176,7 @@ def base_mapping(
             shape (p,); 1 if None. It changes which groups are formed, not how many. See
             ``ParameterLayout.preference``.
         rtol: Pivots below this share of the largest count as 0.
+        n_rows: Rows of W that one sample has, each of another equation.
 
     Raises:
         DataError: If a shape does not fit, W is not finite or all zero.
@@ -181,31 +189,74 @@ def base_mapping(
     if not np.isfinite(W).all() or not W.any():
         raise DataError("W must be finite and not all zero")
     magnitude = np.ones(len(names)) if scales is None else scales
-    R = scipy.linalg.qr(W * magnitude, mode="r", overwrite_a=True, check_finite=False)[0]
-    R = R[: len(names)]  # the rest is 0
-    order, pivots = _pivot(R)
-    rank = int(np.sum(pivots > rtol * pivots[0]))
-    if preference is not None:
-        order, _ = _pivot(R * preference)
-    independent, dependent = np.sort(order[:rank]), np.sort(order[rank:])
-    triangle = scipy.linalg.qr(R[:, np.append(independent, dependent)], mode="r")[0][:rank]
-    X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled, (b, p - b)
-    X[np.abs(X) < _CLEAN] = 0.0
-    K = np.zeros((rank, len(names)))
-    K[:, independent] = np.eye(rank)
-    K[:, dependent] = X * magnitude[independent][:, None] / magnitude[dependent]
-    return BaseMapping(K, independent, names, pivots / pivots[0])
+    favour = np.ones(len(names)) if preference is None else preference
+    parts = [
+        (columns, _triangle(W, rows, columns, magnitude, n_rows))
+        for rows, columns in independent_parts(W, n_rows)
+    ]
+    first = [_pivot(R, columns) for columns, R in parts]
+    pivots = np.sort(np.concatenate([sizes for _, sizes in first]))[::-1]
+    K, kept = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
+    for (columns, R), (order, sizes) in zip(parts, first, strict=True):
+        rank = int(np.sum(sizes > rtol * pivots[0]))
+        order = order if preference is None else _pivot(R * favour[columns], columns)[0]
+        own, others = np.sort(order[:rank]), np.sort(order[rank:])
+        triangle = scipy.linalg.qr(R[:, np.append(own, others)], mode="r")[0][:rank]
+        X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
+        X[np.abs(X) < _CLEAN] = 0.0
+        own, others = columns[own], columns[others]
+        kept[own] = True
+        K[own, own] = 1.0
+        K[np.ix_(own, others)] = X * magnitude[own][:, None] / magnitude[others]
+    return BaseMapping(K[kept], np.flatnonzero(kept), names, pivots / pivots[0])
 
 
-def _pivot(R: Array) -> tuple[Array, Array]:
+def independent_parts(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
+    """Return equations and columns that have no entry in common with those of another part.
+
+    Arms on a base that stands still are such parts.
+
+    Args:
+        W: Regressor, shape (N n_rows, p).
+        n_rows: Rows, each of another equation, of one sample.
+
+    Returns:
+        Numbers of the equations, 0 to n_rows - 1, and of the columns of each part.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    filled = (W.reshape(-1, n_rows, W.shape[1]) != 0.0).any(axis=0)  # (n_rows, p)
+    linked = filled.astype(float) @ filled.T > 0.0
+    count, label = connected_components(linked, directed=False)
+    # a column without an entry goes with the first equation
+    of_column = label[filled.argmax(axis=0)]
+    parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
+    return [(rows, columns) for rows, columns in parts if len(columns)]
+
+
+def _triangle(W: Array, rows: Array, columns: Array, magnitude: Array, n_rows: int) -> Array:
+    """Return the triangular factor of a part's scaled columns, shape (c, c)."""
+    part = W.reshape(-1, n_rows, W.shape[1])[:, rows][:, :, columns] * magnitude[columns]
+    flat = part.reshape(-1, len(columns))
+    R: Array = scipy.linalg.qr(flat, mode="r", overwrite_a=True, check_finite=False)[0]
+    return R[: len(columns)]  # the rest is 0
+
+
+def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
     """Return the order in which columns are chosen and the size of each when it was.
 
     LAPACK's QR with column pivoting takes the longest remaining column; later columns are
     shortened by a hair, so that among equal ones the first wins and rounding does not choose.
+
+    Args:
+        R: The columns.
+        columns: Their numbers among all.
     """
-    handicap = 1.0 - _TIE * np.arange(R.shape[1])
-    triangle, order = scipy.linalg.qr(R * handicap, mode="r", pivoting=True)
-    return order, np.abs(np.diag(triangle))
+    triangle, order = scipy.linalg.qr(R * (1.0 - _TIE * columns), mode="r", pivoting=True)
+    sizes = np.zeros(len(columns))
+    diagonal = np.abs(np.diag(triangle))
+    sizes[: len(diagonal)] = diagonal
+    return order, sizes
 
 
 def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
@@ -239,6 +290,7 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
         model.layout.names[:columns],
         scales=model.layout.scales(model.length)[:columns],
         preference=model.layout.preference()[:columns],
+        n_rows=model.n_rows,
     )
 
 
