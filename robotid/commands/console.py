@@ -57,7 +57,8 @@ def open_closed_streams() -> None:
     os.close(number)
     for name in ("stdout", "stderr"):
         if not _is_open(getattr(sys, name)):
-            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))
+            lost = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - to the process' end
+            setattr(sys, name, lost)
 
 
 def _is_open(stream: TextIO | None) -> bool:

@@ -290,18 +290,18 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
     return found
 
 
-def _numbers(values: object, where: str, name: str) -> Array:
+def _numbers(values: ArrayLike | None, where: str, name: str) -> Array:
     """Return values as a read-only array of numbers; NaN where a masked array is masked."""
     if values is None:
         hint = "; without torques, give zeros and has_torque=False" if name == "tau" else ""
         raise DataError(f"{where}: {name} is None, wanted an array{hint}")
     try:
-        array = np.ma.asanyarray(values) if isinstance(values, np.ma.MaskedArray) else values
-        if isinstance(array, np.ma.MaskedArray):
-            array = array.astype(np.float64).filled(np.nan)
-        if (kind := np.asarray(array).dtype.kind) not in "biufO":
-            raise TypeError(f"numbers of kind {kind!r}")
-        return _frozen(array)
+        array: Array = np.ma.asanyarray(values)
+        if array.dtype.kind not in "biufO":
+            raise TypeError(f"numbers of kind {array.dtype.kind!r}")
+        if np.ma.is_masked(array):
+            return _frozen(np.ma.filled(array.astype(np.float64), np.nan))
+        return _frozen(values)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
             f"{where}: {name} is no array of real numbers ({str(error)[:100]}); wanted one of "

@@ -119,9 +119,10 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
 def _names(stated: object) -> list[str]:
     """Return the names of a feature's values; none if they are stated in no known way."""
     groups = list(stated.values()) if isinstance(stated, dict) else [stated]
-    if not all(isinstance(group, list) for group in groups):  # {"motors": [...]}, or a list
+    lists = [group for group in groups if isinstance(group, list)]
+    if len(lists) < len(groups):  # neither {"motors": [...]} nor a list
         return []
-    names = [name for group in groups for name in group]
+    names = [name for group in lists for name in group]
     return names if all(isinstance(name, str) for name in names) else []
 
 
