@@ -81,8 +81,8 @@ def _run(words: Sequence[str]) -> int:
         print_error(error)
         return 1
     except MemoryError as error:
-        words = "the memory does not suffice; lower rates, shorten logs, or lock joints"
-        print_error(error, f"{words} ({error})" if str(error) else words)
+        remedy = "not enough memory; lower rates, shorten logs, or lock joints"
+        print_error(error, f"{remedy} ({error})" if str(error) else remedy)
         return 1
     except KeyboardInterrupt as error:
         print_error(error, "interrupted")
