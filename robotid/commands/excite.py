@@ -36,12 +36,12 @@ __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 _ROUTES = ("sweeps", "stands")
 _START = 2.0  # [s] of design from which compiled code pays
 _RANGES = {
-    "duration": (0.1, 3600.0),
-    "harmonics": (2, 100),
-    "share": (1e-3, 1.0),
-    "starts": (1, 1000),
-    "seconds": (1e-3, np.inf),
-    "points": (0.1, 1e5),
+    "duration": (0.1, 3600.0, " s"),
+    "harmonics": (2, 100, ""),
+    "share": (1e-3, 1.0, " of the limits"),
+    "starts": (1, 1000, ""),
+    "seconds": (1e-3, np.inf, " s"),
+    "points": (0.1, 1e5, " rows per second"),
 }
 _SIZES = 1e-9, 1e12  # of limits and noise, in any unit
 _FARTHEST = 1e3  # [m] of what stands around a robot
@@ -97,15 +97,15 @@ class MotionSettings:
     def __post_init__(self) -> None:
         if self.kind not in _KINDS:
             raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_KINDS)}")
-        for name, (least, most) in _RANGES.items():
+        for name, (least, most, unit) in _RANGES.items():
             value = getattr(self, name)
             if not least <= value <= most:
-                raise SettingsError(f"{name} is {value:g}, wanted {least:g} to {most:g}")
+                raise SettingsError(f"{name} is {value:g}, wanted {least:g} to {most:g}{unit}")
         for name in ("acceleration", "jerk", "power", "noise"):
             for joint, value in getattr(self, name).items():
                 if not _SIZES[0] <= value <= _SIZES[1]:
                     raise SettingsError(
-                        f"{name} of {joint} is {value:g}, wanted {_SIZES[0]:g} to {_SIZES[1]:g}"
+                        f"{name} of {joint!r} is {value:g}, wanted {_SIZES[0]:g} to {_SIZES[1]:g}"
                     )
         if not 0 <= self.seed < 2**63:
             raise SettingsError(f"seed is {self.seed}, wanted 0 or a positive whole number")

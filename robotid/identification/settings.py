@@ -93,8 +93,8 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     found = f"{what} is [{low:g}, {high:g}] kg"
     if not (math.isfinite(low) and math.isfinite(high)):
         raise SettingsError(
-            f"{what} is {value!r}, wanted numbers of at most {_LARGEST:.0e} kg; write that for no "
-            "upper bound"
+            f"{what} is {value!r}, wanted finite numbers of at most {_LARGEST:g} kg; write "
+            f"{_LARGEST:g} for no upper bound"
         )
     if not low <= high:
         raise SettingsError(f"{found}: the first is above the second; write the smaller one first")
@@ -111,7 +111,7 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     if not is_box or not all(abs(x) <= _LARGEST for corner in corners for x in corner):
         raise SettingsError(
             f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], at most "
-            f"{_LARGEST:.0e} each"
+            f"{_LARGEST:g} each"
         )
     low, high = corners
     if any(a > b for a, b in zip(low, high, strict=True)):

@@ -69,10 +69,10 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     [
         (["--clearance", "near"], "--clearance 'near': wanted metres, or none"),
         (["--box", "post=1,2,3"], "--box 'post=1,2,3': wanted NAME=x0,y0,z0,x1,y1,z1"),
-        (["--duration", "-1"], "duration is -1, wanted more than 0"),
+        (["--duration", "-1"], "duration is -1, wanted 0.1 to 3600 s"),
         (["--max-jerk", "elbow=3"], "jerk is stated of 'elbow', which is no joint that moves"),
-        (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1"),
-        (["--harmonics", "1"], "harmonics is 1, wanted 2 or more"),
+        (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1, wanted 1e-09 to 1e+12"),
+        (["--harmonics", "1"], "harmonics is 1, wanted 2 to 100"),
         (["--criterion", "widest"], "criterion is widest, which is about what logs have told"),
     ],
 )
