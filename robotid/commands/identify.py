@@ -30,7 +30,7 @@ from robotid.report.document import write_report
 from robotid.robot.drives import AUTO, DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
-from robotid.workers.checkpoint import Checkpoint
+from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
 __all__ = ["identify_job", "run_job", "save_result"]
@@ -77,7 +77,8 @@ def run_job(
     check_folder(target, ["result.json", *_names(model)])
     found, checkpoint = identify_job(job, model, chosen, target)
     report_stage(chosen.progress, "writing")
-    saved = _write(found, job, target, source=source, beside=beside)
+    with released_on_error(checkpoint):
+        saved = _write(found, job, target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -235,7 +236,7 @@ def identify_job(
             "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
             job.rows_in_memory,
         )
-    with plan:
+    with plan, released_on_error(checkpoint):
         concluded = conclude(
             recordings,
             job.estimator,
