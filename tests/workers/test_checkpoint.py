@@ -153,6 +153,8 @@ def test_a_run_whose_checkpoint_is_gone_does_not_promise_to_resume_it(tmp_path):
         reduce_all(pieces, checkpoint=checkpoint)
     promise = f"finished pieces are kept in {checkpoint.folder}: --resume uses them"
     assert promise in kept.value.__notes__
+    checkpoint.release()
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
     with pytest.raises(DataError, match="there is no folder") as gone:
         reduce_all(
             pieces, checkpoint=checkpoint, progress=lambda *_: shutil.rmtree(checkpoint.folder)
