@@ -112,7 +112,7 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
-    links, last = probe.loads(), probe.regressor()[:, :, -10:-6]
+    links, last = probe.loads(), probe.last_body
     bodies = links.shape[2]
     X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0) if level is None else level

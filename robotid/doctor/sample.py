@@ -1,5 +1,6 @@
 """A log's motion at a few hundred instants, with each part of its torque apart: for the doctor."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,12 +18,16 @@ __all__ = ["Probe", "smooth_motion", "take_probe"]
 
 _MARGIN = 0.15  # [s] rows nearer to the end of a stretch are left out: the filter has not settled
 _STILL = 0.02  # [rad/s] slower than this the sign of a friction torque is not known
+_BLOCK = 32  # instants whose regressors are in memory together
 _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
 
 
 @dataclass(frozen=True, eq=False)
-class _Regressors:
-    """The regressors of N instants, each made when it is first asked for."""
+class _Loads:
+    """The torques of links and the columns of drives at N instants, each when first asked for.
+
+    The regressors they come from are too large to be kept: of 60 joints 0.3 MB an instant.
+    """
 
     model: RobotModel
     q: Array
@@ -30,19 +35,44 @@ class _Regressors:
     a: Array
 
     @cached_property
-    def whole(self) -> Array:
-        """In the gravity that the model states, all columns, shape (N, n, p)."""
-        return self._of(self.model, self.v, self.a)
+    def moving(self) -> tuple[Array, Array, Array]:
+        """Of each link by the URDF, last body's first four columns, those of coupled drives.
+
+        Shapes (N, n, bodies), (N, n, 4) and (N, n, k), in the gravity that the model states.
+        """
+        layout, found = self.model.layout, []
+        coupled = layout.n_inertial + np.flatnonzero(layout.is_coupled)
+        last = layout.n_inertial - np.arange(10, 6, -1)
+        for Y in self._blocks(self.model, self.v, self.a):
+            found.append((self._by_link(Y), Y[:, :, last], Y[:, :, coupled]))
+        links, ends, drives = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return links, ends, drives
 
     @cached_property
-    def pulled(self) -> Array:
-        """At rest in a gravity of 1 m/s^2 along x, y and z, shape (3, N, n, 10 bodies)."""
-        still, size = np.zeros_like(self.v), self.model.layout.n_inertial
-        axes = [_in_gravity(self.model, axis) for axis in np.eye(3)]
-        return np.array([self._of(model, still, still)[:, :, :size] for model in axes])
+    def pulls(self) -> Array:
+        """Of links at rest, per m/s^2 of gravity along x, y and z, shape (3, N, n, bodies)."""
+        still = np.zeros_like(self.v)
+        pulled = [_in_gravity(self.model, axis) for axis in np.eye(3)]
+        return np.array(
+            [
+                np.concatenate([self._by_link(Y) for Y in self._blocks(model, still, still)])
+                for model in pulled
+            ]
+        )
 
-    def _of(self, model: RobotModel, v: Array, a: Array) -> Array:
-        return joint_torque_regressor(model, self.q, v, a).reshape(len(v), model.n_rows, -1)
+    def _blocks(self, model: RobotModel, v: Array, a: Array) -> Iterator[Array]:
+        """Yield the regressors of a few instants after the other, shape (k, n, p)."""
+        for first in range(0, len(v), _BLOCK):
+            part = slice(first, first + _BLOCK)
+            Y = joint_torque_regressor(model, self.q[part], v[part], a[part])
+            yield Y.reshape(-1, model.n_rows, Y.shape[1])
+
+    def _by_link(self, Y: Array) -> Array:
+        size = self.model.layout.n_inertial
+        pi = self.model.standard_parameters()[:size].reshape(-1, 10)
+        by_body = Y[:, :, :size].reshape(*Y.shape[:2], -1, 10)
+        loads: Array = np.einsum("...bi,bi->...b", by_body, pi)
+        return loads
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +87,7 @@ class Probe:
         v: Velocities, shape (N, n).
         a: Accelerations, shape (N, n).
         tau: Torques, shape (N, n) [N m or N].
-        regressors: The regressors of these instants.
+        parts: The parts of the model's torque at these instants.
     """
 
     model: RobotModel
@@ -67,24 +97,17 @@ class Probe:
     v: Array
     a: Array
     tau: Array
-    regressors: _Regressors
+    parts: _Loads
 
     @property
     def gravity(self) -> Array:
         """Gravity as the model states it, shape (3,) [m/s^2]."""
         return np.array(self.model.pin_model.gravity.linear)
 
-    def regressor(self, gravity: Array | None = None) -> Array:
-        """Return the inertial regressor in a gravity, shape (N, n, 10 bodies).
-
-        Args:
-            gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
-        """
-        Y: Array = self.regressors.whole[:, :, : self.model.layout.n_inertial]
-        if gravity is None:
-            return Y
-        more: Array = np.tensordot(gravity - self.gravity, self.regressors.pulled, axes=1)
-        return Y + more
+    @property
+    def last_body(self) -> Array:
+        """Columns of mass and first moments of the last body, shape (N, n, 4)."""
+        return self.parts.moving[1]
 
     def loads(self, gravity: Array | None = None) -> Array:
         """Return the torque that each link loads each joint with by the URDF, (N, n, bodies).
@@ -92,24 +115,11 @@ class Probe:
         Args:
             gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
         """
+        links = self.parts.moving[0]
         if gravity is None:
-            return self._loads
-        more: Array = np.tensordot(gravity - self.gravity, self._pulls, axes=1)
-        return self._loads + more
-
-    @cached_property
-    def _loads(self) -> Array:
-        return self._by_link(self.regressor())
-
-    @cached_property
-    def _pulls(self) -> Array:
-        """The loads of links at rest, per m/s^2 of gravity along each axis, (3, N, n, bodies)."""
-        return self._by_link(self.regressors.pulled)
-
-    def _by_link(self, Y: Array) -> Array:
-        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
-        loads: Array = np.einsum("...bi,bi->...b", Y.reshape(*Y.shape[:-1], -1, 10), pi)
-        return loads
+            return links
+        more: Array = np.tensordot(gravity - self.gravity, self.parts.pulls, axes=1)
+        return links + more
 
     def drive(self, j: int) -> Array:
         """Return what the drive of joint j may add: inertia, frictions, offset of either sign.
@@ -124,9 +134,7 @@ class Probe:
         least = _STILL * float(self.model.layout.drive_speeds[j])
         still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
-        layout = self.model.layout
-        drives = self.regressors.whole[:, j, layout.n_inertial :]
-        return np.hstack([own, drives[:, layout.is_coupled]])
+        return np.hstack([own, self.parts.moving[2][:, j]])
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion, computed anew.
@@ -196,7 +204,7 @@ def _probe_at(model: RobotModel, motion: Trajectory, rows: Array) -> Probe:
 def _probe(
     model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
 ) -> Probe:
-    return Probe(model, motion, rows, *state, motion.tau[rows], _Regressors(model, *state))
+    return Probe(model, motion, rows, *state, motion.tau[rows], _Loads(model, *state))
 
 
 def _in_gravity(model: RobotModel, gravity: Array) -> RobotModel:
