@@ -1,6 +1,5 @@
 """A log's motion at a few hundred instants, with each part of its torque apart: for the doctor."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,14 +10,13 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve, unwrap
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import carried_columns, joint_torque_regressor
 from robotid.robot.model import RobotModel
 
 __all__ = ["Probe", "smooth_motion", "take_probe"]
 
 _MARGIN = 0.15  # [s] rows nearer to the end of a stretch are left out: the filter has not settled
 _STILL = 0.02  # [rad/s] slower than this the sign of a friction torque is not known
-_BLOCK = 32  # instants whose regressors are in memory together
 _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its largest speed
 
 
@@ -26,7 +24,7 @@ _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its larges
 class _Loads:
     """The torques of links and the columns of drives at N instants, each when first asked for.
 
-    The regressors they come from are too large to be kept: of 60 joints 0.3 MB an instant.
+    Whole regressors are too large for it: of 60 joints 0.3 MB an instant.
     """
 
     model: RobotModel
@@ -35,43 +33,47 @@ class _Loads:
     a: Array
 
     @cached_property
-    def moving(self) -> tuple[Array, Array, Array]:
-        """Of each link by the URDF, last body's first four columns, those of coupled drives.
+    def moving(self) -> tuple[Array, Array]:
+        """Of each link by the URDF, (N, n, bodies), and the last body's first four columns."""
+        columns = carried_columns(self.model, self.q, self.v, self.a)
+        ten = columns.reshape(len(columns), -1, 10)
+        rows, bodies = self._places
+        is_last = bodies == self.model.layout.n_inertial // 10 - 1
+        last = np.zeros((*self.v.shape, 4))
+        last[:, rows[is_last]] = ten[:, is_last, :4]
+        return self._by_link(ten), last
 
-        Shapes (N, n, bodies), (N, n, 4) and (N, n, k), in the gravity that the model states.
-        """
-        layout, found = self.model.layout, []
-        coupled = layout.n_inertial + np.flatnonzero(layout.is_coupled)
-        last = layout.n_inertial - np.arange(10, 6, -1)
-        for Y in self._blocks(self.model, self.v, self.a):
-            found.append((self._by_link(Y), Y[:, :, last], Y[:, :, coupled]))
-        links, ends, drives = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return links, ends, drives
+    @cached_property
+    def coupled(self) -> Array:
+        """Columns of the coupled drives, shape (N, n, k)."""
+        layout = self.model.layout
+        chosen = layout.n_inertial + np.flatnonzero(layout.is_coupled)
+        if not len(chosen):
+            return np.empty((*self.v.shape, 0))
+        Y = joint_torque_regressor(self.model, self.q, self.v, self.a)
+        columns: Array = Y.reshape(*self.v.shape, -1)[:, :, chosen]
+        return columns
 
     @cached_property
     def pulls(self) -> Array:
         """Of links at rest, per m/s^2 of gravity along x, y and z, shape (3, N, n, bodies)."""
         still = np.zeros_like(self.v)
         pulled = [_in_gravity(self.model, axis) for axis in np.eye(3)]
-        return np.array(
-            [
-                np.concatenate([self._by_link(Y) for Y in self._blocks(model, still, still)])
-                for model in pulled
-            ]
-        )
+        columns = (carried_columns(model, self.q, still, still) for model in pulled)
+        return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
 
-    def _blocks(self, model: RobotModel, v: Array, a: Array) -> Iterator[Array]:
-        """Yield the regressors of a few instants after the other, shape (k, n, p)."""
-        for first in range(0, len(v), _BLOCK):
-            part = slice(first, first + _BLOCK)
-            Y = joint_torque_regressor(model, self.q[part], v[part], a[part])
-            yield Y.reshape(-1, model.n_rows, Y.shape[1])
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        """Rows and bodies of the carried columns, ten by ten."""
+        carried = self.model.support()[:, : self.model.layout.n_inertial : 10]
+        rows, bodies = np.nonzero(carried)
+        return rows, bodies
 
-    def _by_link(self, Y: Array) -> Array:
-        size = self.model.layout.n_inertial
-        pi = self.model.standard_parameters()[:size].reshape(-1, 10)
-        by_body = Y[:, :, :size].reshape(*Y.shape[:2], -1, 10)
-        loads: Array = np.einsum("...bi,bi->...b", by_body, pi)
+    def _by_link(self, ten: Array) -> Array:
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
+        rows, bodies = self._places
+        loads = np.zeros((*self.v.shape, len(pi)))
+        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", ten, pi[bodies])
         return loads
 
 
@@ -134,7 +136,7 @@ class Probe:
         least = _STILL * float(self.model.layout.drive_speeds[j])
         still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
-        return np.hstack([own, self.parts.moving[2][:, j]])
+        return np.hstack([own, self.parts.coupled[:, j]])
 
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion, computed anew.

@@ -16,7 +16,7 @@ from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import carried_columns, joint_torque_regressor
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_torque_delay"]
@@ -37,7 +37,6 @@ _AWAY = 0.75  # [periods of the filter] so near a slow instant friction is not k
 _ROWS = 2000  # instants that are looked at
 _WINDOWS = 8  # stretches they are in, where the log has more of them
 _BLOCKS = 8  # parts of the log that are left out in turn
-_BLOCK = 32  # instants whose regressors are in memory together
 _OVERSAMPLED = 8.0  # instants per period of the filter: products of motions are faster than they
 # Cut-off of the comparison over the job's, and over the rate at most: noise that is interpolated
 # between rows would be smoothed there.
@@ -185,7 +184,7 @@ def _misfit(
         _window(model, motion, part, step, every, signals, period)
         for part in _stretches(model, motion, every)
     ]
-    ends = np.cumsum(_carried(model).sum(axis=1)).tolist()
+    ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
     own = [slice(*pair) for pair in pairwise([0, *ends])]
     found = [_squares(windows, j, part) for j, part in enumerate(own)] if windows else []
     told = [one for one in found if one is not None]
@@ -234,7 +233,8 @@ def _window(
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
     inertial, coupled = (
-        low_pass(part, 1 / (step * every), signals)[inner] for part in _columns(model, *state)
+        low_pass(columns(model, *state), 1 / (step * every), signals)[inner]
+        for columns in (carried_columns, _coupled)
     )
     at = motion.t[coarse[inner]]
     turns = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
@@ -246,23 +246,14 @@ def _window(
     return _Window(inertial, drive, np.column_stack(steady), late)
 
 
-def _columns(model: RobotModel, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """Return the regressor's columns, inertial of ``_carried`` and of coupled drives (N, n, k)."""
-    carried, size, found = _carried(model), model.layout.n_inertial, []
-    coupled = size + np.flatnonzero(model.layout.is_coupled)
-    for first in range(0, len(q), _BLOCK):
-        part = slice(first, first + _BLOCK)
-        W = joint_torque_regressor(model, q[part], v[part], a[part])
-        W = W.reshape(-1, len(model.joints), W.shape[1])
-        found.append((W[:, :, :size][:, carried], W[:, :, coupled]))
-    inertial, drives = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return inertial, drives
-
-
-def _carried(model: RobotModel) -> Array:
-    """Return which inertial columns each joint has, shape (n, p), bool: a tenth of 60 joints'."""
-    own: Array = model.support()[:, : model.layout.n_inertial]
-    return own
+def _coupled(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the regressor's columns of coupled drives, shape (N, n, k)."""
+    coupled = model.layout.n_inertial + np.flatnonzero(model.layout.is_coupled)
+    if not len(coupled):
+        return np.empty((*q.shape, 0))
+    W = joint_torque_regressor(model, q, v, a)
+    columns: Array = W.reshape(*q.shape, -1)[:, :, coupled]
+    return columns
 
 
 def _interpolated(t: Array, values: Array, times: Sequence[Array]) -> Array:

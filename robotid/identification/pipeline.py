@@ -515,7 +515,7 @@ class Identification:
         """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
         return call_witness(self)
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
         return judge(
