@@ -16,7 +16,7 @@ from robotid.exceptions import ModelError
 from robotid.findings import Finding, listed
 from robotid.regressor.base_parameters import (
     BaseMapping,
-    independent_parts,
+    independent_factors,
     structural_mapping,
 )
 from robotid.regressor.torque import random_regressor
@@ -142,11 +142,9 @@ def _condition(model: RobotModel, mapping: BaseMapping) -> float:
     columns = len(mapping.names)
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
-    unit, n = W / np.linalg.norm(W, axis=0), model.n_rows
     sizes = [
-        np.linalg.svd(np.linalg.qr(part.reshape(-1, len(kept)), mode="r"), compute_uv=False)
-        for rows, kept in independent_parts(unit, n)
-        for part in [unit.reshape(-1, n, unit.shape[1])[:, rows][:, :, kept]]
+        np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
+        for _, R in independent_factors(W, model.n_rows)
     ]
     return float(max(s[0] for s in sizes) / min(s[-1] for s in sizes))
 

@@ -22,7 +22,7 @@ __all__ = [
     "RANK_TOLERANCE",
     "BaseMapping",
     "base_mapping",
-    "independent_parts",
+    "independent_factors",
     "structural_mapping",
 ]
 
@@ -31,6 +31,7 @@ __all__ = [
 RANK_TOLERANCE = 1e-4
 _TIE = 1e-6  # share by which each column is shortened against the one before it
 _FAINTEST = 1e-12  # length of a column that is 0 at every state
+_PANEL = 24  # columns eliminated at a time
 _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
 _SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
 
@@ -190,10 +191,7 @@ def base_mapping(
         raise DataError("W must be finite and not all zero")
     magnitude = np.ones(len(names)) if scales is None else scales
     favour = np.ones(len(names)) if preference is None else preference
-    parts = [
-        (columns, _triangle(W, rows, columns, magnitude, n_rows))
-        for rows, columns in independent_parts(W, n_rows)
-    ]
+    parts = [(own, R * magnitude[own]) for own, R in independent_factors(W, n_rows)]
     first = [_pivot(R, columns) for columns, R in parts]
     pivots = np.sort(np.concatenate([sizes for _, sizes in first]))[::-1]
     K, kept = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
@@ -211,8 +209,8 @@ def base_mapping(
     return BaseMapping(K[kept], np.flatnonzero(kept), names, pivots / pivots[0])
 
 
-def independent_parts(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
-    """Return equations and columns that have no entry in common with those of another part.
+def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
+    """Return factors of parts of a regressor that have no equation and no column in common.
 
     Arms on a base that stands still are such parts.
 
@@ -221,25 +219,72 @@ def independent_parts(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
         n_rows: Rows, each of another equation, of one sample.
 
     Returns:
-        Numbers of the equations, 0 to n_rows - 1, and of the columns of each part.
+        Of each part its c columns, and R with R^T R = W^T W of them, shape (c, c).
     """
     from scipy.sparse.csgraph import connected_components
 
-    filled = (W.reshape(-1, n_rows, W.shape[1]) != 0.0).any(axis=0)  # (n_rows, p)
+    samples = W.reshape(-1, n_rows, W.shape[1])
+    filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
     linked = filled.astype(float) @ filled.T > 0.0
     count, label = connected_components(linked, directed=False)
     # a column without an entry goes with the first equation
     of_column = label[filled.argmax(axis=0)]
     parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
-    return [(rows, columns) for rows, columns in parts if len(columns)]
+    return [
+        (own, _factor(samples[:, rows][:, :, own], filled[np.ix_(rows, own)]))
+        for rows, own in parts
+        if len(own)
+    ]
 
 
-def _triangle(W: Array, rows: Array, columns: Array, magnitude: Array, n_rows: int) -> Array:
-    """Return the triangular factor of a part's scaled columns, shape (c, c)."""
-    part = W.reshape(-1, n_rows, W.shape[1])[:, rows][:, :, columns] * magnitude[columns]
-    flat = part.reshape(-1, len(columns))
-    R: Array = scipy.linalg.qr(flat, mode="r", overwrite_a=True, check_finite=False)[0]
-    return R[: len(columns)]  # the rest is 0
+def _factor(rows: Array, filled: Array) -> Array:
+    """Return R with R^T R = W^T W.
+
+    An equation has the columns of what its joint carries. From those at the ends of the robot to
+    that at its base, each is folded into the columns that it has, which are neighbours in a
+    suitable order; a robot whose equations are not nested so is factored as a whole.
+
+    Args:
+        rows: W, shape (N, m, c).
+        filled: Which columns an equation has, shape (m, c), bool.
+    """
+    c = rows.shape[2]
+    fewest = np.argsort(filled.sum(axis=1), kind="stable")
+    place = np.lexsort(filled[fewest])  # by the equation with the most columns first
+    spans = [_span(own) for own in filled[:, place]]
+    if None in spans or not _are_nested([span for span in spans if span is not None]):
+        R: Array = scipy.linalg.qr(rows.reshape(-1, c), mode="r", check_finite=False)[0]
+        return R[:c]
+    R = np.zeros((c, c))
+    for k in fewest:
+        first, last = spans[k] or (0, 0)
+        if first == last:
+            continue
+        own = slice(first, last)
+        panel = min(_PANEL, last - first)
+        # pentagonal of height 0: no row below the triangle is triangular itself
+        R[own, own] = scipy.linalg.lapack.dtpqrt(
+            0, panel, np.asfortranarray(R[own, own]), np.asfortranarray(rows[:, k, place[own]])
+        )[0]
+    found = np.empty((c, c))
+    found[:, place] = R
+    return found
+
+
+def _span(own: Array) -> tuple[int, int] | None:
+    """Return first and end of columns, None if they are no neighbours."""
+    places = np.flatnonzero(own)
+    if not len(places):
+        return 0, 0
+    first, last = int(places[0]), int(places[-1]) + 1
+    return (first, last) if last - first == len(places) else None
+
+
+def _are_nested(spans: Sequence[tuple[int, int]]) -> bool:
+    """Return whether of two spans that share a column one has the other."""
+    first, last = np.array(spans).T
+    begins, ends = first[:, None] < first, last[:, None] < last
+    return not (begins & (first < last[:, None]) & ends).any()
 
 
 def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
