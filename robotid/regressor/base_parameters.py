@@ -240,15 +240,16 @@ def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
 def _factor(rows: Array, filled: Array) -> Array:
     """Return R with R^T R = W^T W.
 
-    An equation has the columns of what its joint carries. From those at the ends of the robot to
-    that at its base, each is folded into the columns that it has, which are neighbours in a
-    suitable order; a robot whose equations are not nested so is factored as a whole.
+    An equation has the columns of what its joint carries, those of every joint behind it among
+    them. From the ends of the robot to its base, each is folded into these columns, which are
+    neighbours in a suitable order. A robot whose equations are not nested so is factored as a
+    whole.
 
     Args:
         rows: W, shape (N, m, c).
         filled: Which columns an equation has, shape (m, c), bool.
     """
-    c = rows.shape[2]
+    c, filled = rows.shape[2], _with_carried(filled)
     fewest = np.argsort(filled.sum(axis=1), kind="stable")
     place = np.lexsort(filled[fewest])  # by the equation with the most columns first
     spans = [_span(own) for own in filled[:, place]]
@@ -269,6 +270,18 @@ def _factor(rows: Array, filled: Array) -> Array:
     found = np.empty((c, c))
     found[:, place] = R
     return found
+
+
+def _with_carried(filled: Array) -> Array:
+    """Return the columns of each equation with all of those of which it has most.
+
+    A parameter that loads a joint loads none before it if its axis happens to be so.
+    """
+    wider, sizes = filled.copy(), filled.sum(axis=1)
+    for k in np.argsort(sizes, kind="stable"):
+        shared = (filled & filled[k]).sum(axis=1)
+        wider[k] |= wider[(sizes <= sizes[k]) & (2 * shared > sizes)].any(axis=0)
+    return wider
 
 
 def _span(own: Array) -> tuple[int, int] | None:
