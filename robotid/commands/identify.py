@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
+from robotid._settings import require_kind
 from robotid._typing import report_stage
 from robotid.commanded.identify import Commanded
 from robotid.commands.commanded import run_commanded
@@ -69,6 +70,8 @@ def run_job(
         SettingsError: If a setting does not fit.
         WorkerError: If a worker ends before its work.
     """
+    require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
+    require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
     if isinstance(job.estimator, SimulationSettings):
         return run_commanded(job, folder, progress=chosen.progress)
@@ -99,6 +102,8 @@ def save_result(identification: Identification, folder: str | Path, *, report: b
         ModelError: If the URDF that the robot was read from is gone.
         SettingsError: If the folder is a file, or cannot be written to.
     """
+    require_kind(folder, (str, Path), "folder", "the path of a folder")
+    require_kind(report, bool, "report", "True or False")
     target = Path(folder)
     check_folder(target, ["result.json", *_names(identification.model)])
     asked = identification.asked

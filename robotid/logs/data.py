@@ -96,6 +96,9 @@ class Log:
         Raises:
             DataError: If fewer than two rows are left.
         """
+        for name, limit in (("start", start), ("end", end)):
+            if not isinstance(limit, float | int | np.number | None):
+                raise DataError(f"{name} is {str(limit)[:60]!r}, wanted a time [s], or None")
         first = self.t[0] if start is None else start
         last = self.t[-1] if end is None else end
         rows = np.flatnonzero((self.t >= first) & (self.t <= last))

@@ -81,7 +81,7 @@ def predict_instants(
     Raises:
         DataError: If a shape does not fit, or a value is not finite.
     """
-    q = np.asarray(q, dtype=float)
+    q = _numbers("q", q)
     wanted = (*q.shape[:-1], model.n_rows)
     width = len(model.joints) + 7 * model.free_flyer
     if q.ndim not in (1, 2) or q.shape[-1] != width:
@@ -90,7 +90,9 @@ def predict_instants(
             f"{'the pose of the base, then ' if model.free_flyer else ''}a column for each of "
             f"{listed(model.joints)}"
         )
-    given = [np.zeros(wanted) if x is None else np.asarray(x, dtype=float) for x in (v, a)]
+    given = [
+        np.zeros(wanted) if x is None else _numbers(name, x) for name, x in (("v", v), ("a", a))
+    ]
     for name, x in zip("va", given, strict=True):
         if x.shape != wanted:
             raise DataError(
@@ -102,6 +104,15 @@ def predict_instants(
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
     return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    """Return values as an array of numbers."""
+    try:
+        array: Array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name} is {str(values)[:60]!r}, wanted an array of numbers") from error
+    return array
 
 
 def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
