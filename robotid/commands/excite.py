@@ -100,7 +100,8 @@ class MotionSettings:
         for name, (least, most, unit) in _RANGES.items():
             value = getattr(self, name)
             if not least <= value <= most:
-                raise SettingsError(f"{name} is {value:g}, wanted {least:g} to {most:g}{unit}")
+                wanted = f"{least:g} to {most:g}" if most < np.inf else f"{least:g} or more"
+                raise SettingsError(f"{name} is {value:g}, wanted {wanted}{unit}")
         for name in ("acceleration", "jerk", "power", "noise"):
             for joint, value in getattr(self, name).items():
                 if not _SIZES[0] <= value <= _SIZES[1]:

@@ -33,7 +33,7 @@ __all__ = ["Noise", "Run", "another_robot", "carried", "follow", "lateness", "si
 _LONGEST_STEP = 2.5e-3  # [s] of the integration, whatever the rate of the log
 _ELASTIC_STEP = 0.3  # of 1 / w of the fastest elastic gear
 _SHORTEST_STEP = 1e-6  # [s] of the integration; a stiffer gear is refused
-_MOST = 1e8  # steps of a simulation ...
+_MOST = 2e7  # steps of a simulation, half an hour's work ...
 _MOST_EACH = 100_000  # ... and between two samples
 _CHUNK = 1024  # steps that a motion is evaluated for at once
 _LEAST_INERTIA = 0.02  # [kg m^2 or kg] that PD gains are reckoned with, at least
@@ -171,7 +171,7 @@ def follow(
 
 
 def _check_size(samples: float, steps: int) -> None:
-    """Refuse simulations of more steps than a computer makes in a day."""
+    """Refuse simulations of more steps than a computer makes in an hour."""
     if samples * steps > _MOST or steps > _MOST_EACH:
         raise SettingsError(
             f"the simulation has {samples:.3g} samples of {steps} steps each, wanted at most "

@@ -254,7 +254,7 @@ class Simulation(Settings):
 
     seed: int = setting(0, "of the truth, the noise, and what is dropped", within=NOT_NEGATIVE)
     rate: float = setting(
-        1000.0, "rate of the log [Hz]", within=Range("1e-3 to 1e6", lambda x: 1e-3 <= x <= 1e6)
+        1000.0, "rate of the log [Hz]", within=Range("1e-3 to 1e5", lambda x: 1e-3 <= x <= 1e5)
     )
     duration: float | None = setting(
         None, "length of the log [s]; that of the motion if not stated", within=POSITIVE
