@@ -12,7 +12,7 @@ from robotid.simulation.settings import DELAY, GAIN, LEVEL, PerJoint
 
 __all__ = ["LoopSettings", "groups_of"]
 
-_CLOCK = Range("1 to 1e5 Hz", lambda x: 1.0 <= x <= 1e5)
+_CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)
 #: What a loop has that a logged torque has not.
 _OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
 

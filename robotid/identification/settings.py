@@ -367,7 +367,7 @@ class SimulationSettings(EstimatorSettings):
     step: float = setting(
         2e-3,
         "longest step of the integration [s]",
-        within=Range("1e-5 to 0.1", lambda x: 1e-5 <= x <= 0.1),
+        within=Range("2e-5 to 0.1", lambda x: 2e-5 <= x <= 0.1),
     )
     bodies: float = setting(
         0.1,

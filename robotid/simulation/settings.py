@@ -89,7 +89,7 @@ class Truth(Settings):
         "how far each body is from the URDF's: standard deviation along each of ten directions in "
         "the metric of pseudo-inertias, so that every draw is a possible body; 0.1: masses differ "
         "by about 14 % [-]",
-        within=NOT_NEGATIVE,
+        within=Range("0 to 5", lambda x: 0 <= x <= 5),
     )
     drives: str = setting(
         "usual",

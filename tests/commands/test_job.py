@@ -164,7 +164,7 @@ WRONG = {
                       "a drive term is [], wanted a table, as { term = 'Stribeck'"),
     "group": ('"wls"', '"simulation"\n[controller]\ngroups = { a = "j1" }',
               "groups.a is 'j1', wanted a list"),
-    "step": ('"wls"', '"simulation"\nstep = 1e-9', "step is 1e-09, wanted 1e-5 to 0.1"),
+    "step": ('"wls"', '"simulation"\nstep = 1e-9', "step is 1e-09, wanted 2e-5 to 0.1"),
     "window": ('"wls"', '"simulation"\nwindow = 1e-3', "window is 0.001, wanted 0.05 s or more"),
     "delay": ('"wls"', '"simulation"\n[controller]\ndelay = 1.5', "delay is 1.5, wanted 0 to 1 s"),
     "clock": ('"wls"', '"simulation"\n[controller]\nrate = 1e9', "rate is 1000000000.0, wanted 1"),

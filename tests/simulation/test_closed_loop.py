@@ -13,7 +13,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.simulation.closed_loop import Noise, carried, follow, simulate
 from robotid.simulation.motions import FourierTrajectory, random_fourier
-from robotid.simulation.settings import Actuator, Controller, Payload, Simulation
+from robotid.simulation.settings import Actuator, Controller, Payload, Simulation, Truth
 
 
 def test_a_fourier_motion_keeps_its_derivatives(rng):
@@ -239,3 +239,5 @@ def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5):
                    settings=Simulation())  # fmt: skip
     with pytest.raises(SettingsError, match=r"rate is 1000000000\.0, wanted 1e-3 to 1e5"):
         Simulation(rate=1e9)
+    with pytest.raises(SettingsError, match="inertials is 1000, wanted 0 to 5"):
+        Truth(inertials=1000)
