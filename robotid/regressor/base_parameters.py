@@ -253,7 +253,7 @@ def _factor(rows: Array, filled: Array) -> Array:
     fewest = np.argsort(filled.sum(axis=1), kind="stable")
     place = np.lexsort(filled[fewest])  # by the equation with the most columns first
     spans = [_span(own) for own in filled[:, place]]
-    if None in spans or not _are_nested([span for span in spans if span is not None]):
+    if None in spans:  # equations that share columns without one having the other's
         R: Array = scipy.linalg.qr(rows.reshape(-1, c), mode="r", check_finite=False)[0]
         return R[:c]
     R = np.zeros((c, c))
@@ -291,13 +291,6 @@ def _span(own: Array) -> tuple[int, int] | None:
         return 0, 0
     first, last = int(places[0]), int(places[-1]) + 1
     return (first, last) if last - first == len(places) else None
-
-
-def _are_nested(spans: Sequence[tuple[int, int]]) -> bool:
-    """Return whether of two spans that share a column one has the other."""
-    first, last = np.array(spans).T
-    begins, ends = first[:, None] < first, last[:, None] < last
-    return not (begins & (first < last[:, None]) & ends).any()
 
 
 def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
