@@ -34,8 +34,9 @@ def check_file(target: Path) -> None:
 
     Raises:
         DataError: If its folder does not exist.
-        SettingsError: If it is a folder.
+        SettingsError: If it is a folder, or its name is too long.
     """
+    _check_length(target.name)
     if not target.parent.is_dir():
         raise DataError(f"there is no folder {str(target.parent)!r} to write {target.name} in")
     if target.is_dir():
@@ -53,7 +54,7 @@ def check_folder(target: Path, names: Iterable[str] = ()) -> None:
 
     Raises:
         SettingsError: If it, or a folder above it, is a file or not writable, or if one of its
-            files is a folder.
+            files is a folder or has a name that is too long.
     """
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not there.is_dir():
@@ -62,9 +63,15 @@ def check_folder(target: Path, names: Iterable[str] = ()) -> None:
         )
     if not os.access(there, os.W_OK | os.X_OK):
         raise SettingsError(f"the folder {str(there)!r} is not writable; name another")
-    if there == target:
-        for name in names:
+    for name in names:
+        _check_length(name)
+        if there == target:
             check_file(target / name)
+
+
+_LONGEST = 255  # bytes of a file's name
+_HIDDEN = 32  # bytes that the name of a hidden file has beside it
+_SHOWN = 60  # characters of a name in a message
 
 
 @contextmanager
@@ -95,7 +102,7 @@ def written_whole(target: str | Path) -> Iterator[Path]:
             except BrokenPipeError as error:
                 raise DataError(f"the reader of {str(path)!r} left before its end") from error
         return
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside = path.with_name(_hidden(path.name))
     try:
         yield beside
         os.replace(beside, path)
@@ -104,6 +111,22 @@ def written_whole(target: str | Path) -> Iterator[Path]:
         raise
     finally:
         beside.unlink(missing_ok=True)
+
+
+def _hidden(name: str) -> str:
+    """Return the name of a file while it is written; that of a long name has its hash."""
+    known = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    kept = name if len(os.fsencode(name)) <= _LONGEST - _HIDDEN else known
+    return f".{kept}.{os.getpid()}"
+
+
+def _check_length(name: str) -> None:
+    """Refuse a name that no file system takes."""
+    if (length := len(os.fsencode(name))) > _LONGEST:
+        raise SettingsError(
+            f"the name '{name[:_SHOWN]}...' of a file to write has {length} bytes, wanted at most "
+            f"{_LONGEST}; name a shorter one (names of results begin with that of the URDF)"
+        )
 
 
 def _is_stream(path: Path) -> bool:
@@ -234,8 +257,13 @@ def file_sha256(path: str | Path) -> str:
 
     Args:
         path: The file, or the folder of a bag.
+
+    Raises:
+        DataError: If it is a pipe or a device, which has no end or another content each time.
     """
     source = Path(path)
+    if source.exists() and not source.is_file() and not source.is_dir():
+        raise DataError(missing_file(source, "file"))
     if source.is_dir():
         files = sorted(file for file in source.iterdir() if file.is_file())
         listing = "".join(f"{file_sha256(file)}  {file.name}\n" for file in files)  # as sha256sum

@@ -20,6 +20,7 @@ __all__ = [
     "Range",
     "Settings",
     "check_keys",
+    "require_kind",
     "setting",
     "table_in",
 ]
@@ -40,6 +41,22 @@ class Entries:
     outer: type  # list or dict
     inner: tuple[type, ...]  # of each entry
     count: int | None = None  # how many there are; any number if None
+
+
+def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted: str) -> None:
+    """Refuse an argument of another kind than a function takes.
+
+    Args:
+        value: The argument.
+        kind: What it may be.
+        name: What it is called.
+        wanted: What is wanted, in words.
+
+    Raises:
+        SettingsError: If it is something else.
+    """
+    if not isinstance(value, kind):
+        raise SettingsError(f"{name} is {_shown(value)}, a {type(value).__name__}, wanted {wanted}")
 
 
 POSITIVE = Range("a positive number", lambda x: x > 0)
@@ -206,7 +223,7 @@ def _check_array(value: object, schema: Mapping[str, Any], where: str, name: str
         )
     for item in value:
         check_keys(item, schema, where, f"{name}.")
-        for required in ("log", "name", "ratios", "matrix"):
+        for required in ("log", "name", "ratios", "joints", "matrix"):
             if required in schema and required not in item:
                 raise SettingsError(f"{where}: a [[{name}]] has no key {required!r}")
 
@@ -233,7 +250,7 @@ def _check_type(value: object, kinds: tuple[type, ...], at: str) -> None:
 def _shown(value: object) -> str:
     """Return a value as a message shows it, in one line."""
     try:
-        text = repr(value)
+        text = " ".join(repr(value).split())
     except ValueError:  # Python writes no number of more than 4300 digits
         return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:60]}...{text[-17:]}"
@@ -244,13 +261,22 @@ def _check_value(value: Any, key: Key, name: str) -> None:  # noqa: ANN401
         return
     words = [f"one of {listed(key.among)}"] if key.among else []
     if key.within is None:
-        is_right = value in key.among
+        is_right = _is_so(lambda: value in key.among)
     elif isinstance(value, str):
         is_right, words = value in key.among, [key.within.words, *words]
     else:
-        is_right, words = key.within.holds(value), [key.within.words]
+        within = key.within
+        is_right, words = _is_so(lambda: within.holds(value)), [within.words]
     if not is_right:
         raise SettingsError(f"{name} is {_shown(value)}, wanted {' or '.join(words)}")
+
+
+def _is_so(holds: Callable[[], Any]) -> bool:
+    """Return whether a check holds; of a value that it cannot be made of it does not."""
+    try:
+        return bool(holds())
+    except (TypeError, ValueError):
+        return False
 
 
 _NUMBER = (int, float)

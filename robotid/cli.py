@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from robotid._files import check_file
 from robotid.commands.console import (
     Terminated,
+    open_closed_streams,
     print_error,
     shown_log,
     terminal_progress,
@@ -53,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         that is not ignored, 2 wrong usage, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
     """
     code = 0
+    open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may lack what a name has
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -77,6 +79,10 @@ def _run(words: Sequence[str]) -> int:
         return 2
     except (RobotIdError, OSError) as error:
         print_error(error)
+        return 1
+    except MemoryError as error:
+        remedy = "not enough memory; lower rates, shorten logs, or lock joints"
+        print_error(error, f"{remedy} ({error})" if str(error) else remedy)
         return 1
     except KeyboardInterrupt as error:
         print_error(error, "interrupted")

@@ -89,7 +89,8 @@ class MissingDependencyError(RobotIdError, ImportError):
     def __init__(self, purpose: str, package: str, extra: str) -> None:
         self.package = package
         super().__init__(
-            f"{purpose} needs {package}, which is not installed: pip install robotid[{extra}]"
+            f"{purpose} needs {package}, which is not installed: pip install '.[{extra}]' in a "
+            f"checkout of robotid, or pip install 'robotid[{extra}]' where an index has it"
         )
 
 

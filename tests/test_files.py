@@ -8,7 +8,14 @@ import threading
 
 import pytest
 
-from robotid._files import check_file, check_folder, folder_beside, write_text, written_whole
+from robotid._files import (
+    check_file,
+    check_folder,
+    file_sha256,
+    folder_beside,
+    write_text,
+    written_whole,
+)
 from robotid.exceptions import DataError, SettingsError
 
 
@@ -129,3 +136,27 @@ def test_an_error_names_the_file_and_leaves_nothing(tmp_path):
         raise OSError(28, "no space")
     assert caught.value.__notes__ == [f"while writing {str(tmp_path / 'x')!r}"]
     assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["x" * 255, "é" * 127, "x" * 223])
+def test_a_file_whose_name_is_as_long_as_can_be_is_written(tmp_path, name):
+    assert write_text("page", tmp_path / name).read_text() == "page"
+    assert names(tmp_path) == [name]
+
+
+def test_a_name_that_no_file_system_takes_is_refused_before_the_work(tmp_path):
+    words = "has 256 bytes, wanted at most 255; name a shorter one"
+    for refuse in (
+        lambda: check_file(tmp_path / ("x" * 256)),
+        lambda: check_file(tmp_path / ("é" * 128)),
+        lambda: check_folder(tmp_path, ["a", "x" * 256]),
+        lambda: check_folder(tmp_path / "to make", ["a", "x" * 256]),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            refuse()
+
+
+def test_what_has_no_end_has_no_hash(tmp_path):
+    (tmp_path / "log.csv").symlink_to("/dev/null")
+    with pytest.raises(DataError, match=r"log.csv' is a pipe or a device, wanted a file; copy it"):
+        file_sha256(tmp_path / "log.csv")

@@ -4,14 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-from robotid._settings import POSITIVE, Settings, setting
+from robotid._settings import Entries, Range, Settings, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 from robotid.logs.data import suggestion
-from robotid.simulation.settings import GAIN, LEVEL, PerJoint
+from robotid.simulation.settings import DELAY, GAIN, LEVEL, PerJoint
 
 __all__ = ["LoopSettings", "groups_of"]
 
+_CLOCK = Range("1 to 2e4 Hz", lambda x: 1.0 <= x <= 2e4)
 #: What a loop has that a logged torque has not.
 _OF_LOOPS = ("kp", "kd", "limit", "delay", "delays", "rate", "gravity_compensation", "zeros")
 
@@ -47,7 +48,7 @@ class LoopSettings(Settings):
         among=("find",),
     )
     delay: PerJoint | None = setting(
-        None, "how late the command acts [s], likewise; found if not stated", **LEVEL
+        None, "how late the command acts [s], likewise; found if not stated", **DELAY
     )
     delays: str = setting(
         "one", "whether the robot has one delay that is found, that of bus and controller, or each "
@@ -55,7 +56,7 @@ class LoopSettings(Settings):
     )  # fmt: skip
     rate: float | None = setting(
         None, "how often a second a controller with a clock reads position and speed, to hold its "
-        "torque until the next time [Hz]; none if not stated: it follows at once", within=POSITIVE,
+        "torque until the next time [Hz]; none if not stated: it follows at once", within=_CLOCK,
     )  # fmt: skip
     gravity_compensation: bool = setting(
         False, "whether the controller adds the torque of gravity by the URDF"
@@ -63,7 +64,7 @@ class LoopSettings(Settings):
     groups: Mapping[str, Sequence[str]] = setting(
         {}, "joints with equal drives, by a name for each group, which share gains, armature and "
         "viscous friction; joints that are alike in the URDF if not stated",
-        reads=(dict,),
+        reads=Entries(dict, (list,)),
     )  # fmt: skip
     zeros: str = setting(
         "urdf", "zero and sign of the encoders: as the URDF has them, or found, from gravity",
@@ -97,6 +98,10 @@ def groups_of(settings: LoopSettings, joints: Sequence[str], alike: Sequence[Any
     """
     found: dict[str, str] = {}
     for group, members in settings.groups.items():
+        if isinstance(members, str) or not isinstance(members, Sequence):
+            raise SettingsError(
+                f"controller: groups.{group} is {members!r}, wanted a list of joints"
+            )
         for joint in members:
             if joint not in joints:
                 raise SettingsError(

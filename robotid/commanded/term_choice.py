@@ -4,6 +4,7 @@ The residual is linear in a term that is not there yet, to first order. So one r
 slopes of all candidates tells, for any of them, what a fit to some windows would make of others.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,8 +20,11 @@ __all__ = ["Tried", "candidates", "choose"]
 
 _GAIN = 0.02  # of a joint's squared residual, by which a term must lower that of other windows
 _FOLDS = 6
+_FEWEST = 2  # windows: one is judged by what others were fitted to
 _SLOW = 0.3  # of a joint's usual speed, over which Stribeck's hook fades
 _WIDE = 0.05  # [rad or m] of motion from which friction can depend on the position
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,13 @@ def choose(
         estimator: How residuals weigh.
     """
     joints = simulator.robot.model.joints
+    if len(simulator.windows) < _FEWEST:
+        _log.warning(
+            "further friction is not tried: the logs have %d window to fit, wanted at least %d, to "
+            "judge by one what another was fitted to; record longer, or shorten window in "
+            "[estimator]",
+            len(simulator.windows), _FEWEST,
+        )  # fmt: skip
     place = {name: k for k, name in enumerate(simulator.names)}
     sets = [[place[unknown.name] for unknown in unknowns] for unknowns in offered]
     folds = _folds(simulator, theta, estimator)
@@ -162,20 +173,28 @@ def _folds(simulator: LoopSimulator, theta: Array, estimator: OutputError) -> li
 def _gains(
     folds: Sequence[_Fold], columns: list[int], sets: dict[int, list[int]]
 ) -> dict[int, float]:
-    """Return by how much each set of further columns lowers the squares of folds left out."""
+    """Return by how much each set of further columns lowers the squares of folds left out.
+
+    0 of all if the other folds leave a parameter open, as those of short logs: then nothing shows
+    what a term gains where it was not fitted.
+    """
     gains = dict.fromkeys(sets, 0.0)
     H, g = sum(fold.H for fold in folds), sum(fold.g for fold in folds)
     base = np.array(columns)
     for fold in folds:
         H_f, g_f = H - fold.H, g - fold.g  # of the others
-        factor = scipy.linalg.cho_factor(H_f[np.ix_(base, base)])
+        try:
+            factor = scipy.linalg.cho_factor(H_f[np.ix_(base, base)])
+        except scipy.linalg.LinAlgError:  # not positive definite
+            return dict.fromkeys(sets, 0.0)
         move = scipy.linalg.cho_solve(factor, g_f[base])
         slope = fold.H[np.ix_(base, base)] @ move - fold.g[base]
         for s, own in sets.items():
             further = np.array(own)
             B = H_f[np.ix_(base, further)]
             X = scipy.linalg.cho_solve(factor, B)
-            y = np.linalg.solve(H_f[np.ix_(further, further)] - B.T @ X, g_f[further] - B.T @ move)
+            S = H_f[np.ix_(further, further)] - B.T @ X
+            y = np.linalg.lstsq(S, g_f[further] - B.T @ move, rcond=None)[0]
             d = -X @ y
             change = 2 * slope @ d + d @ fold.H[np.ix_(base, base)] @ d
             across = fold.H[np.ix_(further, base)] @ (move + d) - fold.g[further]

@@ -1,5 +1,6 @@
 """Errors and progress on a terminal, and how a command that is told to end does."""
 
+import errno
 import logging
 import os
 import re
@@ -8,8 +9,9 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from robotid._text import terminal_width, tinted, wrapped
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Terminated",
+    "open_closed_streams",
     "print_error",
     "shown_log",
     "terminal_progress",
@@ -28,6 +31,7 @@ __all__ = [
 ]
 
 
+_LAST_STREAM = 2  # the number of the standard error stream
 _ENDS = tuple(getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n))
 
 
@@ -41,6 +45,33 @@ class Terminated(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         self.number = number
         super().__init__(signal.Signals(number).name)
+
+
+def open_closed_streams() -> None:
+    """Open a standard stream that is closed, as by ``2>&-``: what is written there is lost.
+
+    Otherwise the next file that is opened gets the number of the stream.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= _LAST_STREAM:
+        pass
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if not _is_open(getattr(sys, name)):
+            lost = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - to the process' end
+            setattr(sys, name, lost)
+
+
+def _is_open(stream: TextIO | None) -> bool:
+    """Return whether a stream can be written to; one without a number can."""
+    try:
+        number = -1 if stream is None else stream.fileno()
+    except (OSError, ValueError):  # it is in memory
+        return True
+    try:
+        os.write(number, b"")
+    except OSError as error:
+        return error.errno != errno.EBADF
+    return True
 
 
 @contextmanager
@@ -79,8 +110,7 @@ def unheard_in_silence() -> Iterator[None]:
         try:
             yield
         finally:
-            if sys.stdout is not None:
-                sys.stdout.flush()
+            sys.stdout.flush()
     except OSError as error:
         # what is left is not tried again at the end of the process
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -16,7 +16,7 @@ from robotid.excitation.basis import Basis, BSplineBasis, FourierBasis
 from robotid.excitation.clearance import Box, Clearance
 from robotid.excitation.course import Course
 from robotid.excitation.design import Design, Designer
-from robotid.excitation.files import write_motion
+from robotid.excitation.files import check_motion_file, write_motion
 from robotid.excitation.limits import LIMITS, MotionLimits
 from robotid.excitation.motion_page import write_motion_page
 from robotid.excitation.payload_motion import design_payload
@@ -35,6 +35,16 @@ __all__ = ["MotionSettings", "design_motion", "stated_boxes"]
 
 _ROUTES = ("sweeps", "stands")
 _START = 2.0  # [s] of design from which compiled code pays
+_RANGES = {
+    "duration": (0.1, 3600.0, " s"),
+    "harmonics": (2, 100, ""),
+    "share": (1e-3, 1.0, " of the limits"),
+    "starts": (1, 1000, ""),
+    "seconds": (1e-3, np.inf, " s"),
+    "points": (0.1, 1e5, " rows per second"),
+}
+_SIZES = 1e-9, 1e12  # of limits and noise, in any unit
+_FARTHEST = 1e3  # [m] of what stands around a robot
 _KINDS = ("fourier", "bspline", "payload", *_ROUTES)
 
 
@@ -87,10 +97,22 @@ class MotionSettings:
     def __post_init__(self) -> None:
         if self.kind not in _KINDS:
             raise SettingsError(f"kind is {self.kind!r}, wanted one of {', '.join(_KINDS)}")
-        for name in ("duration", "starts", "seconds", "points"):
+        for name, (least, most, unit) in _RANGES.items():
             value = getattr(self, name)
-            if not value > 0:
-                raise SettingsError(f"{name} is {value:g}, wanted more than 0")
+            if not least <= value <= most:
+                wanted = f"{least:g} to {most:g}" if most < np.inf else f"{least:g} or more"
+                raise SettingsError(f"{name} is {value:g}, wanted {wanted}{unit}")
+        for name in ("acceleration", "jerk", "power", "noise"):
+            for joint, value in getattr(self, name).items():
+                if not _SIZES[0] <= value <= _SIZES[1]:
+                    raise SettingsError(
+                        f"{name} of {joint!r} is {value:g}, wanted {_SIZES[0]:g} to {_SIZES[1]:g}"
+                    )
+        if not 0 <= self.seed < 2**63:
+            raise SettingsError(f"seed is {self.seed}, wanted 0 or a positive whole number")
+        for name, value in {"clearance": self.clearance, "floor": self.floor}.items():
+            if value is not None and not abs(value) <= _FARTHEST:
+                raise SettingsError(f"{name} is {value:g} m, wanted at most {_FARTHEST:g} m")
         if self.kind != "payload" and (self.moving or self.payload != Payload()):
             raise SettingsError(
                 f"a payload or joints that move are stated, but kind is {self.kind!r}; wanted "
@@ -124,9 +146,10 @@ def stated_boxes(words: Sequence[str]) -> tuple[Box, ...]:
             x = [float(number) for number in numbers.split(",")]
         except ValueError:
             x = []
-        if len(x) != 6 or not np.isfinite(x).all():
+        if len(x) != 6 or not (np.abs(x) <= _FARTHEST).all():
             raise SettingsError(
-                f"--box {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner [m]"
+                f"--box {word!r}: wanted NAME=x0,y0,z0,x1,y1,z1, the lower and the upper corner "
+                f"[m], within {_FARTHEST:g} m"
             )
         boxes.append(Box(name, (x[0], x[1], x[2]), (x[3], x[4], x[5])))
     return tuple(boxes)
@@ -155,12 +178,14 @@ def design_motion(
         What ``robotid excite --json`` prints.
 
     Raises:
-        DataError: If collisions cannot be looked at, or the result's logs are gone.
+        DataError: If collisions cannot be looked at, the result's logs are gone, or motions are
+            not written in the target's format.
         ModelError: If the URDF cannot be used.
         SettingsError: If a setting does not fit, or nothing keeps the limits.
     """
     for file in (target, *([] if report is None else [report])):
         check_file(Path(file))
+    check_motion_file(target)
     designer, run = _designer(job, settings, given)
     model = designer.information.model
 

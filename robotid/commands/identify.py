@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from robotid._files import check_folder, folder_beside, write_json
+from robotid._settings import require_kind
 from robotid._typing import report_stage
 from robotid.commanded.identify import Commanded
 from robotid.commands.commanded import run_commanded
@@ -30,7 +31,7 @@ from robotid.report.document import write_report
 from robotid.robot.drives import AUTO, DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.tree import read_tree
-from robotid.workers.checkpoint import Checkpoint
+from robotid.workers.checkpoint import Checkpoint, released_on_error
 from robotid.workers.plan import WorkPlan
 
 __all__ = ["identify_job", "run_job", "save_result"]
@@ -69,6 +70,8 @@ def run_job(
         SettingsError: If a setting does not fit.
         WorkerError: If a worker ends before its work.
     """
+    require_kind(job, Job, "job", "a Job, as robotid.read_job returns it")
+    require_kind(folder, (str, Path), "folder", "the path of a folder")
     chosen = plan or WorkPlan(job.workers or 1)
     if isinstance(job.estimator, SimulationSettings):
         return run_commanded(job, folder, progress=chosen.progress)
@@ -77,7 +80,8 @@ def run_job(
     check_folder(target, ["result.json", *_names(model)])
     found, checkpoint = identify_job(job, model, chosen, target)
     report_stage(chosen.progress, "writing")
-    saved = _write(found, job, target, source=source, beside=beside)
+    with released_on_error(checkpoint):
+        saved = _write(found, job, target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -98,6 +102,8 @@ def save_result(identification: Identification, folder: str | Path, *, report: b
         ModelError: If the URDF that the robot was read from is gone.
         SettingsError: If the folder is a file, or cannot be written to.
     """
+    require_kind(folder, (str, Path), "folder", "the path of a folder")
+    require_kind(report, bool, "report", "True or False")
     target = Path(folder)
     check_folder(target, ["result.json", *_names(identification.model)])
     asked = identification.asked
@@ -235,7 +241,7 @@ def identify_job(
             "resume have nothing to do; lower rows_in_memory in [reduction] to cut them",
             job.rows_in_memory,
         )
-    with plan:
+    with plan, released_on_error(checkpoint):
         concluded = conclude(
             recordings,
             job.estimator,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotid._files import missing_file
-from robotid._settings import Entries, Range, Settings, check_keys, setting
+from robotid._settings import Entries, Range, Settings, check_keys, require_kind, setting
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -321,6 +321,7 @@ def read_job(path: str | Path) -> Job:
     Raises:
         SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
     """
+    require_kind(path, (str, Path), "path", "the path of a job file")
     source = Path(path)
     if not source.is_file():
         raise SettingsError(missing_file(source, "job file"))

@@ -112,7 +112,11 @@ def followed_logs(result: Result, job: Job) -> list[Followed]:
 def _check_target(goal: Path) -> None:
     """Refuse to write where something else than a page is."""
     check_file(goal)
-    if goal.exists() and not goal.read_bytes()[:15].lower().startswith(b"<!doctype html"):
+    if not goal.is_file():  # a pipe gets the page
+        return
+    with goal.open("rb") as file:
+        is_page = file.read(15).lower().startswith(b"<!doctype html")
+    if not is_page:
         raise SettingsError(
             f"{str(goal)!r} is there and is no page; it would be lost: name another --out"
         )
@@ -136,6 +140,11 @@ def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
             raise DataError(
                 f"the {what} {str(path)!r}, which {name} was made from, is not there; put it back, "
                 "or identify again"
+            )
+        if not wanted:
+            raise DataError(
+                f"{name} states no SHA-256 of the {what} {str(path)!r}, which it was made from, so "
+                "nobody knows whether it is the same; identify again"
             )
         if (found := file_sha256(path)) != wanted:
             raise DataError(

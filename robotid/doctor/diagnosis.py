@@ -7,6 +7,7 @@ unless its code is ignored.
 from collections.abc import Sequence
 from typing import Any
 
+from robotid._settings import require_kind
 from robotid.doctor.channels import check_channels
 from robotid.doctor.clock import check_clock, check_rest
 from robotid.doctor.command_channels import check_commands
@@ -59,6 +60,8 @@ def check_logs(
         DataError: If a file or a DataFrame does not hold a log.
         SettingsError: If a setting does not fit a log.
     """
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
     first, second = (
         read_logs(some, model.joints, prismatic=model.layout.prismatic, needs="any")
         for some in (logs, validation)

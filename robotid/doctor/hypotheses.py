@@ -250,11 +250,12 @@ def own_share(probe: Probe, gravity: Array | None = None, any_load: bool = False
     Args:
         probe: The motion.
         gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
-        any_load: Whether the last link may also have any mass more, and any centre of it.
+        any_load: Whether the last link may also have any mass more, and any centre of it, in the
+            model's gravity.
     """
     loads = probe.loads(gravity)
     if any_load:
-        last = probe.regressor(gravity)[:, :, -10:-6]
+        last = probe.last_body
         loads = np.concatenate([loads, last, -last[:, :, 1:]], axis=2)
     size = _variation(probe)
     share = np.zeros(len(size))

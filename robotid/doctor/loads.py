@@ -125,7 +125,7 @@ def load_model(probe: Probe, share: Array, level: Array | None = None) -> LoadMo
     N, n = probe.tau.shape
     duration = float(np.ptp(probe.motion.t[probe.rows]))
     independent = min(_INDEPENDENT, _PER_SECOND * duration)
-    links, last = probe.loads(), probe.regressor()[:, :, -10:-6]
+    links, last = probe.loads(), probe.last_body
     bodies = links.shape[2]
     X = np.concatenate([links, last, probe.tau[:, :, None]], axis=2)
     level = probe.tau.std(axis=0) if level is None else level
@@ -252,7 +252,7 @@ def _lifting(probe: Probe) -> list[int]:
 
 def _cancelled(probe: Probe, j: int, theta: Array) -> float:
     """Return which share of a joint's gravity its counterbalance takes, by fitted links [-]."""
-    Y = np.concatenate([probe.loads()[:, j], probe.regressor()[:, j, -10:-6]], axis=1)
+    Y = np.concatenate([probe.loads()[:, j], probe.last_body[:, j]], axis=1)
     swing = probe.swing(j)
     X = np.hstack([probe.drive(j)[:, :4], swing])
     size = np.linalg.norm(X, axis=0)

@@ -10,7 +10,7 @@ from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.signals import process, resolve, unwrap
 from robotid.regressor.columns import friction_speeds
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import carried_columns, joint_torque_regressor
 from robotid.robot.model import RobotModel
 
 __all__ = ["Probe", "smooth_motion", "take_probe"]
@@ -21,8 +21,11 @@ _SLOW = 0.05  # ... of a joint that is slow throughout: this share of its larges
 
 
 @dataclass(frozen=True, eq=False)
-class _Regressors:
-    """The regressors of N instants, each made when it is first asked for."""
+class _Loads:
+    """The torques of links and the columns of drives at N instants, each when first asked for.
+
+    Whole regressors are too large for it: of 60 joints 0.3 MB an instant.
+    """
 
     model: RobotModel
     q: Array
@@ -30,19 +33,48 @@ class _Regressors:
     a: Array
 
     @cached_property
-    def whole(self) -> Array:
-        """In the gravity that the model states, all columns, shape (N, n, p)."""
-        return self._of(self.model, self.v, self.a)
+    def moving(self) -> tuple[Array, Array]:
+        """Of each link by the URDF, (N, n, bodies), and the last body's first four columns."""
+        columns = carried_columns(self.model, self.q, self.v, self.a)
+        ten = columns.reshape(len(columns), -1, 10)
+        rows, bodies = self._places
+        is_last = bodies == self.model.layout.n_inertial // 10 - 1
+        last = np.zeros((*self.v.shape, 4))
+        last[:, rows[is_last]] = ten[:, is_last, :4]
+        return self._by_link(ten), last
 
     @cached_property
-    def pulled(self) -> Array:
-        """At rest in a gravity of 1 m/s^2 along x, y and z, shape (3, N, n, 10 bodies)."""
-        still, size = np.zeros_like(self.v), self.model.layout.n_inertial
-        axes = [_in_gravity(self.model, axis) for axis in np.eye(3)]
-        return np.array([self._of(model, still, still)[:, :, :size] for model in axes])
+    def coupled(self) -> Array:
+        """Columns of the coupled drives, shape (N, n, k)."""
+        layout = self.model.layout
+        chosen = layout.n_inertial + np.flatnonzero(layout.is_coupled)
+        if not len(chosen):
+            return np.empty((*self.v.shape, 0))
+        Y = joint_torque_regressor(self.model, self.q, self.v, self.a)
+        columns: Array = Y.reshape(*self.v.shape, -1)[:, :, chosen]
+        return columns
 
-    def _of(self, model: RobotModel, v: Array, a: Array) -> Array:
-        return joint_torque_regressor(model, self.q, v, a).reshape(len(v), model.n_rows, -1)
+    @cached_property
+    def pulls(self) -> Array:
+        """Of links at rest, per m/s^2 of gravity along x, y and z, shape (3, N, n, bodies)."""
+        still = np.zeros_like(self.v)
+        pulled = [_in_gravity(self.model, axis) for axis in np.eye(3)]
+        columns = (carried_columns(model, self.q, still, still) for model in pulled)
+        return np.array([self._by_link(x.reshape(len(x), -1, 10)) for x in columns])
+
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        """Rows and bodies of the carried columns, ten by ten."""
+        carried = self.model.support()[:, : self.model.layout.n_inertial : 10]
+        rows, bodies = np.nonzero(carried)
+        return rows, bodies
+
+    def _by_link(self, ten: Array) -> Array:
+        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
+        rows, bodies = self._places
+        loads = np.zeros((*self.v.shape, len(pi)))
+        loads[:, rows, bodies] = np.einsum("kbi,bi->kb", ten, pi[bodies])
+        return loads
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +89,7 @@ class Probe:
         v: Velocities, shape (N, n).
         a: Accelerations, shape (N, n).
         tau: Torques, shape (N, n) [N m or N].
-        regressors: The regressors of these instants.
+        parts: The parts of the model's torque at these instants.
         balanced: Joints whose torque may also follow their own position, as a counterbalance's.
     """
 
@@ -68,7 +100,7 @@ class Probe:
     v: Array
     a: Array
     tau: Array
-    regressors: _Regressors
+    parts: _Loads
     balanced: tuple[int, ...] = ()
 
     @property
@@ -76,17 +108,10 @@ class Probe:
         """Gravity as the model states it, shape (3,) [m/s^2]."""
         return np.array(self.model.pin_model.gravity.linear)
 
-    def regressor(self, gravity: Array | None = None) -> Array:
-        """Return the inertial regressor in a gravity, shape (N, n, 10 bodies).
-
-        Args:
-            gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
-        """
-        Y: Array = self.regressors.whole[:, :, : self.model.layout.n_inertial]
-        if gravity is None:
-            return Y
-        more: Array = np.tensordot(gravity - self.gravity, self.regressors.pulled, axes=1)
-        return Y + more
+    @property
+    def last_body(self) -> Array:
+        """Columns of mass and first moments of the last body, shape (N, n, 4)."""
+        return self.parts.moving[1]
 
     def loads(self, gravity: Array | None = None) -> Array:
         """Return the torque that each link loads each joint with by the URDF, (N, n, bodies).
@@ -94,24 +119,11 @@ class Probe:
         Args:
             gravity: Gravity, shape (3,) [m/s^2]; the model's if None.
         """
+        links = self.parts.moving[0]
         if gravity is None:
-            return self._loads
-        more: Array = np.tensordot(gravity - self.gravity, self._pulls, axes=1)
-        return self._loads + more
-
-    @cached_property
-    def _loads(self) -> Array:
-        return self._by_link(self.regressor())
-
-    @cached_property
-    def _pulls(self) -> Array:
-        """The loads of links at rest, per m/s^2 of gravity along each axis, (3, N, n, bodies)."""
-        return self._by_link(self.regressors.pulled)
-
-    def _by_link(self, Y: Array) -> Array:
-        pi = self.model.standard_parameters()[: self.model.layout.n_inertial].reshape(-1, 10)
-        loads: Array = np.einsum("...bi,bi->...b", Y.reshape(*Y.shape[:-1], -1, 10), pi)
-        return loads
+            return links
+        more: Array = np.tensordot(gravity - self.gravity, self.parts.pulls, axes=1)
+        return links + more
 
     def drive(self, j: int) -> Array:
         """Return what the drive of joint j may add: inertia, frictions, offset of either sign.
@@ -127,10 +139,8 @@ class Probe:
         least = _STILL * float(self.model.layout.drive_speeds[j])
         still = min(least, _SLOW * float(np.abs(v).max())) or least
         own = np.column_stack([self.a[:, j], v, np.tanh(v / still), one, -one])
-        layout = self.model.layout
-        drives = self.regressors.whole[:, j, layout.n_inertial :]
         swing = self.swing(j) if j in self.balanced else np.empty((len(v), 0))
-        return np.hstack([own, drives[:, layout.is_coupled], swing, -swing])
+        return np.hstack([own, self.parts.coupled[:, j], swing, -swing])
 
     def swing(self, j: int) -> Array:
         """Return what follows the position of a revolute joint, as a counterbalance does, (N, 2).
@@ -209,7 +219,7 @@ def _probe_at(model: RobotModel, motion: Trajectory, rows: Array) -> Probe:
 def _probe(
     model: RobotModel, motion: Trajectory, rows: Array, state: tuple[Array, Array, Array]
 ) -> Probe:
-    return Probe(model, motion, rows, *state, motion.tau[rows], _Regressors(model, *state))
+    return Probe(model, motion, rows, *state, motion.tau[rows], _Loads(model, *state))
 
 
 def _in_gravity(model: RobotModel, gravity: Array) -> RobotModel:

@@ -6,6 +6,7 @@ the same filter: what a filter takes from one of them alone looks like a delay.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from robotid.findings import Finding, log_finding
 from robotid.logs.data import Log, Trajectory
 from robotid.logs.settings import SignalSettings
 from robotid.logs.smoothing import low_pass
-from robotid.regressor.torque import joint_torque_regressor
+from robotid.regressor.torque import carried_columns, joint_torque_regressor
 from robotid.robot.model import RobotModel
 
 __all__ = ["check_torque_delay"]
@@ -105,7 +106,7 @@ class _Window:
     """Filtered torques of contiguous rows of a motion, and the columns that may explain them.
 
     Attributes:
-        inertial: Of each body, shape (N, n, p).
+        inertial: Of the bodies that each joint carries, joint after joint, shape (N, columns).
         drive: Of each joint's inertia, frictions and position, and of coupled drives, (N, n, k).
         steady: Whether a joint is far from where its drive may stick, shape (N, n), bool.
         late: Torques at each delay of the grid after the instants, shape (delays, N, n).
@@ -183,10 +184,11 @@ def _misfit(
         _window(model, motion, part, step, every, signals, period)
         for part in _stretches(model, motion, every)
     ]
-    joints = range(len(model.joints))
-    found = [_squares(model, windows, j) for j in joints] if windows else []
+    ends = np.cumsum(model.support()[:, : model.layout.n_inertial].sum(axis=1)).tolist()
+    own = [slice(*pair) for pair in pairwise([0, *ends])]
+    found = [_squares(windows, j, part) for j, part in enumerate(own)] if windows else []
     told = [one for one in found if one is not None]
-    if len(told) < max(2.0, len(joints) / 2):
+    if len(told) < max(2.0, len(own) / 2):
         return None
     squares, rows = zip(*told, strict=True)
     return _Misfit(np.array(squares), np.array(rows, dtype=float))
@@ -230,10 +232,10 @@ def _window(
     own = np.stack([motion.a[rows], v, *signs, v * np.abs(v), *waves], axis=2)
     own = low_pass(own, 1 / step, signals)[::every][inner]
     state = motion.q[coarse], motion.v[coarse], motion.a[coarse]
-    W = joint_torque_regressor(model, *state).reshape(len(coarse), len(model.joints), -1)
-    W = low_pass(W, 1 / (step * every), signals)[inner]
-    size = model.layout.n_inertial
-    coupled = W[:, :, size:][:, :, model.layout.is_coupled]
+    inertial, coupled = (
+        low_pass(columns(model, *state), 1 / (step * every), signals)[inner]
+        for columns in (carried_columns, _coupled)
+    )
     at = motion.t[coarse[inner]]
     turns = np.diff(np.sign(v), axis=0, append=np.sign(v[-1:])) != 0
     slow = turns | (np.abs(v) < _SLOW)
@@ -241,7 +243,17 @@ def _window(
     tau = low_pass(motion.tau[rows], 1 / step, signals)
     late = _interpolated(t, tau, [at + delay for delay in _GRID])
     drive = np.concatenate([own, coupled], axis=2)
-    return _Window(W[:, :, :size], drive, np.column_stack(steady), late)
+    return _Window(inertial, drive, np.column_stack(steady), late)
+
+
+def _coupled(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the regressor's columns of coupled drives, shape (N, n, k)."""
+    coupled = model.layout.n_inertial + np.flatnonzero(model.layout.is_coupled)
+    if not len(coupled):
+        return np.empty((*q.shape, 0))
+    W = joint_torque_regressor(model, q, v, a)
+    columns: Array = W.reshape(*q.shape, -1)[:, :, coupled]
+    return columns
 
 
 def _interpolated(t: Array, values: Array, times: Sequence[Array]) -> Array:
@@ -262,20 +274,19 @@ def _distance(at: Array, turns: Array) -> Array:
     return distance
 
 
-def _squares(model: RobotModel, windows: Sequence[_Window], j: int) -> tuple[Array, int] | None:
+def _squares(windows: Sequence[_Window], j: int, own: slice) -> tuple[Array, int] | None:
     """Return what is unexplained of joint j's torque, shape (blocks, delays), and its instants.
 
-    None of a joint that moves in too few.
+    Its inertial columns are ``own``. None of a joint that moves in too few.
     """
     steady = np.concatenate([window.steady[:, j] for window in windows])
     if steady.sum() < max(_FEW, _MOVING * len(steady)):
         return None
     inertial, drive = (
         np.concatenate(parts)[steady]
-        for parts in zip(*((w.inertial[:, j], w.drive[:, j]) for w in windows), strict=True)
+        for parts in zip(*((w.inertial[:, own], w.drive[:, j]) for w in windows), strict=True)
     )
-    carried = model.support()[j, : model.layout.n_inertial]
-    X = np.hstack([inertial[:, carried], drive, np.ones((len(inertial), 1))])
+    X = np.hstack([inertial, drive, np.ones((len(inertial), 1))])
     late = np.concatenate([window.late[:, :, j] for window in windows], axis=1)[:, steady]
     late = late - late.mean(axis=1, keepdims=True)  # (delays, N)
     size = np.einsum("dk,dk->d", late, late)

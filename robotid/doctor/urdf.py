@@ -9,12 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid.doctor.urdf_base import faint_parameters, rounded_angles
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
 from robotid.exceptions import ModelError
 from robotid.findings import Finding, listed
-from robotid.regressor.base_parameters import BaseMapping, structural_mapping
+from robotid.regressor.base_parameters import (
+    BaseMapping,
+    independent_factors,
+    structural_mapping,
+)
 from robotid.regressor.torque import random_regressor
 from robotid.robot.bodies import LinkPlace, link_places
 from robotid.robot.model import RobotModel
@@ -101,6 +106,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
     Returns:
         The inspection. A file that no model can be built from gives a finding, not an error.
     """
+    require_kind(path, (str, Path), "path", "the path of a URDF")
     where = f"file {Path(path).name}"
     try:
         robot = parse_urdf(path)
@@ -138,7 +144,11 @@ def _condition(model: RobotModel, mapping: BaseMapping) -> float:
     columns = len(mapping.names)
     samples = 2 * columns // model.n_rows + 20
     W = random_regressor(model, samples, np.random.default_rng(0))[:, mapping.independent]
-    return float(np.linalg.cond(np.linalg.qr(W / np.linalg.norm(W, axis=0), mode="r")))
+    sizes = [
+        np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
+        for _, R in independent_factors(W, model.n_rows)
+    ]
+    return float(max(s[0] for s in sizes) / min(s[-1] for s in sizes))
 
 
 def _numbers(robot: ET.Element) -> Iterator[Finding]:

@@ -232,8 +232,13 @@ def solve_factor(factors: Factors, sigma: Array, prior: Array | None) -> Solutio
     norms = np.linalg.norm(A, axis=0)
     heard = norms > _SILENT * norms.max()
     scale = np.where(heard, norms, 1.0)
-    U, s, Vt = np.linalg.svd(np.where(heard, A / scale, 0.0))
+    X = np.where(heard, A / scale, 0.0)
+    s = np.linalg.svd(X, compute_uv=False)
     rank = int(np.sum(s > _RANK * s[0])) if s[0] > 0 else 0
+    if rank == c:  # the directions are not needed: they take most of the time
+        inverse = scipy.linalg.solve_triangular(A[:c], np.eye(c))
+        return Solution(inverse @ d[:c], inverse @ inverse.T, rank, float(s[0] / s[-1]), ())
+    U, s, Vt = np.linalg.svd(X)
     V, V0 = Vt[:rank].T, Vt[rank:].T
     share = np.linalg.norm(V0, axis=1)
     undetermined = tuple(np.array(factors.names)[share > _OPEN].tolist())

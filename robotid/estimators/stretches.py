@@ -28,7 +28,9 @@ class Scatter:
     meat: Array  # (c, c), covariance of the score W^T S^-1 (tau - W theta) of all stretches
     bread: Array  # (c, c), covariance of the parameters if rows were independent
     inflation: float  # mean ratio of the scatter to that of independent rows [-]
-    factors: Array  # (s, c, c), factors R_s of the weighted rows of each stretch
+    factors: (
+        Array  # (s, c, c), factors of the weighted rows of each stretch, along its eigenvectors
+    )
     adjusted: Array  # (s, c, c), the same behind the correction for their leverage
 
     @property
@@ -82,20 +84,26 @@ def scatter(stretches: Sequence[Factors], theta: Array, sigma: Array, bread: Arr
             f"least {FEWEST_STRETCHES}: fit longer logs"
         )
     c = len(theta)
-    weighted = np.array([stretch.weighted(sigma) for stretch in stretches])
-    R, u = weighted[:, :c, :c], weighted[:, :c, c] - weighted[:, :c, :c] @ theta
-    leverage, V = np.linalg.eigh(R @ bread @ R.transpose(0, 2, 1))
-    kept = np.clip(1.0 - leverage, 0.0, 1.0)  # share of its own noise that a residual still shows
-    gain = 1.0 / np.sqrt(np.maximum(kept, 1.0 - _OWN))
-    along = gain * np.einsum("sij,si->sj", V, u)
-    # each eigenvector counts by the weight it has in the fit
-    inflation = float((leverage * along**2).sum() / (leverage * gain**2 * kept).sum())
-    adjusted = V @ (gain[:, :, None] * (V.transpose(0, 2, 1) @ R))
-    scores = np.einsum("sij,si->sj", V.transpose(0, 2, 1) @ R, along)
-    missing = np.sqrt(np.maximum(1.0 - gain**2 * kept, 0.0))[:, :, None]
-    alone = (missing * (V.transpose(0, 2, 1) @ R)).reshape(-1, c)
-    meat = scores.T @ scores + inflation * (alone.T @ alone)
-    return Scatter(meat, bread, inflation, R, adjusted)
+    meat, alone, along_squares, expected = np.zeros((c, c)), np.zeros((c, c)), 0.0, 0.0
+    turned, adjusted = np.empty((2, len(stretches), c, c))
+    for k, stretch in enumerate(stretches):  # those of all together are far larger than a cache
+        weighted = stretch.weighted(sigma)
+        R, u = weighted[:c, :c], weighted[:c, c] - weighted[:c, :c] @ theta
+        leverage, V = np.linalg.eigh(R @ bread @ R.T)
+        kept = np.clip(1.0 - leverage, 0.0, 1.0)  # share of its own noise that a residual shows
+        gain = 1.0 / np.sqrt(np.maximum(kept, 1.0 - _OWN))
+        along = gain * (V.T @ u)
+        # each eigenvector counts by the weight it has in the fit
+        along_squares += float(leverage @ along**2)
+        expected += float(leverage @ (gain**2 * kept))
+        np.matmul(V.T, R, out=turned[k])
+        np.multiply(gain[:, None], turned[k], out=adjusted[k])
+        score = along @ turned[k]
+        meat += np.outer(score, score)
+        missing = np.sqrt(np.maximum(1.0 - gain**2 * kept, 0.0))[:, None] * turned[k]
+        alone += missing.T @ missing
+    inflation = along_squares / expected
+    return Scatter(meat + inflation * alone, bread, inflation, turned, adjusted)
 
 
 def quantile(freedom: Array) -> Array:

@@ -227,6 +227,12 @@ class Clearance:
             moved[i - 1, [j - 1 for j in list(tree.supports[i])[1:]]] = True
         return moved
 
+    @cached_property
+    def movers(self) -> Array:
+        """Which joints move the hulls of each pair against each other, shape (pairs, n), bool."""
+        moved: Array = (self._levers > 0.0) @ np.abs(self._ratios) > 0.0
+        return moved
+
     @property
     def everything(self) -> Array:
         """All pairs, as ``near`` takes them, shape (pairs,), bool."""

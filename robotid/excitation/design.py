@@ -20,6 +20,7 @@ from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.findings import listed
 from robotid.identification.previews import (
     CORRELATION,
     Run,
@@ -59,6 +60,7 @@ _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
 _TRIED = 200  # random postures until one is found that the robot can rest in ...
 _AT_ONCE = 10  # ... so many at a time
+_REPAIRS = 300  # joints that are redrawn of a posture that breaks a limit, one after another
 _WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
 _STARTED = 10  # random motions of which the best is a start
 
@@ -306,20 +308,22 @@ class Designer:
     def _clear(self, C: Array) -> tuple[Array, Contact | None]:
         """Return a motion scaled down until it is clear between its instants, too, and how far.
 
+        It is scaled by 0.99 first, then by more and more.
+
         Raises:
-            NotConvergedError: If it is not clear at nine tenths of its size.
+            NotConvergedError: If it is not clear at a thirtieth of its size.
         """
         if self.clearance is None:
             return C, None
-        for _ in range(_TRIALS):
+        for k in range(_TRIALS):
             contact = self.clearance.nearest(DesignedMotion(self.basis, C), self.basis.duration)
             if contact is None or contact.margin >= 0.0:
                 return C, contact
-            C = _scaled(C, 0.99)
+            C = _scaled(C, max(1.0 - 0.01 * 2.0**k, 0.5))
         raise NotConvergedError(
-            f"between the instants that were looked at {contact}, nearer than "
-            f"{1e3 * (contact.kept if contact else 0.0):.0f} mm; raise the clearance or try "
-            "another seed",
+            f"between the instants that were looked at {contact}, margin "
+            f"{1e3 * (contact.margin if contact else 0.0):.2g} mm, wanted 0 or more; raise the "
+            "clearance or try another seed",
             "max_iterations",
         )
 
@@ -490,8 +494,49 @@ class Designer:
         q = self._drawn(rng, tried)
         kept: Array = q[self.can_rest(q)]
         if not len(kept):
+            kept = self._repaired(q[:_AT_ONCE], rng)
+        if not len(kept):
             raise SettingsError(self._why_not(*self._at_rest(q)))
         return kept
+
+    def _repaired(self, q: Array, rng: np.random.Generator) -> Array:
+        """Return the postures that keep all limits once joints of what they broke are redrawn.
+
+        Of each posture one such joint is redrawn at a time; what breaks more is not kept. Robots of
+        many joints have postures at rest, but one in a million random ones is one.
+
+        Args:
+            q: Postures, shape (N, n) [rad or m].
+            rng: Source of the joints and of their positions.
+
+        References:
+            Selman, Kautz, Cohen (1994), Noise strategies for improving local search.
+        """
+        q, broken = q.copy(), self._broken_by_joint(q)
+        for _ in range(_REPAIRS):
+            total = broken.sum(axis=1)
+            if not total.all():
+                break
+            share = broken.cumsum(axis=1) / total[:, None]
+            joint = (share < rng.uniform(size=(len(q), 1))).sum(axis=1)
+            other, rows = q.copy(), np.arange(len(q))
+            other[rows, joint] = self._drawn(rng, len(q))[rows, joint]
+            now = self._broken_by_joint(other)
+            is_kept = now.sum(axis=1) <= total
+            q[is_kept], broken[is_kept] = other[is_kept], now[is_kept]
+        kept: Array = q[self.can_rest(q)]
+        return kept
+
+    def _broken_by_joint(self, q: Array) -> Array:
+        """Return how much of what postures break each joint has part in, shape (N, n)."""
+        used, margins = self._at_rest(q)
+        found = np.maximum(used - 1.0, 0.0).sum(axis=0) @ self.information.chains
+        if self.clearance is not None:
+            movers = self.clearance.movers
+            movers = movers / np.maximum(movers.sum(axis=1, keepdims=True), 1)
+            found += np.maximum(-margins.T, 0.0) / _SOFT @ movers
+        by_joint: Array = found
+        return by_joint
 
     def _posture(self, rng: np.random.Generator) -> Array:
         """Return the first of ``postures``, which are tried a few at a time, shape (n,)."""
@@ -531,28 +576,42 @@ class Designer:
         return used, self._margins(rows.state, 1.0)
 
     def _why_not(self, used: Array, margins: Array) -> str:
-        """Return which limit leaves no posture, and by how much."""
-        least = used.min(axis=1)  # (6, n)
-        kind, joint = np.unravel_index(int(np.argmax(least)), least.shape)
-        names = self.information.model.joints
+        """Return what leaves no posture: a limit or a distance alone, or several together."""
+        broken = sorted(self._broken(used, margins), key=lambda entry: -entry[0])
         tried = f"of {used.shape[1]} random postures none can be held at rest"
-        if least[kind, joint] > 1.0:
-            return (
-                f"{tried}: {names[joint]} needs {100 * least[kind, joint]:.0f} % of its "
-                f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
-                "load that it carries"
-            )
-        if self.clearance is None:
-            return f"{tried}: each needs more than a limit allows"
-        best = int(np.argmax(margins.min(axis=0)))
-        pair = int(np.argmin(margins[:, best]))
-        wanted = float(self.clearance.kept[pair] + self._spare[pair, 0])
-        first, second = self.clearance.named[pair]
+        share, alone, _ = broken[0]
+        if share == 1.0:
+            return f"{tried}: {alone}"
+        most = [f"{words} in {100 * share:.0f} %" for share, _, words in broken]
         return (
-            f"{tried}: in the best of them {first} and {second} are "
-            f"{1e3 * (float(margins[pair, best]) + wanted):.1f} mm apart, wanted "
-            f"{1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the boxes"
+            f"{tried}: each breaks a limit or a distance, though none of them breaks all. Most "
+            f"often {listed(most, 3)}; narrow the limits of these joints, lock joints that need "
+            "not move, lower the clearance, or --clearance none to leave collisions unlooked at"
         )
+
+    def _broken(self, used: Array, margins: Array) -> list[tuple[float, str, str]]:
+        """Return each limit and distance that postures break: their share, and two wordings."""
+        found, names = [], self.information.model.joints
+        for kind, joint in np.argwhere((used > 1.0).any(axis=1)).tolist():
+            own = used[kind, :, joint]
+            least = (
+                f"{names[joint]} needs {_percent(own.min())} % of its {LIMITS[kind]} limit at the "
+                "least; state the limits that the robot has, or the load that it carries"
+            )
+            some = f"{names[joint]} needs more than its {LIMITS[kind]} limit"
+            found.append((float(np.mean(own > 1.0)), least, some))
+        for pair in np.flatnonzero((margins < 0.0).any(axis=1)).tolist():
+            two = " and ".join(self.clearance.named[pair]) if self.clearance else ""
+            wanted = float((self.clearance.kept if self.clearance else self._spare)[pair])
+            wanted += float(self._spare[pair, 0])
+            most = (
+                f"in the best of them {two} are {1e3 * (margins[pair].max() + wanted):.1f} mm "
+                f"apart, wanted {1e3 * wanted:.1f} mm; lower the clearance, or move the floor and "
+                "the boxes"
+            )
+            some = f"{two} are nearer than {1e3 * wanted:.1f} mm"
+            found.append((float(np.mean(margins[pair] < 0.0)), most, some))
+        return found
 
     def _feasible(self, C: Array, most: float) -> Array:
         """Return the largest share of a motion about its middle that keeps the limits, (h, n).
@@ -666,6 +725,11 @@ def _gravity(model: RobotModel) -> Array:
     return torque
 
 
+def _percent(share: float) -> str:
+    """Return a share in per cent, in few digits however large it is."""
+    return f"{100 * share:.0f}" if share < 1e4 else f"{100 * share:.2g}"
+
+
 class _OutOfTime(Exception):
     """The time of a design is over."""
 
@@ -748,6 +812,7 @@ def _between(values: Array | float, times: int) -> Array | float:
         return values
     share = np.arange(times).reshape(-1, *[1] * (values.ndim - 2)) / times
     steps = np.diff(values, axis=1)[:, :, None]
-    between = (values[:, :-1, None] + share * steps).reshape(len(values), -1, *values.shape[2:])
+    shape = len(values), times * (values.shape[1] - 1), *values.shape[2:]  # maybe of no pair
+    between = (values[:, :-1, None] + share * steps).reshape(shape)
     fine: Array = np.concatenate([between, values[:, -1:]], axis=1) / times
     return fine

@@ -8,14 +8,27 @@ import numpy as np
 from robotid._files import write_text
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
-from robotid.logs.formats import write_columns
+from robotid.logs.formats import check_suffix, write_columns
 from robotid.simulation.motions import Motion
 
-__all__ = ["write_motion"]
+__all__ = ["check_motion_file", "write_motion"]
 
 _UR_JOINTS = 6
 _UR_STEP = 0.008  # [s] of servoj on every UR
 _SETTLES = 1.0  # [s] that a UR rests where the motion begins
+
+
+def check_motion_file(target: str | Path) -> None:
+    """Refuse a format that motions are not written in, as before the work of a design.
+
+    Args:
+        target: The file.
+
+    Raises:
+        DataError: If a motion cannot be written in its format.
+    """
+    if Path(target).suffix not in (".yaml", ".script"):
+        check_suffix(Path(target))
 
 
 def write_motion(

@@ -108,6 +108,20 @@ class MotionInformation:
             drives.append(drive)
         return [(term, *places) for term, places in found.items()]
 
+    @cached_property
+    def chains(self) -> Array:
+        """Share of each joint (column) in the torque at rest of each (row), shape (n, n).
+
+        The same of all joints before and behind it, 0 of others.
+        """
+        ratios = self.model.velocity_map[self._regressor.places] != 0.0  # (m, n)
+        chain = np.eye(len(ratios), dtype=bool)
+        for i in range(len(ratios)):
+            chain[i, [j - 1 for j in list(self.model.pin_model.supports[i + 1])[1:]]] = True
+        linked = ratios.T.astype(int) @ (chain | chain.T) @ ratios > 0
+        share: Array = linked / linked.sum(axis=1, keepdims=True)
+        return share
+
     def rows(self, q: Array, v: Array, a: Array) -> MotionRows:
         """Return the rows along a motion of N instants.
 

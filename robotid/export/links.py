@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robotid._files import write_text
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import ModelError
 from robotid.export.urdf import link_parameters
@@ -102,6 +103,8 @@ def write_model(
         ModelError: If a link or a drive would be physically impossible, or has the world's name.
         SettingsError: If the target is a folder.
     """
+    require_kind(target, (str, Path), "target", "the path of a file to write")
+    require_kind(original, (str, Path, type(None)), "original", "the path of a URDF, or none")
     inertials, meshes = _inertials(model, pi), set[str]()
     shapes = _shapes(model, to, [*([original] if original else []), model.tree.path], meshes)
     values = dict(zip(model.layout.names, pi.tolist(), strict=True))

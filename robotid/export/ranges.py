@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robotid._files import write_text
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.export.urdf import link_parameters
 from robotid.export.yaml_text import yaml_text
@@ -182,6 +183,8 @@ def write_ranges(found: Identification, target: str | Path) -> None:
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the target is a folder.
     """
+    require_kind(found, Identification, "found", "a robotid.Identification")
+    require_kind(target, (str, Path), "target", "the path of a file to write")
     write_text(ranges_text(parameter_ranges(found)), target)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robotid._files import file_sha256, read_json
-from robotid._settings import Range
+from robotid._settings import Range, require_kind
 from robotid._typing import Array
 from robotid.commanded.errors import OpenLoop
 from robotid.commanded.identify import Commanded
@@ -654,6 +654,7 @@ def load_result(path: str | Path) -> Result:
     Raises:
         DataError: If it is missing, no JSON, or of another schema.
     """
+    require_kind(path, (str, Path), "path", "the path of a result.json or of its folder")
     source = Path(path)
     source = source / "result.json" if source.is_dir() else source
     return Result(source, read_result(source))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.export.links import WORLD, Format, SimulatedLink, write_model
 from robotid.export.urdf import numbers_text
@@ -56,6 +57,8 @@ def write_sdf(
         ModelError: If a link or a drive would be physically impossible.
         SettingsError: If the target is a folder.
     """
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+    require_kind(notes, (list, tuple), "notes", "a list of sentences")
     gravity = numbers_text(model.pin_model.gravity.linear)
     said = [
         *notes,

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from robotid._files import folder_beside, read_json
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError
 from robotid.export import xml_splice
@@ -98,6 +99,8 @@ def write_urdf(
         ModelError: If a link or a drive would be physically impossible, the original is gone or
             cannot be edited, the target is not usable, or the written file differs from pi.
     """
+    require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+    require_kind(target, (str, Path), "target", "the path of a URDF to write")
     source, goal = Path(model.tree.path), Path(target)
     written = link_parameters(model, pi)
     _check_target(source, goal)
@@ -308,6 +311,7 @@ def _drive_value(drives: Mapping[str, Any], name: str, where: str) -> float:
 
 def _check_parameters(model: RobotModel, pi: Array) -> None:
     wanted = (len(model.layout.names),)
+    require_kind(pi, np.ndarray, "pi", f"an array of shape {wanted}")
     if pi.shape != wanted:
         raise DataError(f"pi has shape {pi.shape}, wanted {wanted}")
     for name, value in zip(model.layout.names, pi, strict=True):

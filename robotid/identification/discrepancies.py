@@ -18,8 +18,7 @@ import numpy as np
 from robotid._typing import Array
 from robotid.findings import Finding, listed
 from robotid.identification.misfit import Sample, chance, trials
-from robotid.logs.data import Trajectory
-from robotid.regressor.torque import trajectory_regressor
+from robotid.regressor.prediction import inverse_dynamics
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -118,12 +117,7 @@ def _origins(model: RobotModel, pi: Array, sample: Sample, joint: str, tau: Arra
 
 def _torques(model: RobotModel, pi: Array, sample: Sample) -> Array:
     """Return the torques of the motions by standard parameters, shape (N, n)."""
-    return np.concatenate([_torque(model, pi, m) for m in sample.at])
-
-
-def _torque(model: RobotModel, pi: Array, m: Trajectory) -> Array:
-    torque: Array = (trajectory_regressor(model, m) @ pi).reshape(len(m.t), model.n_rows)
-    return torque
+    return np.concatenate([inverse_dynamics(model, pi, m) for m in sample.at])
 
 
 def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import stdtr
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
@@ -201,6 +202,10 @@ def wanted_families(
     Raises:
         SettingsError: If a name or a joint is unknown.
     """
+    wanted_kind = "auto, names of families joined by +, or a table of these by joint"
+    require_kind(friction, (str, Mapping), "friction", wanted_kind)
+    for joint, names in friction.items() if isinstance(friction, Mapping) else ():
+        require_kind(names, str, f"friction of {joint}", wanted_kind)
     stated = {"*": friction} if isinstance(friction, str) else {"*": AUTO, **friction}
     strangers = [joint for joint in stated if joint not in (*joints, "*")]
     if strangers:

@@ -1,12 +1,13 @@
 """What hangs on a link: a run with it against a run without, and gains from a known mass."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.estimators import Consistent, Constraints, Estimate
 from robotid.estimators.stretches import quantile
@@ -232,6 +233,13 @@ def identify_payload(
         SettingsError: If links or gains do not fit the robot.
         NotConvergedError: If a solver fails.
     """
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    for name, value, kinds, wanted in (
+        ("links", links, Collection, "names of links"),
+        ("masses", masses, (Mapping, type(None)), "a table of masses [kg] by link"),
+        ("unknown_gains", unknown_gains, Collection, "names of joints"),
+    ):
+        require_kind(value, kinds, name, wanted)
     model = robot_of(model, logs)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     loaded, without = (
@@ -241,7 +249,13 @@ def identify_payload(
             for given in (logs, reference)
         )
     )
-    links = links or model.layout.bodies[-1:]
+    for what, runs in (("logs", loaded), ("reference", without)):
+        if not runs.fitted:
+            raise DataError(
+                f"{what} has no log, wanted at least one: logs with the payload, and a reference "
+                "without it"
+            )
+    links = tuple(links) or model.layout.bodies[-1:]
     return fit_payloads(
         loaded, without, links=links, masses=masses or {}, unknown_gains=unknown_gains
     )
@@ -382,7 +396,10 @@ def _check_known(
                 "link among them"
             )
         if not 0 < mass < 1e6:
-            raise SettingsError(f"the mass of the payload on {link} is {mass:g} kg, wanted > 0")
+            raise SettingsError(
+                f"the mass of the payload on {link} is {mass:g} kg, wanted more than 0 and less "
+                "than 1e6"
+            )
     unknown = [joint for joint in gains if joint not in model.joints]
     if unknown:
         raise SettingsError(

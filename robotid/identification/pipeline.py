@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid._settings import Settings
+from robotid._settings import Settings, require_kind
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
@@ -527,7 +527,7 @@ class Identification:
         """Gravity and masses against the URDF's: what speaks for the scale but the sensors."""
         return call_witness(self)
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """How far to trust the result."""
         return judge(
@@ -582,6 +582,10 @@ def identify(
         NotConvergedError: If a solver fails.
         SettingsError: If a setting is out of range, or a code to ignore is unknown.
     """
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    require_kind(
+        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
+    )
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()

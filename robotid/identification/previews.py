@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.doctor.motions import excitation_finding
 from robotid.estimators import Estimate
@@ -274,6 +275,14 @@ def preview(
         DataError: If a motion cannot be read, does not fit the model or is too short.
         SettingsError: If a setting is out of range, or a joint is unknown.
     """
+    require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
+    require_kind(
+        estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
+    )
+    require_kind(
+        noise, (TorqueNoise, Mapping, type(None)), "noise", "a TorqueNoise, or numbers by joint"
+    )
+    require_kind(given, (Identification, type(None)), "given", "a robotid.Identification, or none")
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings, run = signals or SignalSettings(), None
     model = model if isinstance(model, RobotModel) else RobotModel.from_urdf(model)

@@ -30,6 +30,8 @@ __all__ = [
 
 _NOT_NEGATIVE = Range("x >= 0", lambda x: x >= 0)
 _COUNT = Range("1 to 10000", lambda x: 1 <= x <= 10_000)
+_LARGEST = 1e9  # [kg] or [m] of bounds, as of numbers in a URDF
+_WINDOW = Range("0.05 s or more", lambda x: 0.05 <= x < math.inf)
 _FINITE = Range("a positive, finite number", lambda x: 0 < x < math.inf)
 
 
@@ -87,10 +89,13 @@ def _interval(value: object, what: str) -> tuple[float, float]:
     pair = [value, value] if _is_number(value) else value
     if not (isinstance(pair, Sequence) and len(pair) == 2 and all(map(_is_number, pair))):
         raise SettingsError(f"{what} is {value!r}, wanted a number or [smallest, largest] [kg]")
-    low, high = (math.inf if abs(x) > 1e300 else float(x) for x in pair)
+    low, high = (math.inf if abs(x) > _LARGEST else float(x) for x in pair)
     found = f"{what} is [{low:g}, {high:g}] kg"
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise SettingsError(f"{found}, wanted finite numbers; write a large one for no upper bound")
+        raise SettingsError(
+            f"{what} is {value!r}, wanted finite numbers of at most {_LARGEST:g} kg; write "
+            f"{_LARGEST:g} for no upper bound"
+        )
     if not low <= high:
         raise SettingsError(f"{found}: the first is above the second; write the smaller one first")
     return low, high
@@ -103,8 +108,11 @@ def _corners(value: Any, name: str) -> tuple[list[float], list[float]]:  # noqa:
     except (TypeError, ValueError, OverflowError):
         corners = []
     is_box = [len(corner) for corner in corners] == [3, 3]
-    if not is_box or not all(math.isfinite(x) for corner in corners for x in corner):
-        raise SettingsError(f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m]")
+    if not is_box or not all(abs(x) <= _LARGEST for corner in corners for x in corner):
+        raise SettingsError(
+            f"com of {name} is {value!r}, wanted [[x, y, z], [x, y, z]] [m], at most "
+            f"{_LARGEST:g} each"
+        )
     low, high = corners
     if any(a > b for a, b in zip(low, high, strict=True)):
         raise SettingsError(
@@ -350,13 +358,17 @@ class SimulationSettings(EstimatorSettings):
     )
     window: float | None = setting(
         None, "length of the windows that are rolled out [s]; if not stated 2.5, or 0.5 where the "
-        "logged torque drives the robot", within=_FINITE,
+        "logged torque drives the robot", within=_WINDOW,
     )  # fmt: skip
     lead: float | None = setting(
         None, "how long before each window its roll-out begins [s]; if not stated 0.6, or 0 where "
         "the logged torque drives the robot", within=_NOT_NEGATIVE,
     )  # fmt: skip
-    step: float = setting(2e-3, "longest step of the integration [s]", within=_FINITE)
+    step: float = setting(
+        2e-3,
+        "longest step of the integration [s]",
+        within=Range("2e-5 to 0.1", lambda x: 2e-5 <= x <= 0.1),
+    )
     bodies: float = setting(
         0.1,
         "plausible relative error of the URDF's bodies, by which they may change; 0: they stay",

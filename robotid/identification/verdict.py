@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid.doctor.diagnosis import CODES
 from robotid.exceptions import SettingsError
 from robotid.findings import Finding, listed
@@ -283,7 +284,9 @@ def check_ignored(ignore: Sequence[str]) -> None:
         SettingsError: If a code is unknown.
     """
     known = sorted({*CODES, *DOUBTFUL, *_OF_RESULTS})
+    require_kind(ignore, (list, tuple, set, frozenset), "ignore", "a list of codes")
     for code in ignore:
+        require_kind(code, str, "a code in ignore", "the code of a finding")
         if code not in known:
             near = difflib.get_close_matches(code, known, n=1)
             hint = f". Did you mean {near[0]!r}?" if near else ""

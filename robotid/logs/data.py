@@ -5,7 +5,7 @@ Reading and writing files is in `robotid.logs.read`.
 
 import difflib
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ COLUMNS = {
     "dqref": "v_ref",
     "tauref": "tau_ref",
 }
+_SHORTEST = 1e-12  # [s] of a step, in the mean
+_REQUIRED = ("q", "tau")
 _LARGEST = 1e30  # in any unit; what is computed from it is still a number
 
 
@@ -94,6 +96,9 @@ class Log:
         Raises:
             DataError: If fewer than two rows are left.
         """
+        for name, limit in (("start", start), ("end", end)):
+            if not isinstance(limit, float | int | np.number | None):
+                raise DataError(f"{name} is {str(limit)[:60]!r}, wanted a time [s], or None")
         first = self.t[0] if start is None else start
         last = self.t[-1] if end is None else end
         rows = np.flatnonzero((self.t >= first) & (self.t <= last))
@@ -254,20 +259,18 @@ def repeated(names: Sequence[str]) -> list[str]:
 
 def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]) -> None:
     """Check joints, shapes and values of the arrays, and replace them by read-only ones."""
-    if isinstance(owner.joints, str) or not owner.joints:
-        raise DataError(f"{where}: joints is {owner.joints!r}, wanted at least one name in a tuple")
-    joints = tuple(owner.joints)
+    joints = _names(owner.joints, where)
     if twice := repeated(joints):
         raise DataError(f"{where}: joints {listed(twice)} are named twice; name each joint once")
-    t = _frozen(owner.t)
+    t = _numbers(owner.t, where, "t")
     if t.ndim != 1:
         raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
     require_finite(t[:, None], t, ["time"], where)
     settled = {"t": t}
     for name, values in arrays.items():
-        if values is None:
+        if values is None and name not in _REQUIRED:
             continue
-        array = _frozen(values)
+        array = _numbers(values, where, name)
         if array.shape != (len(t), len(joints)):
             raise DataError(
                 f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
@@ -278,6 +281,35 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
     for name, array in settled.items():
         object.__setattr__(owner, name, array)
     object.__setattr__(owner, "joints", joints)
+
+
+def _names(joints: object, where: str) -> tuple[str, ...]:
+    """Return the names of joints as a tuple."""
+    names = joints.tolist() if isinstance(joints, np.ndarray) else joints
+    is_list = isinstance(names, Iterable) and not isinstance(names, str | Mapping)
+    found: tuple[Any, ...] = tuple(names) if is_list else ()  # type: ignore[arg-type]
+    if not found or not all(isinstance(name, str) for name in found):
+        raise DataError(f"{where}: joints is {joints!r}, wanted at least one name in a tuple")
+    return found
+
+
+def _numbers(values: ArrayLike | None, where: str, name: str) -> Array:
+    """Return values as a read-only array of numbers; NaN where a masked array is masked."""
+    if values is None:
+        hint = "; without torques, give zeros and has_torque=False" if name == "tau" else ""
+        raise DataError(f"{where}: {name} is None, wanted an array{hint}")
+    try:
+        array: Array = np.ma.asanyarray(values)
+        if array.dtype.kind not in "biufO":
+            raise TypeError(f"numbers of kind {array.dtype.kind!r}")
+        if np.ma.is_masked(array):
+            return _frozen(np.ma.filled(array.astype(np.float64), np.nan))
+        return _frozen(values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"{where}: {name} is no array of real numbers ({str(error)[:100]}); wanted one of "
+            "floats, with rows of equal length"
+        ) from error
 
 
 def _frozen(values: ArrayLike, dtype: type = np.float64) -> Array:
@@ -328,10 +360,11 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
         first: Number in its file of the first row.
 
     Raises:
-        DataError: If a time stamp is not after the one before.
+        DataError: If a time stamp is not after the one before, or they lie too close.
     """
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back) == 0:
+        _check_rate(t, where)
         return
     k = int(back[0]) + 1
     row, now, before = first + k, _stamp(t[k]), _stamp(t[k - 1])
@@ -346,6 +379,19 @@ def require_increasing(t: Array, where: str, first: int = 0) -> None:
         "sort the rows, or correct the recording",
         code="stamp_order",
     )
+
+
+def _check_rate(t: Array, where: str) -> None:
+    """Refuse time stamps that no clock has."""
+    if len(t) < 2:
+        return
+    step = float(t[-1] - t[0]) / (len(t) - 1)
+    if step < _SHORTEST:
+        raise DataError(
+            f"{where}: {len(t)} rows lie within {float(t[-1] - t[0]):.3g} s, {step:.3g} s from one "
+            f"to the next, wanted at least {_SHORTEST:g} s; correct the time stamps or their unit",
+            code="time_unit",
+        )
 
 
 def _stamp(t: float) -> str:

@@ -1,6 +1,5 @@
 """LeRobot datasets, folders of version 2 or 3: an episode as a table of named columns."""
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from robotid._files import read_json
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
@@ -74,16 +74,13 @@ class _Column:
 
 def _features(path: Path) -> dict[str, Any]:
     """Return what the dataset says of its columns."""
-    try:
-        info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
-        features: dict[str, Any] = info["features"]
-        if not isinstance(features, dict):
-            raise TypeError(f"features is {features!r}")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    info = read_json(path / "meta" / "info.json", "description of a LeRobot dataset")
+    features = info.get("features") if isinstance(info, dict) else None
+    if not isinstance(features, dict) or not all(isinstance(x, dict) for x in features.values()):
         raise DataError(
-            f"{path.name}: meta/info.json is no description of a LeRobot dataset of version 2 or 3 "
-            f"({type(error).__name__}: {error})"
-        ) from error
+            f"{path.name}: meta/info.json is no description of a LeRobot dataset of version 2 or "
+            f"3: features is {str(features)[:80]}, wanted a table of tables"
+        )
     return features
 
 
@@ -93,9 +90,7 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
     for feature, starts in _FEATURES.items():
         if feature not in features:
             continue
-        names = features[feature].get("names")
-        if isinstance(names, dict):  # {"motors": [...]}, and the same in other words
-            names = [name for group in names.values() for name in group]
+        names = _names(features[feature].get("names"))
         if not names:
             raise DataError(
                 f"{path.name}: meta/info.json gives no names of the motors in {feature}; add "
@@ -105,12 +100,30 @@ def _columns(path: Path, features: Mapping[str, Any]) -> dict[str, _Column]:
             joint, dot, end = str(name).rpartition(".")
             if not dot or end not in starts:
                 joint, end = str(name), ""
-            columns[f"{starts[end]}_{joint}"] = _Column(feature, place)
+            column = f"{starts[end]}_{joint}"
+            if column in columns:
+                first = columns[column]
+                raise DataError(
+                    f"{path.name}: meta/info.json names {str(name)!r} of {feature}, number {place},"
+                    f" and number {first.place} of {first.feature} alike; give each motor a name "
+                    "of its own"
+                )
+            columns[column] = _Column(feature, place)
     if not columns:
         raise DataError(
             f"{path.name} has neither observation.state nor action; features: {listed(features)}"
         )
     return columns
+
+
+def _names(stated: object) -> list[str]:
+    """Return the names of a feature's values; none if they are stated in no known way."""
+    groups = list(stated.values()) if isinstance(stated, dict) else [stated]
+    lists = [group for group in groups if isinstance(group, list)]
+    if len(lists) < len(groups):  # neither {"motors": [...]} nor a list
+        return []
+    names = [name for group in lists for name in group]
+    return names if all(isinstance(name, str) for name in names) else []
 
 
 def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:

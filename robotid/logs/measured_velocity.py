@@ -112,7 +112,7 @@ def unlike_velocities(log: Log) -> dict[str, float]:
     length = int(np.clip(round(_STRETCH / median), 1, max(1, len(dt) // 4)))
     moved = _means(np.where(usual, np.diff(np.unwrap(log.q, axis=0), axis=0), 0.0), length)
     swept = _means(np.where(usual, dt * (v[1:] + v[:-1]) / 2, 0.0), length)
-    reach = round(_LONGEST / median)
+    reach = min(round(_LONGEST / median), len(moved) // 2)
     shifts = [k for k in range(-reach, reach + 1, max(length // 2, 1)) if abs(k) < len(moved) // 2]
     found = {}
     for j, joint in enumerate(log.joints):

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
@@ -297,10 +298,21 @@ def lay_out(
         SettingsError: If gains, columns or the source name what is not read.
         MissingDependencyError: If a package that reads the file is not installed.
     """
+    require_kind(needs, str, "needs", f"one of {listed(get_args(Needs))}")
     if needs not in get_args(Needs):
         raise SettingsError(f"needs is {needs!r}, wanted one of {listed(get_args(Needs))}")
-    if isinstance(joints, str) or not joints:
+    require_kind(joints, Sequence, "joints", "a list of at least one name")
+    if isinstance(joints, str) or not joints or not all(isinstance(x, str) for x in joints):
         raise SettingsError(f"joints is {joints!r}, wanted a list of at least one name")
+    for name, value, kinds, wanted in (
+        ("columns", columns, (Mapping, type(None)), "a table of names by column"),
+        ("gains", gains, (Mapping, type(None)), "a table of numbers by joint"),
+        ("units", units, LogUnits, "a robotid.LogUnits"),
+        ("source", source, LogSource, "a robotid.LogSource"),
+        ("prismatic", prismatic, (list, tuple, set, frozenset), "a list of names"),
+        ("transmissions", transmissions, (list, tuple), "a list of Transmission"),
+    ):
+        require_kind(value, kinds, name, wanted)
     if isinstance(path, str | Path):
         where, opened = Path(path).name, open_table(Path(path), source)
     elif is_frame(path):
@@ -347,6 +359,8 @@ def write_log(log: Log, path: str | Path) -> None:
         MissingDependencyError: If a package that writes the format is not installed.
         OSError: If the folder cannot be written to.
     """
+    require_kind(log, Log, "log", "a robotid.Log")
+    require_kind(path, (str, Path), "path", "the path of a file")
     table = {"time": log.t}
     for kind, name in COLUMNS.items():
         values = getattr(log, name)

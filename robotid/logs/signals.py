@@ -20,6 +20,7 @@ from robotid.logs.smoothing import Stretch, process_stretches, too_short
 
 __all__ = ["decide", "process", "resolve", "turns_note", "unwrap"]
 
+_SLOWEST = 1e-6  # a cut-off over the rate
 _GAP_STEPS = 2.5  # a step longer than this many median steps may be a gap
 _GAP_CYCLES = 0.25  # ... if it is also longer than this share of the filter's period
 
@@ -79,6 +80,11 @@ def decide(
         raise SettingsError(
             f"{where}: cutoff {cutoff:g} Hz is not below half the rate {rate:g} Hz; lower the "
             "cutoff or set cutoff = false"
+        )
+    if cutoff is not None and rate is not None and cutoff < _SLOWEST * rate:
+        raise SettingsError(
+            f"{where}: cutoff {cutoff:g} Hz is less than {_SLOWEST:g} of the rate {rate:g} Hz, at "
+            "which no filter is exact; raise the cutoff, lower rate, or correct the time stamps"
         )
     measured = {"velocity": ("dq", has_velocity), "acceleration": ("ddq", has_acceleration)}
     for quantity, (column, is_there) in measured.items():

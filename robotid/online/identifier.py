@@ -6,6 +6,7 @@ from typing import overload
 
 import numpy as np
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.estimators import Estimate, Kalman, KalmanState
 from robotid.exceptions import DataError
@@ -59,6 +60,8 @@ class OnlineIdentifier:
     """
 
     def __init__(self, model: RobotModel, settings: OnlineSettings | None = None) -> None:
+        require_kind(model, RobotModel, "model", "a robotid.RobotModel")
+        require_kind(settings, (OnlineSettings, type(None)), "settings", "an OnlineSettings")
         if model.is_static:
             raise DataError("an online identification needs a model with dynamics = 'full'")
         self.model, self.settings = model, settings or OnlineSettings()

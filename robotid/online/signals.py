@@ -17,6 +17,7 @@ __all__ = ["Instant", "LiveSignals"]
 #: One instant of smooth motion: t [s], then q, v, a, tau, each of shape (n,).
 Instant = tuple[float, Array, Array, Array, Array]
 
+_SLOWEST = 1e-5  # a cut-off over the rate
 _GAP_CYCLES = 0.25  # a longer pause than this share of the filter's period is a gap
 _SETTLE = 4.0  # [delays] after a start or a gap, before the first instant is given out
 
@@ -42,6 +43,11 @@ class LiveSignals:
         if not 0 < cutoff < rate / 2:
             raise SettingsError(
                 f"cutoff {cutoff:g} Hz is not between 0 and half the rate {rate:g} Hz"
+            )
+        if cutoff < _SLOWEST * rate:
+            raise SettingsError(
+                f"cutoff {cutoff:g} Hz is less than {_SLOWEST:g} of the rate {rate:g} Hz, at which "
+                "no filter is exact; raise the cutoff, or correct the time stamps"
             )
         if order < 2 or order % 2:
             raise SettingsError(f"order is {order}, wanted an even number")

@@ -18,13 +18,20 @@ from robotid.regressor.problem import Problem
 from robotid.regressor.torque import random_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = ["RANK_TOLERANCE", "BaseMapping", "base_mapping", "structural_mapping"]
+__all__ = [
+    "RANK_TOLERANCE",
+    "BaseMapping",
+    "base_mapping",
+    "independent_factors",
+    "structural_mapping",
+]
 
 #: Pivots below this share of the largest are no structure. Over example-robot-data, every pivot
 #: lies above 1e-3 or below 1e-12, but for angles that a URDF rounds (3.1416), at 1e-5 to 1e-6.
 RANK_TOLERANCE = 1e-4
 _TIE = 1e-6  # share by which each column is shortened against the one before it
 _FAINTEST = 1e-12  # length of a column that is 0 at every state
+_PANEL = 24  # columns eliminated at a time
 _CLEAN = 1e-10  # smaller coefficients, relative to the scales, are rounding
 _SHOWN = 1e-6  # smaller coefficients are left out of the expressions, not of K
 
@@ -154,6 +161,7 @@ def base_mapping(
     scales: Array | None = None,
     preference: Array | None = None,
     rtol: float = RANK_TOLERANCE,
+    n_rows: int = 1,
 ) -> BaseMapping:
     """Return the base parameters of a regressor taken at random states.
 
@@ -169,6 +177,7 @@ def base_mapping(
             shape (p,); 1 if None. It changes which groups are formed, not how many. See
             ``ParameterLayout.preference``.
         rtol: Pivots below this share of the largest count as 0.
+        n_rows: Rows of W that one sample has, each of another equation.
 
     Raises:
         DataError: If a shape does not fit, W is not finite or all zero.
@@ -181,31 +190,124 @@ def base_mapping(
     if not np.isfinite(W).all() or not W.any():
         raise DataError("W must be finite and not all zero")
     magnitude = np.ones(len(names)) if scales is None else scales
-    R = scipy.linalg.qr(W * magnitude, mode="r", overwrite_a=True, check_finite=False)[0]
-    R = R[: len(names)]  # the rest is 0
-    order, pivots = _pivot(R)
-    rank = int(np.sum(pivots > rtol * pivots[0]))
-    if preference is not None:
-        order, _ = _pivot(R * preference)
-    independent, dependent = np.sort(order[:rank]), np.sort(order[rank:])
-    triangle = scipy.linalg.qr(R[:, np.append(independent, dependent)], mode="r")[0][:rank]
-    X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled, (b, p - b)
-    X[np.abs(X) < _CLEAN] = 0.0
-    K = np.zeros((rank, len(names)))
-    K[:, independent] = np.eye(rank)
-    K[:, dependent] = X * magnitude[independent][:, None] / magnitude[dependent]
-    return BaseMapping(K, independent, names, pivots / pivots[0])
+    favour = np.ones(len(names)) if preference is None else preference
+    parts = [(own, R * magnitude[own]) for own, R in independent_factors(W, n_rows)]
+    first = [_pivot(R, columns) for columns, R in parts]
+    pivots = np.sort(np.concatenate([sizes for _, sizes in first]))[::-1]
+    K, kept = np.zeros((len(names), len(names))), np.zeros(len(names), dtype=bool)
+    for (columns, R), (order, sizes) in zip(parts, first, strict=True):
+        rank = int(np.sum(sizes > rtol * pivots[0]))
+        order = order if preference is None else _pivot(R * favour[columns], columns)[0]
+        own, others = np.sort(order[:rank]), np.sort(order[rank:])
+        triangle = scipy.linalg.qr(R[:, np.append(own, others)], mode="r")[0][:rank]
+        X = scipy.linalg.solve_triangular(triangle[:, :rank], triangle[:, rank:])  # scaled
+        X[np.abs(X) < _CLEAN] = 0.0
+        own, others = columns[own], columns[others]
+        kept[own] = True
+        K[own, own] = 1.0
+        K[np.ix_(own, others)] = X * magnitude[own][:, None] / magnitude[others]
+    return BaseMapping(K[kept], np.flatnonzero(kept), names, pivots / pivots[0])
 
 
-def _pivot(R: Array) -> tuple[Array, Array]:
+def independent_factors(W: Array, n_rows: int) -> list[tuple[Array, Array]]:
+    """Return factors of parts of a regressor that have no equation and no column in common.
+
+    Arms on a base that stands still are such parts.
+
+    Args:
+        W: Regressor, shape (N n_rows, p).
+        n_rows: Rows, each of another equation, of one sample.
+
+    Returns:
+        Of each part its c columns, and R with R^T R = W^T W of them, shape (c, c).
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    samples = W.reshape(-1, n_rows, W.shape[1])
+    filled = (samples != 0.0).any(axis=0)  # (n_rows, p)
+    linked = filled.astype(float) @ filled.T > 0.0
+    count, label = connected_components(linked, directed=False)
+    # a column without an entry goes with the first equation
+    of_column = label[filled.argmax(axis=0)]
+    parts = [(np.flatnonzero(label == k), np.flatnonzero(of_column == k)) for k in range(count)]
+    return [
+        (own, _factor(samples[:, rows][:, :, own], filled[np.ix_(rows, own)]))
+        for rows, own in parts
+        if len(own)
+    ]
+
+
+def _factor(rows: Array, filled: Array) -> Array:
+    """Return R with R^T R = W^T W.
+
+    An equation has the columns of what its joint carries, those of every joint behind it among
+    them. From the ends of the robot to its base, each is folded into these columns, which are
+    neighbours in a suitable order. A robot whose equations are not nested so is factored as a
+    whole.
+
+    Args:
+        rows: W, shape (N, m, c).
+        filled: Which columns an equation has, shape (m, c), bool.
+    """
+    c, filled = rows.shape[2], _with_carried(filled)
+    fewest = np.argsort(filled.sum(axis=1), kind="stable")
+    place = np.lexsort(filled[fewest])  # by the equation with the most columns first
+    spans = [_span(own) for own in filled[:, place]]
+    if None in spans:  # equations that share columns without one having the other's
+        R: Array = scipy.linalg.qr(rows.reshape(-1, c), mode="r", check_finite=False)[0]
+        return R[:c]
+    R = np.zeros((c, c))
+    for k in fewest:
+        first, last = spans[k] or (0, 0)
+        if first == last:
+            continue
+        own = slice(first, last)
+        panel = min(_PANEL, last - first)
+        # pentagonal of height 0: no row below the triangle is triangular itself
+        R[own, own] = scipy.linalg.lapack.dtpqrt(
+            0, panel, np.asfortranarray(R[own, own]), np.asfortranarray(rows[:, k, place[own]])
+        )[0]
+    found = np.empty((c, c))
+    found[:, place] = R
+    return found
+
+
+def _with_carried(filled: Array) -> Array:
+    """Return the columns of each equation with all of those of which it has most.
+
+    A parameter that loads a joint loads none before it if its axis happens to be so.
+    """
+    wider, sizes = filled.copy(), filled.sum(axis=1)
+    for k in np.argsort(sizes, kind="stable"):
+        shared = (filled & filled[k]).sum(axis=1)
+        wider[k] |= wider[(sizes <= sizes[k]) & (2 * shared > sizes)].any(axis=0)
+    return wider
+
+
+def _span(own: Array) -> tuple[int, int] | None:
+    """Return first and end of columns, None if they are no neighbours."""
+    places = np.flatnonzero(own)
+    if not len(places):
+        return 0, 0
+    first, last = int(places[0]), int(places[-1]) + 1
+    return (first, last) if last - first == len(places) else None
+
+
+def _pivot(R: Array, columns: Array) -> tuple[Array, Array]:
     """Return the order in which columns are chosen and the size of each when it was.
 
     LAPACK's QR with column pivoting takes the longest remaining column; later columns are
     shortened by a hair, so that among equal ones the first wins and rounding does not choose.
+
+    Args:
+        R: The columns.
+        columns: Their numbers among all.
     """
-    handicap = 1.0 - _TIE * np.arange(R.shape[1])
-    triangle, order = scipy.linalg.qr(R * handicap, mode="r", pivoting=True)
-    return order, np.abs(np.diag(triangle))
+    triangle, order = scipy.linalg.qr(R * (1.0 - _TIE * columns), mode="r", pivoting=True)
+    sizes = np.zeros(len(columns))
+    diagonal = np.abs(np.diag(triangle))
+    sizes[: len(diagonal)] = diagonal
+    return order, sizes
 
 
 def _expression(row: Array, names: tuple[str, ...], first: int) -> str:
@@ -239,6 +341,7 @@ def structural_mapping(model: RobotModel, *, inertial_only: bool = False) -> Bas
         model.layout.names[:columns],
         scales=model.layout.scales(model.length)[:columns],
         preference=model.layout.preference()[:columns],
+        n_rows=model.n_rows,
     )
 
 

@@ -17,7 +17,8 @@ from robotid._typing import Array
 
 __all__ = ["Triangle"]
 
-_PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns
+_PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
+_WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which leave a cache
 
 
 class Triangle:
@@ -32,7 +33,7 @@ class Triangle:
     def __init__(self, columns: int) -> None:
         """Begin with no rows of so many columns."""
         self.R = np.zeros((columns, columns), order="F")
-        self._panel = min(_PANEL, columns)
+        self._panel = min(_PANEL if columns < _WIDE else _WIDE_PANEL, columns)
         self._scratch = np.empty(2 * self._panel * columns)
         # m, n, l, nb, lda, ldb, ldt, info
         self._sizes = np.array(

@@ -16,7 +16,7 @@ from robotid.regressor.rows import BLOCK, COMPILED, TrajectoryRows, trajectory_r
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.model import RobotModel
 
-__all__ = ["predict", "predict_instants", "rigid_parts"]
+__all__ = ["inverse_dynamics", "predict", "predict_instants", "rigid_parts"]
 
 _START = 5  # work of one call of inverse dynamics beside its joints, as of work_per_sample
 
@@ -49,7 +49,7 @@ def predict(
     source = trajectory_rows(model, trajectory, None, compiled)
     few = len(parameters) * (_START + model.pin_model.nv) <= work_per_sample(model)
     if source.engine != COMPILED and few and all(_has_centres(model, pi) for pi in parameters):
-        return [_inverse_dynamics(model, pi, trajectory) for pi in parameters]
+        return [inverse_dynamics(model, pi, trajectory) for pi in parameters]
     return _from_rows(source, np.column_stack(list(parameters)))
 
 
@@ -81,7 +81,7 @@ def predict_instants(
     Raises:
         DataError: If a shape does not fit, or a value is not finite.
     """
-    q = np.asarray(q, dtype=float)
+    q = _numbers("q", q)
     wanted = (*q.shape[:-1], model.n_rows)
     width = len(model.joints) + 7 * model.free_flyer
     if q.ndim not in (1, 2) or q.shape[-1] != width:
@@ -90,7 +90,9 @@ def predict_instants(
             f"{'the pose of the base, then ' if model.free_flyer else ''}a column for each of "
             f"{listed(model.joints)}"
         )
-    given = [np.zeros(wanted) if x is None else np.asarray(x, dtype=float) for x in (v, a)]
+    given = [
+        np.zeros(wanted) if x is None else _numbers(name, x) for name, x in (("v", v), ("a", a))
+    ]
     for name, x in zip("va", given, strict=True):
         if x.shape != wanted:
             raise DataError(
@@ -102,6 +104,15 @@ def predict_instants(
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
     return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    """Return values as an array of numbers."""
+    try:
+        array: Array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name} is {str(values)[:60]!r}, wanted an array of numbers") from error
+    return array
 
 
 def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:
@@ -163,14 +174,42 @@ def _has_centres(model: RobotModel, pi: Array) -> bool:
     return bool((moments <= bodies[:, 0] * bodies[:, [4, 6, 9]].sum(axis=1)).all())
 
 
-def _inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
-    """Return the torque by the recursive Newton-Euler algorithm and the drives' terms."""
+def inverse_dynamics(model: RobotModel, pi: Array, trajectory: Trajectory) -> Array:
+    """Return the torque W pi by the recursive Newton-Euler algorithm and the drives' terms.
+
+    Of bodies that cannot be, as those of ordinary least squares, it is the difference of the
+    torques of bodies that can.
+
+    Args:
+        model: The robot.
+        pi: Standard parameters, shape (p,), possible ones or not.
+        trajectory: N samples of q, v, a and, if the torque was filtered, direction.
+
+    Returns:
+        Torques, shape (N, n_rows) [N m, N].
+    """
     m, layout, theta = trajectory, model.layout, pi[model.layout.n_inertial :]
-    torque = _newton_euler(model, pi, m.q, m.v, m.a)
+    added = _making_possible(model, pi)
+    torque = _newton_euler(model, pi + added, m.q, m.v, m.a)
+    if added.any():
+        torque -= _newton_euler(model, added, m.q, m.v, m.a)
     if theta.any():
         values = trajectory_values(layout, m)
         torque[:, model.n_rows - len(model.joints) :] += values.T @ (layout.drive_loads * theta).T
     return torque
+
+
+def _making_possible(model: RobotModel, pi: Array) -> Array:
+    """Return bodies that make those of pi possible where they are added, shape (p,)."""
+    added = np.zeros_like(pi)
+    if _has_centres(model, pi):
+        return added
+    bodies, more = (x[: model.layout.n_inertial].reshape(-1, 10) for x in (pi, added))
+    moment = np.linalg.norm(bodies[:, 1:4], axis=1)
+    more[:, 0] = np.abs(bodies[:, 0]) + moment / model.length
+    size = np.abs(bodies[:, 4:]).max(axis=1) + moment * model.length
+    more[:, [4, 6, 9]] = size[:, None]
+    return added
 
 
 def _newton_euler(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> Array:

@@ -20,6 +20,7 @@ from robotid.robot.model import RobotModel
 __all__ = [
     "InstantRegressor",
     "build_problem",
+    "carried_columns",
     "joint_torque_regressor",
     "mass_regressor",
     "random_regressor",
@@ -27,6 +28,7 @@ __all__ = [
 ]
 
 _DECADES = 3.0  # of speeds, at random states of a robot whose friction is a curve
+_INSTANTS = 32  # whose whole regressors are in memory together, where a part of them is kept
 _BLOCK_SIZE = 2**19  # numbers per block of W, 4 MiB
 
 
@@ -63,14 +65,7 @@ def joint_torque_regressor(
         Atkeson, An, Hollerbach (1986), Estimation of Inertial Parameters of Manipulator Loads and
         Links; Carpentier et al. (2019), The Pinocchio C++ library.
     """
-    wanted = (len(q), model.n_rows)
-    if v.shape != wanted or a.shape != wanted:
-        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
-    for name, values in (("v", v), ("a", a)):
-        if not np.isfinite(values).all():
-            k, j = np.argwhere(~np.isfinite(values))[0]
-            row = model.row_names[j]
-            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
+    _check_motion(model, q, v, a)
     Y = np.empty((len(q), model.n_rows, len(model.layout.names)))
     size = model.layout.n_inertial
     _write_inertial(model, q, v, a, Y[:, :, :size])
@@ -79,6 +74,42 @@ def joint_torque_regressor(
         memory = instant_memory(model.layout, q, v, a, direction, load)
     _write_drives(model, q, v, a, direction, memory, Y[:, :, size:])
     return Y.reshape(len(q) * model.n_rows, -1)
+
+
+def carried_columns(model: RobotModel, q: Array, v: Array, a: Array) -> Array:
+    """Return the inertial columns of the bodies that each row carries, and no others.
+
+    Of robots of many joints they are a tenth of the regressor.
+
+    Args:
+        model: The robot.
+        q: Joint coordinates, shape (N, n) or (N, 7 + n) [rad, m].
+        v: Velocities, shape (N, n_rows) [rad/s, m/s].
+        a: Accelerations, shape (N, n_rows) [rad/s^2, m/s^2].
+
+    Returns:
+        Columns, row after row, as ``model.support()`` has them, shape (N, columns).
+
+    Raises:
+        DataError: If a shape does not fit the model, or a value is not finite.
+    """
+    _check_motion(model, q, v, a)
+    carried = model.support()[:, : model.layout.n_inertial]
+    found = np.empty((len(q), int(carried.sum())))
+    G = model.velocity_map
+    if not np.array_equal(G, np.eye(len(G))):
+        for first in range(0, len(q), _INSTANTS):
+            part = slice(first, first + _INSTANTS)
+            Y = np.empty((len(q[part]), *carried.shape))
+            _write_inertial(model, q[part], v[part], a[part], Y)
+            found[part] = Y[:, carried]
+        return found
+    pin_model, wanted = model.pin_model, np.flatnonzero(carried)
+    data, regressor = pin_model.createData(), pin.computeJointTorqueRegressor
+    instants = zip(found, np.ascontiguousarray(model.configurations(q)), v, a, strict=True)
+    for kept, q_k, v_k, a_k in instants:
+        regressor(pin_model, data, q_k, v_k, a_k).take(wanted, None, kept, "clip")
+    return found
 
 
 def trajectory_regressor(model: RobotModel, trajectory: Trajectory) -> Array:
@@ -267,6 +298,18 @@ def random_regressor(model: RobotModel, samples: int, rng: np.random.Generator) 
     if model.is_static:
         v, a = 0.0 * v, 0.0 * a
     return joint_torque_regressor(model, q, v, a, signs, memory)
+
+
+def _check_motion(model: RobotModel, q: Array, v: Array, a: Array) -> None:
+    """Refuse velocities and accelerations of another shape than the positions', or not finite."""
+    wanted = (len(q), model.n_rows)
+    if v.shape != wanted or a.shape != wanted:
+        raise DataError(f"v and a have shapes {v.shape} and {a.shape}, wanted {wanted}")
+    for name, values in (("v", v), ("a", a)):
+        if not np.isfinite(values).all():
+            k, j = np.argwhere(~np.isfinite(values))[0]
+            row = model.row_names[j]
+            raise DataError(f"{name}[{k}] of {row} is {values[k, j]}, wanted a finite number")
 
 
 def _write_drives(

@@ -6,6 +6,7 @@ from html import escape
 from pathlib import Path
 
 from robotid._files import write_text
+from robotid._settings import require_kind
 from robotid.findings import listed
 from robotid.identification.advice import Origin
 from robotid.identification.evaluation import Evaluation
@@ -63,6 +64,10 @@ def write_report(
     Raises:
         DataError: If the folder of the target does not exist.
     """
+    require_kind(identification, Identification, "identification", "a robotid.Identification")
+    require_kind(target, (str, Path), "target", "the path of a page to write")
+    require_kind(files, (Mapping, type(None)), "files", "a table of file names")
+    require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     found, made = identification, tables(identification)
     header = summary_screen(found, origin or Origin(), files or {}) + _made(found)
     joints = len(found.verdict.joints)

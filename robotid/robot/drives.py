@@ -729,6 +729,10 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
     Raises:
         SettingsError: If there is no such term, or a field of it is unknown or no number.
     """
+    if not isinstance(table, Mapping):
+        raise SettingsError(
+            f"a drive term is {table!r}, wanted a table, as {{ term = 'Stribeck', speed = 0.1 }}"
+        )
     kind = _CLASSES.get(str(table.get("term")))
     if kind is None:
         raise SettingsError(f"term is {table.get('term')!r}, wanted one of {listed(_CLASSES)}")

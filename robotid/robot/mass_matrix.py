@@ -19,6 +19,7 @@ __all__ = [
 ]
 
 POSES = 10_000
+_BLOCK = 200  # poses whose mass matrices are in memory together
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,10 @@ def check_mass_matrix(
     q = rng.uniform(lower, upper, (poses, len(free)))
     if model.free_flyer:  # where the base is changes nothing
         q = np.hstack([np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (poses, 1)), q])
-    smallest = np.linalg.eigvalsh(joint_mass_matrices(model, pi, q))[:, 0]
+    parts = (q[first : first + _BLOCK] for first in range(0, poses, _BLOCK))
+    smallest = np.concatenate(
+        [np.linalg.eigvalsh(joint_mass_matrices(model, pi, part))[:, 0] for part in parts]
+    )
     return MassMatrixCheck(poses, float(smallest.min()), float((smallest > 0).mean()))
 
 
@@ -90,7 +94,10 @@ def rigid_mass_matrices(
     M = np.empty((len(configurations), model.pin_model.nv, model.pin_model.nv))
     for M_k, configuration in zip(M, configurations, strict=True):
         M_k[:] = pin.crba(model.pin_model, data, configuration)
-    mass: Array = model.velocity_map.T @ M @ model.velocity_map
+    G = model.velocity_map
+    if np.array_equal(G, np.eye(len(G))):
+        return M
+    mass: Array = G.T @ M @ G
     return mass
 
 

@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
@@ -111,6 +112,21 @@ class RobotModel:
             ModelError: If the URDF cannot be used, a joint is not in it, or a number is not usable.
             SettingsError: If a term or a coupling is unknown.
         """
+        require_kind(path, (str, Path, Tree), "path", "the path of a URDF")
+        for name, value, kinds, wanted in (
+            ("joints", joints, (list, tuple, str, type(None)), "a list of names"),
+            ("locked", locked, (Mapping, type(None)), "a table of positions by joint"),
+            ("terms", terms, Collection, f"a list of some of {listed(DRIVE_TERMS)}"),
+            ("own_terms", own_terms, Mapping, "a table of terms by joint"),
+            ("mimic", mimic, str, "'independent' or 'coupled'"),
+            ("dynamics", dynamics, str, f"one of {listed(DYNAMICS)}"),
+            ("couplings", couplings, Collection, "a list of robotid.Coupling"),
+        ):
+            require_kind(value, kinds, name, wanted)
+        for name in joints or ():
+            require_kind(name, str, "one of joints", "the name of a joint")
+        for coupling in couplings:
+            require_kind(coupling, Coupling, "one of couplings", "a robotid.Coupling")
         tree = path if isinstance(path, Tree) else read_tree(path)
         tree = tree.snapped() if snap_angles else tree
         if mimic not in ("independent", "coupled"):

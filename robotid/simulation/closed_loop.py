@@ -33,6 +33,8 @@ __all__ = ["Noise", "Run", "another_robot", "carried", "follow", "lateness", "si
 _LONGEST_STEP = 2.5e-3  # [s] of the integration, whatever the rate of the log
 _ELASTIC_STEP = 0.3  # of 1 / w of the fastest elastic gear
 _SHORTEST_STEP = 1e-6  # [s] of the integration; a stiffer gear is refused
+_MOST = 2e7  # steps of a simulation, half an hour's work ...
+_MOST_EACH = 100_000  # ... and between two samples
 _CHUNK = 1024  # steps that a motion is evaluated for at once
 _LEAST_INERTIA = 0.02  # [kg m^2 or kg] that PD gains are reckoned with, at least
 
@@ -130,6 +132,7 @@ def follow(
         Rang, Angermann (2005), New Rosenbrock W-methods of order 3 for partial differential
         algebraic equations of index 1.
     """
+    _check_size(duration * rate, 1)
     t = np.arange(round(duration * rate) + 1) / rate
     loaded = carried(model, pi, settings.payload)
     taken_up = settings.payload.start if settings.payload.mass > 0 else math.inf
@@ -137,6 +140,7 @@ def follow(
         return _perfect(model, pi, loaded, motion, t, taken_up)
     loops = [_Loop(model, x, settings) for x in (pi, loaded)]
     steps = max(1, math.ceil(1.0 / rate / min(loop.longest_step for loop in loops) - 1e-9))
+    _check_size(len(t), steps)
     h = 1.0 / rate / steps
     loop, *later = loops if taken_up > 0 else loops[1:]
     seen = np.empty((len(t), 4, len(model.joints)))
@@ -164,6 +168,16 @@ def follow(
                 y = _advance(loop, y, stages, h, F, f)
     q, v, a, tau = seen.transpose(1, 0, 2)
     return Run(t, q, v, a, tau, reference, limited / len(t))
+
+
+def _check_size(samples: float, steps: int) -> None:
+    """Refuse simulations of more steps than a computer makes in an hour."""
+    if samples * steps > _MOST or steps > _MOST_EACH:
+        raise SettingsError(
+            f"the simulation has {samples:.3g} samples of {steps} steps each, wanted at most "
+            f"{_MOST:.0e} steps in all and {_MOST_EACH:.0e} each: lower its rate or its duration "
+            "(the motion has no gap?), or gains, bandwidth and stiffness"
+        )
 
 
 def _wanted(

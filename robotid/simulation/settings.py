@@ -16,6 +16,7 @@ from robotid.findings import listed
 from robotid.logs.data import suggestion
 
 __all__ = [
+    "DELAY",
     "GAIN",
     "LEVEL",
     "Actuator",
@@ -40,6 +41,10 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+def _are_within(values: Sequence[float], most: float) -> bool:
+    return all(_is_number(x) and abs(x) <= most for x in values)
+
+
 def _all_of(is_right: Any) -> Any:  # noqa: ANN401
     """Return whether a number, or each of a table of numbers, is right."""
 
@@ -51,13 +56,19 @@ def _all_of(is_right: Any) -> Any:  # noqa: ANN401
 
 
 _NUMBERS = "a number, or a table of numbers by joint"
+_LEAST, _LARGEST = 1e-9, 1e12  # of gains, in any unit: their squares are numbers, too
+_LONGEST = 1.0  # [s] of delays
 LEVEL: Mapping[str, Any] = {
     "reads": (int, float, dict),
-    "within": Range(f"0 or positive: {_NUMBERS}", _all_of(lambda x: x >= 0)),
+    "within": Range(f"0 to 1e12: {_NUMBERS}", _all_of(lambda x: 0 <= x <= _LARGEST)),
 }
 GAIN: Mapping[str, Any] = {
     "reads": (int, float, dict),
-    "within": Range(f"positive: {_NUMBERS}", _all_of(lambda x: x > 0)),
+    "within": Range(f"1e-9 to 1e12: {_NUMBERS}", _all_of(lambda x: _LEAST <= x <= _LARGEST)),
+}
+DELAY: Mapping[str, Any] = {
+    "reads": (int, float, dict),
+    "within": Range(f"0 to 1 s: {_NUMBERS}", _all_of(lambda x: 0 <= x <= _LONGEST)),
 }
 
 
@@ -78,7 +89,7 @@ class Truth(Settings):
         "how far each body is from the URDF's: standard deviation along each of ten directions in "
         "the metric of pseudo-inertias, so that every draw is a possible body; 0.1: masses differ "
         "by about 14 % [-]",
-        within=NOT_NEGATIVE,
+        within=Range("0 to 5", lambda x: 0 <= x <= 5),
     )
     drives: str = setting(
         "usual",
@@ -108,7 +119,7 @@ class Controller(Settings):
         20.0,
         "w of the error's w^2 e + 2 w de/dt, which makes the gains that are not stated, times the "
         "inertia of the joint [rad/s]",
-        within=POSITIVE,
+        within=Range("1e-3 to 1e6 rad/s", lambda x: 1e-3 <= x <= 1e6),
     )
     kp: PerJoint | None = setting(None, "torque per error [N m/rad or N/m]", **GAIN)
     kd: PerJoint | None = setting(None, "torque per speed's error [N m s/rad or N s/m]", **GAIN)
@@ -219,14 +230,20 @@ class Payload(Settings):
     _table: ClassVar[str] = "payload"
 
     link: str = setting("", "name of the link; the last moving one if not stated")
-    mass: float = setting(0.0, "its mass [kg]; 0: no payload", within=NOT_NEGATIVE)
+    mass: float = setting(
+        0.0,
+        "its mass [kg]; 0: no payload",
+        within=Range("0 to 1e9 kg", lambda x: 0 <= x <= 1e9),
+    )
     com: tuple[float, float, float] = setting(
-        (0.0, 0.0, 0.0), "its centre of mass in the link's frame [m]"
+        (0.0, 0.0, 0.0),
+        "its centre of mass in the link's frame [m]",
+        within=Range("three numbers within 1e3 m", lambda x: len(x) == 3 and _are_within(x, 1e3)),
     )
     inertia: tuple[float, ...] = setting(
         (0.0,) * 6,
         "Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass, along the link's axes [kg m^2]",
-        within=Range("six numbers", lambda x: len(x) == 6),
+        within=Range("six numbers within 1e9", lambda x: len(x) == 6 and _are_within(x, 1e9)),
     )
     start: float = setting(0.0, "when it is taken up [s]", within=NOT_NEGATIVE)
 
@@ -236,7 +253,9 @@ class Simulation(Settings):
     """All that a simulated log is made from, beside robot and motion."""
 
     seed: int = setting(0, "of the truth, the noise, and what is dropped", within=NOT_NEGATIVE)
-    rate: float = setting(1000.0, "rate of the log [Hz]", within=POSITIVE)
+    rate: float = setting(
+        1000.0, "rate of the log [Hz]", within=Range("1e-3 to 1e5", lambda x: 1e-3 <= x <= 1e5)
+    )
     duration: float | None = setting(
         None, "length of the log [s]; that of the motion if not stated", within=POSITIVE
     )

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._files import write_text
+from robotid._settings import require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.robot.model import RobotModel
@@ -167,6 +168,16 @@ def replay(
         DataError: If times and values do not fit each other or the model.
         SettingsError: If the rate is not positive.
     """
+    for name, value, kinds, wanted in (
+        ("model", model, RobotModel, "a robotid.RobotModel"),
+        ("torques", torques, (Torques, type(None)), "Torques"),
+        ("masses", masses, (Mapping, type(None)), "a table of standard parameters by label"),
+        ("ghosts", ghosts, (Mapping, type(None)), "a table of motions (t, q) by label"),
+        ("bands", bands, (Bands, type(None)), "Bands"),
+        ("marks", marks, (list, tuple), "a list of marks"),
+        ("notes", notes, (list, tuple), "a list of sentences"),
+    ):
+        require_kind(value, kinds, name, wanted)
     _check(t, q, rate)
     moved = _moved(model, t, q, rate)
     others = dict(ghosts or {})
@@ -246,6 +257,11 @@ def _data(
 
 
 def _check(t: Array, q: Array, rate: float) -> None:
+    require_kind(rate, (float, int), "rate", "a number of keyframes per second")
+    for name, values in (("t", t), ("q", q)):
+        require_kind(values, np.ndarray, name, "an array of numbers")
+        if values.dtype.kind not in "biuf":
+            raise DataError(f"{name} is an array of {values.dtype}, wanted numbers")
     if not rate > 0 or not np.isfinite(rate):
         raise SettingsError(f"rate is {rate}, wanted a positive number of keyframes per second")
     if t.ndim != 1 or q.ndim != 2 or len(t) != len(q):

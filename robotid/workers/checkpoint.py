@@ -1,11 +1,14 @@
 """Finished pieces of a long reduction, kept beside its results until it is complete."""
 
+import errno
 import hashlib
 import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ from robotid.exceptions import DataError
 from robotid.regressor.factors import Reduction
 from robotid.workers.pieces import Piece
 
-__all__ = ["FOLDER", "Checkpoint"]
+__all__ = ["FOLDER", "Checkpoint", "released_on_error"]
 
 FOLDER = ".robotid-checkpoint"
 
@@ -26,12 +29,50 @@ _SHOWN = 5  # differences that a message names
 _log = logging.getLogger(__name__)
 
 
+class _Lock:
+    """The right of one run alone to work in a folder; a process that ends gives it back.
+
+    Where the system or the file system has no locks (Windows, some network drives) there is none.
+
+    Args:
+        folder: The folder; it must exist.
+
+    Raises:
+        DataError: If another run has it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            import fcntl
+        except ImportError:  # not a POSIX system
+            self.release: Callable[[], object] = lambda: None
+            return
+        descriptor = os.open(folder, os.O_RDONLY)
+        self.release = weakref.finalize(self, os.close, descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_free = folder.exists() and os.path.samestat(os.fstat(descriptor), folder.stat())
+        except OSError as error:
+            is_free = error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
+        if not is_free:
+            self.release()
+            raise DataError(
+                f"another run works in {folder} now, wanted a checkpoint of this run alone; wait "
+                "for its end, or write to another folder",
+                "checkpoint",
+            )
+
+
 @dataclass(frozen=True)
 class Checkpoint:
-    """A folder with a file per finished piece, each for one set of inputs only."""
+    """A folder with a file per finished piece, each for one set of inputs only.
+
+    Only one run at a time has it open, until it is released or removed.
+    """
 
     folder: Path
     key: str  # SHA-256 of all that determines the reductions, in hexadecimal
+    lock: _Lock
 
     @classmethod
     def open(
@@ -51,25 +92,36 @@ class Checkpoint:
             resume: Whether finished pieces of an interrupted run are used.
 
         Raises:
-            DataError: If the one to resume is of other inputs or cannot be read.
+            DataError: If the one to resume is of other inputs or cannot be read, or another run
+                works in the folder.
         """
         folder = Path(parent) / FOLDER
         stated = {**inputs, "pieces": [piece.name for piece in pieces]}
         text = json.dumps(stated, sort_keys=True, indent=1)
-        found = cls(folder, hashlib.sha256(text.encode()).hexdigest())
-        if (folder / "inputs.json").is_file():
-            if resume:
-                found._require_same(json.loads(text))
-                return found
-            _log.warning("%s holds an unfinished run, which is replaced (no --resume)", folder)
-        elif resume:
-            _log.warning("%s does not exist: nothing to resume, starting anew", folder)
-        if folder.exists():
-            shutil.rmtree(folder)
-        folder.mkdir(parents=True)
-        with written_whole(folder / "inputs.json") as beside:
-            beside.write_text(text)
+        folder.mkdir(parents=True, exist_ok=True)
+        key = hashlib.sha256(text.encode()).hexdigest()
+        found = cls(folder, key, _Lock(folder))
+        with released_on_error(found):
+            found._begin(text, resume=resume)
         return found
+
+    def _begin(self, text: str, *, resume: bool) -> None:
+        """Keep what an interrupted run finished, if it is resumed, or empty the folder."""
+        stated = self.folder / "inputs.json"
+        if stated.is_file() and resume:
+            self._require_same(json.loads(text))
+            return
+        if stated.is_file():
+            _log.warning("%s holds an unfinished run, which is replaced (no --resume)", self.folder)
+        elif resume:
+            _log.warning("%s does not exist: nothing to resume, starting anew", self.folder)
+        for old in self.folder.iterdir():
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old)
+            else:
+                old.unlink()
+        with written_whole(stated) as beside:
+            beside.write_text(text)
 
     def finished(self) -> frozenset[int]:
         """Return the indices of the pieces whose reductions are kept."""
@@ -116,6 +168,11 @@ class Checkpoint:
     def remove(self) -> None:
         """Remove the folder, as when the run is complete."""
         shutil.rmtree(self.folder)
+        self.release()
+
+    def release(self) -> None:
+        """Let another run have it."""
+        self.lock.release()
 
     def _path(self, index: int) -> Path:
         return self.folder / f"piece-{index:06d}.npz"
@@ -136,6 +193,21 @@ class Checkpoint:
                 "to start anew",
                 "checkpoint",
             )
+
+
+@contextmanager
+def released_on_error(checkpoint: Checkpoint | None) -> Iterator[None]:
+    """Release a checkpoint if the work in the context fails; a later run may resume it then.
+
+    Args:
+        checkpoint: The checkpoint, if there is one.
+    """
+    try:
+        yield
+    except BaseException:
+        if checkpoint is not None:
+            checkpoint.release()
+        raise
 
 
 def _differences(kept: object, now: object, name: str = "") -> Iterator[str]:

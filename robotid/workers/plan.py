@@ -182,6 +182,6 @@ def _resumable(checkpoint: Checkpoint | None) -> Iterator[None]:
     except GeneratorExit:
         raise
     except BaseException as error:
-        if checkpoint is not None:
+        if checkpoint is not None and checkpoint.folder.is_dir():
             error.add_note(f"finished pieces are kept in {checkpoint.folder}: --resume uses them")
         raise

@@ -10,6 +10,7 @@ from robotid.commanded.identify import identify_commands
 from robotid.commanded.open_loop_verdict import judge_open_loops
 from robotid.commanded.second_order import SecondOrder
 from robotid.commanded.settings import LoopSettings
+from robotid.commanded.term_choice import _Fold, _gains
 from robotid.exceptions import DataError
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
@@ -263,3 +264,13 @@ def test_a_log_without_commands_is_refused(leg):
         identify_commands(robot.model, [bare], [], stated(robot), SETTINGS)
     with pytest.raises(DataError, match="no log was given"):
         identify_commands(robot.model, [], [], stated(robot), SETTINGS)
+
+
+def test_terms_that_no_other_window_judges_gain_nothing():
+    """Of one window the others are none; of two, one alone may leave a parameter open."""
+    alone = _Fold(np.eye(3), np.ones(3), 10)
+    assert _gains([alone], [0, 1], {5: [2]}) == {5: 0.0}
+    blind = _Fold(np.diag([1.0, 0.0, 1.0]), np.ones(3), 10)
+    assert _gains([blind, blind], [0, 1], {5: [2]}) == {5: 0.0}
+    known = _gains([alone, alone], [0, 1], {5: [2]})[5]
+    assert known == pytest.approx(2.0)  # of two folds 2 y - y^2, y = 1

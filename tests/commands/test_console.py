@@ -239,3 +239,35 @@ def test_findings_are_told_by_cause_and_the_worst_joint_is_named(capsys):
     ]
     print_content("doctor", {"findings": [], "joints": joints})
     assert capsys.readouterr().out == "nothing was found\n"
+
+
+CLOSED = {"no output": ">&-", "no errors": "2>&-", "neither": ">&- 2>&-"}
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_streams_change_neither_files_nor_the_code(log, tmp_path, name):
+    """The next file that is opened gets the number of a closed stream: no word may get into it."""
+    write_log(log, tmp_path / "log.csv")
+    words = ["convert", tmp_path / "log.csv", tmp_path / "out.npz"]
+    close = CLOSED[name]
+    command = shlex.join([sys.executable, "-m", "robotid", *map(str, words)])
+    done = subprocess.run(f"{command} {close}", shell=True, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert len(np.load(tmp_path / "out.npz")["time"]) == 900
+    missing = command.replace("log.csv", "none.csv")
+    done = subprocess.run(f"{missing} {close}", shell=True, capture_output=True, check=False)
+    assert done.returncode == 1
+    assert (b"there is no log file" in done.stderr) == (name == "no output")
+
+
+def test_too_little_memory_is_said(log, tmp_path, monkeypatch, capsys):
+    def ask(*_, **__):
+        raise MemoryError("Unable to allocate 9.1 TiB")
+
+    monkeypatch.setattr("robotid.commands.convert.convert", ask)
+    assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "b.csv")]) == 1
+    said = capsys.readouterr().err
+    assert said == (
+        "robotid: not enough memory; lower rates, shorten logs, or lock joints (Unable to allocate "
+        "9.1 TiB)\n"
+    )

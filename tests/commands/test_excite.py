@@ -69,10 +69,21 @@ def test_the_terminal_says_what_is_left_of_each_limit(tmp_path, capsys):
     [
         (["--clearance", "near"], "--clearance 'near': wanted metres, or none"),
         (["--box", "post=1,2,3"], "--box 'post=1,2,3': wanted NAME=x0,y0,z0,x1,y1,z1"),
-        (["--duration", "-1"], "duration is -1, wanted more than 0"),
+        (["--duration", "-1"], "duration is -1, wanted 0.1 to 3600 s"),
         (["--max-jerk", "elbow=3"], "jerk is stated of 'elbow', which is no joint that moves"),
-        (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1"),
-        (["--harmonics", "1"], "harmonics is 1, wanted 2 or more"),
+        (["--noise", "wrist_1_joint=-1"], "noise of 'wrist_1_joint' is -1, wanted 1e-09 to 1e+12"),
+        (["--harmonics", "1"], "harmonics is 1, wanted 2 to 100"),
+        (["--harmonics", "100000"], "harmonics is 100000, wanted 2 to 100"),
+        (["--duration", "1e9"], "duration is 1e+09, wanted 0.1 to 3600 s"),
+        (["--points", "1e9"], "points is 1e+09, wanted 0.1 to 100000 rows per second"),
+        (["--seconds", "0"], "seconds is 0, wanted 0.001 or more s"),
+        (["--seed", "-1"], "seed is -1, wanted 0 or a positive whole number"),
+        (["--floor", "1e300"], "floor is 1e+300 m, wanted at most 1000 m"),
+        (
+            ["--max-jerk", "wrist_1_joint=1e300"],
+            "jerk of 'wrist_1_joint' is 1e+300, wanted",
+        ),
+        (["--box", "post=0,0,0,1,1,nan"], "the lower and the upper corner [m], within 1000 m"),
         (["--criterion", "widest"], "criterion is widest, which is about what logs have told"),
     ],
 )
@@ -222,3 +233,33 @@ def test_after_a_result_a_motion_is_made_for_what_it_knows_the_least(tmp_path, c
     content = json.loads(capsys.readouterr().out)
     assert content["criterion"] == "A"
     assert "widest" not in content
+
+
+PAN_TILT = """<robot name="pan_tilt"><link name="base"/><link name="pan"><inertial><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="tilt">
+<inertial><origin xyz=".05 0 0"/><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="a" type="revolute"><parent link="base"/><child link="pan"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" velocity="2" effort="10"/></joint>
+<joint name="b" type="revolute"><parent link="pan"/><child link="tilt"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" velocity="2" effort="10"/></joint></robot>"""
+SHAPE = '<collision><geometry><box size=".05 .05 .05"/></geometry></collision></link>'
+
+
+@pytest.mark.parametrize("kind", ["fourier", "stands"])
+def test_a_robot_without_links_to_keep_apart_moves_too(tmp_path, kind, capsys):
+    """Neighbours touch, so of three links in a row only the first and the last could collide."""
+    urdf, out = tmp_path / "pan_tilt.urdf", tmp_path / "motion.csv"
+    urdf.write_text(PAN_TILT.replace("</link>", SHAPE))
+    words = ["--duration", "2", "--seconds", "0.5", "--starts", "1", "--kind", kind]
+    assert main(["excite", str(urdf), "--out", str(out), *words]) == 0
+    assert "no links or obstacles come near each other" in " ".join(capsys.readouterr().out.split())
+    q = np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:3]
+    assert (np.ptp(q, axis=0) > 0.2).all()
+    assert (np.abs(q) <= [2.0, 1.0]).all()
+
+
+def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(tmp_path, capsys):
+    urdf = str(example_urdf("ur5_robot.urdf"))
+    assert main(["excite", urdf, "--out", str(tmp_path / "motion.txt")]) == 1
+    assert "motion.txt: logs are written as .csv, .parquet" in capsys.readouterr().err

@@ -85,6 +85,26 @@ def test_an_input_that_was_changed_or_is_gone_is_named(out, capsys, name, what):
     assert contents(out) == before
 
 
+def test_a_log_that_is_a_device_now_is_not_read(out, capsys):
+    path, before = out.parent / "fit.csv", contents(out)
+    path.unlink()
+    path.symlink_to("/dev/null")
+    assert main(["report", str(out)]) == 1
+    path.unlink()
+    assert f"'{path}' is a pipe or a device" in capsys.readouterr().err
+    assert contents(out) == before
+
+
+def test_an_input_without_a_hash_is_named(out, capsys):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    content["inputs"][1]["sha256"] = None
+    path.write_text(json.dumps(content))
+    assert main(["report", str(out)]) == 1
+    said = f"result.json states no SHA-256 of the log '{out.parent / 'fit.csv'}'"
+    assert said in capsys.readouterr().err
+
+
 def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
     path = out / "result.json"
     content = json.loads(path.read_text())

@@ -11,6 +11,7 @@ from robotid.doctor.hypotheses import explanations
 from robotid.doctor.loads import load_model
 from robotid.doctor.sample import smooth_motion, take_probe
 from robotid.logs.settings import SignalSettings
+from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.examples import example_urdf
 from robotid.robot.model import RobotModel
 
@@ -84,7 +85,8 @@ def test_the_fit_is_the_least_squares_of_all_joints_and_drives(ur5, ur5_log):
     assert model.misfits(scale[None])[0] == pytest.approx(chi, rel=1e-9)
     N, n, bodies = len(probe.rows), 6, 6
     pi = ur5.standard_parameters()[: ur5.layout.n_inertial].reshape(-1, 10)
-    Y = probe.regressor().reshape(N, n, bodies, 10)
+    Y = joint_torque_regressor(ur5, probe.q, probe.v, probe.a)[:, : ur5.layout.n_inertial]
+    Y = Y.reshape(N, n, bodies, 10)
     rows, right = [np.eye(10) / model.spread[:, None]], [model.mean / model.spread]
     for j in range(n):
         sigma = np.sqrt(0.05**2 + share[j]) * probe.tau[:, j].std() / np.sqrt(20.0 / N)

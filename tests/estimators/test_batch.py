@@ -48,6 +48,11 @@ def test_with_a_prior_the_rest_is_kept(ur5, rng):
     case = still_wrist(ur5, rng)
     prior = case.mapping.to_base(ur5.standard_parameters())
     estimate = WLS(prior=prior).fit(case.problem)
+    other = WLS(prior=prior + 1e-3 * np.abs(prior)).fit(case.problem)
+    factors = compress(case.problem)
+    np.testing.assert_allclose(  # what the data determine has nothing of the prior
+        factors.residual_squares(other.theta), factors.residual_squares(estimate.theta), rtol=1e-6
+    )
     i = estimate.names.index("wrist_3_joint.viscous")
     assert estimate.theta[i] == pytest.approx(prior[i], abs=1e-12)
     assert np.isinf(estimate.std_error[i])

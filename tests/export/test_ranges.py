@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robotid.export.ranges import parameter_ranges, ranges_text, write_ranges
 from robotid.export.result import build_result
+from robotid.export.yaml_text import yaml_text
 from robotid.robot.parameters import pseudo_inertia
 
 AXES = ("x", "y", "z")
@@ -130,3 +131,11 @@ def test_yaml_and_result_have_the_same_figures(identified, ranges, tmp_path):
             assert value == (exact[key] if is_text else pytest.approx(exact[key], rel=1e-5, abs=0))
     assert not wanted
     assert build_result(identified, {"estimator": {"name": "consistent"}})["ranges"] == ranges
+
+
+@pytest.mark.parametrize("name", ["a\u2028b", "a\u2029b", "a\x85b", "a\ufeffb", "no", "é"])
+def test_names_of_any_characters_are_read_back_from_yaml(name):
+    table = {name: {"inner": {name: 1.5, "plain": [name, True, None]}}, "plain": name}
+    text = yaml_text(table, "# head")
+    assert yaml.safe_load(text) == table
+    assert len(text.splitlines()) == text.count("\n")

@@ -470,6 +470,19 @@ def test_normalised_positions_are_no_angles(tmp_path):
         (lambda info: info["features"]["action"].update(names=["a", *JOINTS]), "at least 3 motors"),
         (lambda info: info.pop("features"), "is no description of a LeRobot dataset of version 2"),
         (lambda info: info.update(features={"image": {}}), "neither observation.state nor action"),
+        (lambda info: info.update(features=None), "features is None, wanted a table of tables"),
+        (lambda info: info.update(features={"action": 5}), "wanted a table of tables"),
+        (lambda info: info["features"]["action"].update(names=5), "no names of the motors in ac"),
+        (lambda info: info["features"]["action"].update(names={"m": 5}), "no names of the motors"),
+        (lambda info: info["features"]["action"].update(names=[["a"], 5]), "no names of the motor"),
+        (
+            lambda info: info["features"]["action"].update(names=[JOINTS[0], JOINTS[0]]),
+            f"names '{JOINTS[0]}' of action, number 1, and number 0 of action alike",
+        ),
+        (
+            lambda info: info["features"]["action"].update(names=[f"{JOINTS[0]}.pos", JOINTS[0]]),
+            "number 1, and number 0 of action alike; give each motor a name of its own",
+        ),
     ],
 )
 def test_datasets_that_do_not_fit_are_refused(tmp_path, change, text):
@@ -479,4 +492,12 @@ def test_datasets_that_do_not_fit_are_refused(tmp_path, change, text):
     change(info)
     file.write_text(json.dumps(info))
     with pytest.raises(DataError, match=text):
+        read_log(path, JOINTS, needs="commands", units=DEGREES)
+
+
+@pytest.mark.parametrize("text", ["[" * 5000, "{", '{"features": ' * 60 + "1" + "}" * 60, "5"])
+def test_a_description_that_is_none_is_refused(tmp_path, text):
+    path = dataset(tmp_path)
+    (path / "meta" / "info.json").write_text(text)
+    with pytest.raises(DataError, match=r"info\.json"):
         read_log(path, JOINTS, needs="commands", units=DEGREES)

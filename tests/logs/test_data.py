@@ -368,3 +368,11 @@ def test_a_log_and_a_trajectory_are_one_line():
     assert repr(motion) == (
         "<Trajectory: 201 samples of 2 joints (a, b) over 2 s at 50 Hz, in 2 stretches>"
     )
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-12])
+def test_time_stamps_of_no_clock_are_refused(scale):
+    t = scale * np.arange(5) / 100
+    with pytest.raises(DataError, match=r"5 rows lie within .* wanted at least 1e-12 s") as caught:
+        Log(t=t, q=np.zeros((5, 1)), tau=np.zeros((5, 1)), joints=("a",))
+    assert caught.value.code == "time_unit"

@@ -346,20 +346,23 @@ def test_an_mcap_file_that_is_not_of_ros2_says_so(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "message"),
+    ("name", "module", "purpose", "extra"),
     [
-        ("mcap", "rosbags.rosbag2", "reading ROS bags and MCAP files needs rosbags, {}bag]"),
-        ("ros1", "rosbags.rosbag1", "reading ROS bags and MCAP files needs rosbags, {}bag]"),
-        ("hdf5", "h5py", "reading HDF5 and MATLAB v7.3 needs h5py, {}hdf5]"),
-        ("mat 7.3", "h5py", "reading HDF5 and MATLAB v7.3 needs h5py, {}hdf5]"),
+        ("mcap", "rosbags.rosbag2", "reading ROS bags and MCAP files needs rosbags", "bag"),
+        ("ros1", "rosbags.rosbag1", "reading ROS bags and MCAP files needs rosbags", "bag"),
+        ("hdf5", "h5py", "reading HDF5 and MATLAB v7.3 needs h5py", "hdf5"),
+        ("mat 7.3", "h5py", "reading HDF5 and MATLAB v7.3 needs h5py", "hdf5"),
     ],
 )
 def test_without_its_library_a_format_says_how_to_install_it(
-    tmp_path, monkeypatch, name, module, message
+    tmp_path, monkeypatch, name, module, purpose, extra
 ):
     path = FORMATS[name](tmp_path, make_log())
     monkeypatch.setitem(sys.modules, module, None)
-    text = message.format("which is not installed: pip install robotid[")
+    text = (
+        f"{purpose}, which is not installed: pip install '.[{extra}]' in a checkout of robotid, "
+        f"or pip install 'robotid[{extra}]' where an index has it"
+    )
     with refused(text, MissingDependencyError):
         read_log(path, JOINTS)
     if module == "h5py":

@@ -546,7 +546,10 @@ def test_broken_parquet_is_refused(tmp_path):
 def test_parquet_without_pyarrow_says_how_to_install_it(tmp_path, monkeypatch):
     path = save(tmp_path / "run.parquet", make_table())
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    how = "needs pyarrow, which is not installed: pip install robotid[parquet]"
+    how = (
+        "needs pyarrow, which is not installed: pip install '.[parquet]' in a checkout of robotid, "
+        "or pip install 'robotid[parquet]' where an index has it"
+    )
     with refused(f"reading Parquet {how}", MissingDependencyError):
         read_log(path, JOINTS)
     with refused(f"writing Parquet {how}", MissingDependencyError):

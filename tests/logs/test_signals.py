@@ -183,6 +183,12 @@ def test_settings_out_of_range_are_refused(options, message):
         SignalSettings(**options)
 
 
+def test_a_cutoff_that_no_filter_reaches_is_refused():
+    log = sine_log(np.arange(200) / 1e9)
+    with pytest.raises(SettingsError, match=r"cutoff 8 Hz is less than 1e-06 of the rate 1e\+09"):
+        process(log, SignalSettings(cutoff=8.0))
+
+
 def test_a_cutoff_beyond_half_the_rate_is_refused():
     with pytest.raises(SettingsError, match=r"cutoff 60 Hz is not below half the rate 100 Hz"):
         process(sine_log(np.arange(0, 5, 0.01)), SignalSettings(cutoff=60.0))

@@ -72,3 +72,5 @@ def test_settings_that_cannot_be_are_refused():
         LiveSignals(1, 100.0, 60.0, 4, FIXED)
     with pytest.raises(SettingsError, match="order is 3, wanted an even number"):
         LiveSignals(1, 100.0, 6.0, 3, FIXED)
+    with pytest.raises(SettingsError, match=r"cutoff 6 Hz is less than 1e-05 of the rate 1e\+06"):
+        LiveSignals(1, 1e6, 6.0, 4, FIXED)

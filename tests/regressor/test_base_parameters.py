@@ -2,10 +2,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from robotid.exceptions import DataError
 from robotid.paper.planar_2r import urdf_text
-from robotid.regressor.base_parameters import base_mapping, structural_mapping
+from robotid.regressor.base_parameters import base_mapping, independent_factors, structural_mapping
 from robotid.regressor.torque import joint_torque_regressor, random_regressor
 from robotid.robot.drives import Cubic, Harmonic
 from robotid.robot.examples import example_urdf
@@ -155,3 +156,54 @@ def test_further_terms_leave_the_base_parameters_of_the_others_as_they_are(rng):
     q, v, a = rng.uniform(-2, 2, (3, 50, 6))
     W, pi = joint_torque_regressor(model, q, v, a), rng.standard_normal(len(model.layout.names))
     np.testing.assert_allclose(W[:, after.independent] @ after.to_base(pi), W @ pi, atol=1e-9)
+
+
+#: Which columns four equations have: a trunk with two branches; one column of a branch does not
+#: load the trunk; equations that are not nested; two robots in one.
+PATTERNS = {
+    "tree": ["11111111", "01111000", "00000110", "00000010"],
+    "hidden column": ["11101111", "01111000", "00000110", "00000010"],
+    "chain": ["11110000", "00111100", "00001111", "00000000"],
+    "not nested": ["11110000", "00111100", "00001111", "10000001"],
+    "apart": ["11100000", "01100000", "00011111", "00000000"],
+}
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_factors_of_parts_have_the_products_of_all_rows(rng, name):
+    pattern = np.array([[letter == "1" for letter in row] for row in PATTERNS[name]])
+    W = (rng.standard_normal((30, 4, 8)) * pattern).reshape(120, 8)
+    parts = independent_factors(W, 4)
+    assert sorted(np.concatenate([own for own, _ in parts]).tolist()) == list(range(8))
+    assert len(parts) == (2 if name == "apart" else 1)
+    for own, R in parts:
+        np.testing.assert_allclose(R.T @ R, W[:, own].T @ W[:, own], rtol=1e-12, atol=1e-12)
+    product = np.zeros((8, 8))
+    for own, R in parts:
+        product[np.ix_(own, own)] = R.T @ R
+    np.testing.assert_allclose(product, W.T @ W, rtol=1e-12, atol=1e-12)
+
+
+def test_equations_of_a_tree_are_factored_one_by_one(ur5, rng, monkeypatch):
+    W = random_regressor(ur5, 40, rng)
+    expected = W.T @ W
+    monkeypatch.setattr(scipy.linalg, "qr", lambda *_, **__: pytest.fail("factored as a whole"))
+    ((own, R),) = independent_factors(W, ur5.n_rows)
+    np.testing.assert_allclose(R.T @ R, expected[np.ix_(own, own)], rtol=1e-9, atol=1e-9)
+
+
+def test_arms_on_one_base_share_no_base_parameter(ur5, rng):
+    """A robot of two equal halves has the base parameters of each, by the same rule."""
+    W = random_regressor(ur5, 60, rng).reshape(60, 6, -1)
+    p = W.shape[2]
+    both = np.zeros((60, 12, 2 * p))
+    both[:, :6, :p], both[:, 6:, p:] = W, W
+    names = ur5.layout.names
+    alone = base_mapping(W.reshape(360, p), names, n_rows=6)
+    twice = [*names, *(f"other {name}" for name in names)]
+    found = base_mapping(both.reshape(720, 2 * p), twice, n_rows=12)
+    b = len(alone.K)
+    np.testing.assert_allclose(found.K[:b, :p], alone.K, atol=1e-9)
+    np.testing.assert_allclose(found.K[b:, p:], alone.K, atol=1e-9)
+    assert not found.K[:b, p:].any()
+    assert not found.K[b:, :p].any()

@@ -195,7 +195,7 @@ def test_without_numba_pinocchio_computes_the_rows(ur5, rng, monkeypatch):
     trajectory = motion(ur5, rng, 200)
     engine = build_problem(ur5, trajectory).sources[0].engine
     assert engine == "Pinocchio (robotid[fast] is not installed)"
-    with pytest.raises(MissingDependencyError, match=r"pip install robotid\[fast\]"):
+    with pytest.raises(MissingDependencyError, match=r"pip install '\.\[fast\]' in a checkout of"):
         build_problem(ur5, trajectory, compiled=True)
 
 

@@ -10,6 +10,7 @@ from robotid.regressor.problem import Sample, concatenate, shuffled
 from robotid.regressor.torque import (
     InstantRegressor,
     build_problem,
+    carried_columns,
     joint_torque_regressor,
     mass_regressor,
     random_regressor,
@@ -220,3 +221,20 @@ def test_samples_are_shuffled_without_loss(rng):
     found = [int(s.tau[0]) for s in shuffled(samples, rng)]
     assert sorted(found) == list(range(20_000))
     assert np.mean(np.abs(np.array(found) - np.arange(20_000))) > 1000
+
+
+@pytest.mark.parametrize("name", ["ur5", "coupled"])
+def test_columns_of_what_is_carried_are_those_of_the_regressor(ur5, rng, name):
+    model = ur5
+    if name == "coupled":
+        model = RobotModel.from_urdf(example_urdf("tiago.urdf"), mimic="coupled")
+    n = len(model.joints)
+    q, v, a = rng.uniform(-1.0, 1.0, (3, 40, n))
+    Y = joint_torque_regressor(model, q, v, a).reshape(40, model.n_rows, -1)
+    inertial = Y[:, :, : model.layout.n_inertial]
+    carried = model.support()[:, : model.layout.n_inertial]
+    np.testing.assert_array_equal(carried_columns(model, q, v, a), inertial[:, carried])
+    assert not inertial[:, ~carried].any()
+    v[3, 1] = np.nan
+    with pytest.raises(DataError, match=r"v\[3\] of .* is nan, wanted a finite number"):
+        carried_columns(model, q, v, a)

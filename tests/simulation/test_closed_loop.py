@@ -13,7 +13,7 @@ from robotid.robot.model import RobotModel
 from robotid.robot.parameters import pseudo_inertia
 from robotid.simulation.closed_loop import Noise, carried, follow, simulate
 from robotid.simulation.motions import FourierTrajectory, random_fourier
-from robotid.simulation.settings import Actuator, Controller, Payload, Simulation
+from robotid.simulation.settings import Actuator, Controller, Payload, Simulation, Truth
 
 
 def test_a_fourier_motion_keeps_its_derivatives(rng):
@@ -229,3 +229,15 @@ def test_gains_beyond_reason_are_told(ur5):
     wild = Simulation(controller=Controller("pd", kp=1e7, kd=1e6))
     with pytest.raises(DataError, match=r"the simulation diverged at t = .* lower the"):
         followed(ur5, truth(ur5), wild)
+
+
+def test_more_steps_than_a_computer_makes_are_refused_before_the_first(ur5):
+    motion = random_fourier(ur5, np.random.default_rng(0))
+    for rate, duration in ((1e5, 3600.0), (1e3, 1e9)):
+        with pytest.raises(SettingsError, match=r"has .* samples of 1 steps each, wanted at most"):
+            follow(ur5, ur5.standard_parameters(), motion, rate=rate, duration=duration,
+                   settings=Simulation())  # fmt: skip
+    with pytest.raises(SettingsError, match=r"rate is 1000000000\.0, wanted 1e-3 to 1e5"):
+        Simulation(rate=1e9)
+    with pytest.raises(SettingsError, match="inertials is 1000, wanted 0 to 5"):
+        Truth(inertials=1000)

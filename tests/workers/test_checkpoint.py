@@ -1,12 +1,16 @@
 """Finished pieces are kept whole, found again by name, and never used for other inputs."""
 
 import logging
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
 
 import pytest
 from helpers.piecework import marks, pieces_in, reduce_all, same_bits
 
 from robotid.exceptions import DataError
-from robotid.workers.checkpoint import Checkpoint
+from robotid.workers.checkpoint import FOLDER, Checkpoint, released_on_error
 
 INPUTS = {"robotid": "0.1", "signals": {"cutoff": 8.0, "order": 4}, "logs": [{"size": 10}]}
 
@@ -107,3 +111,52 @@ def test_a_kept_piece_has_the_same_bits(tmp_path):
     kept = Checkpoint.open(tmp_path, INPUTS, pieces, resume=True)
     fresh = reduce_all(pieces[:3])
     assert all(same_bits(kept.load(k), fresh[k]) for k in range(3))
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_checkpoint_that_another_run_works_in_is_refused_and_left_as_it_is(tmp_path, resume):
+    pieces = pieces_in(tmp_path / "marks", 3)
+    first = Checkpoint.open(tmp_path, INPUTS, pieces)
+    first.save(1, pieces[1].name, reduce_all(pieces[1:2])[0])
+    with pytest.raises(DataError, match=r"another run works in .*checkpoint now, .*wait for its"):
+        Checkpoint.open(tmp_path, INPUTS, pieces, resume=resume)
+    assert first.finished() == {1}
+    first.release()
+    assert Checkpoint.open(tmp_path, INPUTS, pieces, resume=True).finished() == {1}
+
+
+def test_a_process_that_ended_in_any_way_locks_nothing(tmp_path):
+    code = (
+        "import os, sys; from robotid.workers.checkpoint import Checkpoint; "
+        "kept = Checkpoint.open(sys.argv[1], {}, []); print(kept.folder); os.kill(os.getpid(), 9)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+    assert ended.returncode == -9
+    assert Checkpoint.open(tmp_path, {}, [], resume=True).finished() == frozenset()
+
+
+def test_work_that_fails_releases_the_checkpoint(tmp_path):
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, [])
+    with pytest.raises(KeyboardInterrupt), released_on_error(checkpoint):
+        raise KeyboardInterrupt
+    again = Checkpoint.open(tmp_path, INPUTS, [], resume=True)
+    again.remove()
+    assert not (tmp_path / FOLDER).exists()
+    Checkpoint.open(tmp_path, INPUTS, [])
+
+
+def test_a_run_whose_checkpoint_is_gone_does_not_promise_to_resume_it(tmp_path):
+    pieces = pieces_in(tmp_path / "marks", 3)
+    pieces[1] = replace(pieces[1], fault="data")
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
+    with pytest.raises(DataError, match="row 7") as kept:
+        reduce_all(pieces, checkpoint=checkpoint)
+    promise = f"finished pieces are kept in {checkpoint.folder}: --resume uses them"
+    assert promise in kept.value.__notes__
+    checkpoint.release()
+    checkpoint = Checkpoint.open(tmp_path, INPUTS, pieces)
+    with pytest.raises(DataError, match="there is no folder") as gone:
+        reduce_all(
+            pieces, checkpoint=checkpoint, progress=lambda *_: shutil.rmtree(checkpoint.folder)
+        )
+    assert promise not in getattr(gone.value, "__notes__", [])

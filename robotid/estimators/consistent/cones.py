@@ -383,9 +383,8 @@ def _nearest_by_clarabel(points: Array, cone: Cone, max_iterations: int) -> list
             solved.append(point)
             continue
         solver.update(q=-point / reach)
-        solution = solver.solve()
-        is_solved = str(solution.status) in (_SOLVED, _ALMOST)
-        solved.append(reach * np.array(solution.x) if is_solved else str(solution.status))
+        x, status, _ = _solution(solver)
+        solved.append(reach * x if status in (_SOLVED, _ALMOST) else status)
     return solved
 
 
@@ -421,8 +420,19 @@ def _clarabel(
     # at the default 1e-8 it stalls on easy problems, at an optimum right to 1e-9
     settings = _clarabel_settings(max_iterations, 1e-7)
     solver = clarabel.DefaultSolver(P, np.zeros(2 * p), rows, right, cones, settings)
-    solution = solver.solve()
-    return np.array(solution.x[:p]), str(solution.status), int(solution.iterations)
+    x, status, iterations = _solution(solver)
+    return x[:p], status, iterations
+
+
+def _solution(solver: Any) -> tuple[Array, str, int]:  # noqa: ANN401
+    """Return the point, the status and the iterations of Clarabel, "Panic" where it gave up so."""
+    try:
+        solution = solver.solve()
+    except BaseException as error:  # of Rust: it is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        return np.empty(0), "Panic", 0
+    return np.array(solution.x), str(solution.status), int(solution.iterations)
 
 
 def _cones(cone: Cone) -> list[Any]:

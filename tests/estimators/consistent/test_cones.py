@@ -106,3 +106,26 @@ def test_a_linear_bound_is_active_at_its_face_only():
     gradients, labels = cone.active(np.array([1.0, 5.0]), 1e-6)
     np.testing.assert_allclose(gradients, [[2.0, 0.0]])
     assert labels == ("bound 0",)
+
+
+def test_a_solver_that_breaks_down_is_a_fit_that_was_not_solved(monkeypatch):
+    """Clarabel is written in Rust: what it panics with is no Exception."""
+
+    class PanicException(BaseException):
+        pass
+
+    class Solver:
+        def __init__(self, *_):
+            pass
+
+        def solve(self):
+            raise error
+
+    monkeypatch.setattr("clarabel.DefaultSolver", Solver)
+    error = PanicException("eigenvalues of NaN")
+    with pytest.raises(NotConvergedError, match="not solved by Clarabel") as caught:
+        least_squares(np.eye(10), np.ones(10), psd_cone(), solver="clarabel")
+    assert caught.value.status == "Panic"
+    error = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        least_squares(np.eye(10), np.ones(10), psd_cone(), solver="clarabel")

@@ -173,8 +173,9 @@ def test_bounds_that_no_body_meets_are_named(case):
     ("options", "text"),
     [
         ({"mass": {"a": "heavy"}}, "mass of a is 'heavy', wanted a number or"),
-        ({"mass": {"a": [np.inf, np.inf]}}, r"a is \[inf, inf\] kg, wanted finite numbers"),
-        ({"total_mass": [1.0, np.nan]}, r"total_mass is \[1, nan\] kg, wanted finite numbers"),
+        ({"mass": {"a": [np.inf, np.inf]}}, r"a is \[inf, inf\], wanted finite numbers of at most"),
+        ({"total_mass": [1.0, np.nan]}, r"total_mass is \[1.0, nan\], wanted finite numbers"),
+        ({"total_mass": [1.0, 1e300]}, r"1e\+300\], .* at most 1e\+09 kg; write 1e\+09 for no"),
         ({"total_mass": [3.0]}, r"total_mass is \[3.0\], wanted a number or"),
         ({"total_mass": [4.0, 3.0]}, "the first is above the second"),
         ({"com": {"a": [[0, 0], [1, 1]]}}, "com of a is .* wanted"),
