@@ -63,6 +63,8 @@ _WORDS = {
     "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
+    "joint_torque_delay": "the torque is {delay:+.3f} s (+ late, - early) against the position, "
+    "those of the other joints are not",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
     "payload_change": "its last link carries {mass:+.2g} kg against the fitted logs",
     "position_offset": "the zero of the position may be off",
