@@ -20,6 +20,7 @@ from robotid.excitation.basis import Basis, DesignedMotion
 from robotid.excitation.clearance import Clearance, Contact
 from robotid.excitation.information import Aim, MotionInformation, MotionRows, criterion
 from robotid.excitation.limits import LIMITS, MotionLimits
+from robotid.findings import listed
 from robotid.identification.previews import (
     CORRELATION,
     Run,
@@ -57,6 +58,7 @@ _SPARE_ROOM = 0.25  # of the room that links have which are built near each othe
 _SEEN = 0.01  # [m] short of which distances are reckoned where a motion is made to keep them
 _SOFT = 0.05  # [m] of distance that weighs as much as a whole limit
 _USUAL = 0.3  # of the largest torque, speed and acceleration: about the rms of a motion
+_NAMED = 3  # pairs of links that a refusal names
 _TRIED = 200  # random postures until one is found that the robot can rest in ...
 _AT_ONCE = 10  # ... so many at a time
 _WIDEST = 0.25  # share of the base parameters that the criterion "widest" is about
@@ -542,16 +544,37 @@ class Designer:
                 f"{LIMITS[kind]} limit at the least; state the limits that the robot has, or the "
                 "load that it carries"
             )
-        if self.clearance is None:
-            return f"{tried}: each needs more than a limit allows"
-        best = int(np.argmax(margins.min(axis=0)))
-        pair = int(np.argmin(margins[:, best]))
-        wanted = float(self.clearance.kept[pair] + self._spare[pair, 0])
-        first, second = self.clearance.named[pair]
+        is_clear = (margins >= 0.0).all(axis=0)
+        if self.clearance is None or is_clear.any():
+            return f"{tried}: {self._beyond(used[:, is_clear])}"
+        too_near = (margins < 0.0).mean(axis=1)
+        worst = [k for k in np.argsort(-too_near)[:_NAMED] if too_near[k] > 0.0]
+        shown = listed(
+            [f"{' and '.join(self.clearance.named[k])} in {100 * too_near[k]:.0f} %" for k in worst]
+        )
         return (
-            f"{tried}: in the best of them {first} and {second} are "
-            f"{1e3 * (float(margins[pair, best]) + wanted):.1f} mm apart, wanted "
-            f"{1e3 * wanted:.1f} mm; lower the clearance, or move the floor and the boxes"
+            f"{tried}: hulls of links come nearer than they may, {shown} of the postures. Lower "
+            "the clearance, move the floor and the boxes, or lock joints at a posture in which "
+            "these links are apart"
+        )
+
+    def _beyond(self, used: Array) -> str:
+        """Return which limits postures exceed that keep the distances; each limit is kept by some.
+
+        Args:
+            used: Shares of limits, shape (6, postures, n), more than 1 in each posture.
+        """
+        names, most = self.information.model.joints, used.max(axis=(0, 2))
+        nearest = int(np.argmin(most))
+        kind, joint = np.unravel_index(int(np.argmax(used[:, nearest])), used[:, 0].shape)
+        often, other = np.unravel_index(int(np.argmax((used > 1.0).sum(axis=1))), used[:, 0].shape)
+        share = float(np.mean(used[often, :, other] > 1.0))
+        return (
+            f"{used.shape[1]} keep the distances, but each of these exceeds a limit of some joint. "
+            f"The one nearest to the limits needs {100 * most[nearest]:.0f} % of the "
+            f"{LIMITS[kind]} limit of {names[joint]}; in {100 * share:.0f} % of them "
+            f"{names[other]} exceeds its {LIMITS[often]} limit. State the limits that the robot has, or lock "
+            "joints at a posture that it can hold"
         )
 
     def _feasible(self, C: Array, most: float) -> Array:

@@ -261,8 +261,9 @@ def judge(
         ]
     if undetermined and not is_poorly_excited:
         reasons.append(
-            f"{len(undetermined)} base parameters are lost in the noise of a rich motion and keep "
-            f"the URDF's values: {listed(undetermined, _NAMED)}"
+            f"{len(undetermined)} base parameters are lost in the noise of a rich motion or known "
+            "only in sums with others; what the data leave open keeps the URDF's values: "
+            f"{listed(undetermined, _NAMED)}"
         )
     if witness is not None and not witness.is_against:
         reasons.append(witness.message)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -216,3 +217,24 @@ def test_the_compiled_way_finds_the_same(wrist, designer):
     one, other = plain._lagrangian(C, held), fast._lagrangian(C, held)
     assert other[0] == pytest.approx(one[0], rel=1e-9)
     np.testing.assert_allclose(other[1], one[1], rtol=1e-9, atol=1e-9 * np.abs(one[1]).max())
+
+
+def test_a_refusal_names_the_pairs_or_the_limit_that_leave_no_posture(wrist):
+    class Robot:
+        clearance = SimpleNamespace(named=[("a", "b"), ("c", "d"), ("e", "f")])
+        information = SimpleNamespace(model=wrist)
+        _beyond = Designer._beyond
+
+    used, near = np.full((6, 4, 3), 0.5), np.array([[-1, 1, 1, 1], [1, -1, -1, -1.0], [1, 1, 1, 1]])
+    said = Designer._why_not(Robot(), used, near)
+    assert "c and d in 75 %, a and b in 25 % of the postures" in said
+    assert "e and f" not in said
+    # the last two postures keep the distances: one exceeds a speed by half, both a torque
+    near[1, 2:] = 1.0
+    used[5, :2, 0] = 0.1
+    used[4, 2:, 1] = 1.2, 1.3
+    used[1, 2, 2] = 1.5
+    said = Designer._why_not(Robot(), used, near)
+    assert "2 keep the distances" in said
+    assert f"needs 130 % of the {LIMITS[4]} limit of wrist_2_joint" in said
+    assert f"in 100 % of them wrist_2_joint exceeds its {LIMITS[4]} limit" in said
