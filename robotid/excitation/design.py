@@ -573,8 +573,8 @@ class Designer:
             f"{used.shape[1]} keep the distances, but each of these exceeds a limit of some joint. "
             f"The one nearest to the limits needs {100 * most[nearest]:.0f} % of the "
             f"{LIMITS[kind]} limit of {names[joint]}; in {100 * share:.0f} % of them "
-            f"{names[other]} exceeds its {LIMITS[often]} limit. State the limits that the robot has, or lock "
-            "joints at a posture that it can hold"
+            f"{names[other]} exceeds its {LIMITS[often]} limit. State the limits "
+            "that the robot has, or lock joints at a posture that it can hold"
         )
 
     def _feasible(self, C: Array, most: float) -> Array:
