@@ -573,6 +573,13 @@ def _print_simulation(content: dict[str, Any]) -> None:
         f"{content['robot']}: {content['samples']} samples over {content['duration']:g} s, seed "
         f"{content['settings']['seed']}"
     )
+    noise = content["settings"].get("sensors", {}).get("noise", {})
+    if not any(noise.get(kind) for kind in ("tau", "torque")):
+        say(
+            "no noise was added to the torques: errors of parameters from this log are smaller "
+            "than those of a recorded one, and than those of a preview, which takes noise into "
+            "account; state it with --torque-noise 0.02, a share of the torque"
+        )
     head = "error of the position"
     width = max(len(head), *(len(joint) for joint in content["joints"]))
     print(f"\n{head:{width}}  rms, largest")

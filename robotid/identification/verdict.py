@@ -66,6 +66,8 @@ _WORDS = {
     "joint_origin": "the joint seems to lie elsewhere than the URDF has it",
     "joint_axis": "the joint's axis may be reversed",
     "joint_order": "the columns may be those of another joint",
+    "joint_torque_delay": "the torque is {delay:+.3f} s (+ late, - early) against the position, "
+    "those of the other joints are not",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
     "payload_change": "its last link carries {mass:+.2g} kg against the fitted logs",
     "position_offset": "the zero of the position may be off",
@@ -262,8 +264,9 @@ def judge(
         ]
     if undetermined and not is_poorly_excited:
         reasons.append(
-            f"{len(undetermined)} base parameters are lost in the noise of a rich motion and keep "
-            f"the URDF's values: {listed(undetermined, _NAMED)}"
+            f"{len(undetermined)} base parameters are lost in the noise of a rich motion or known "
+            "only in sums with others; what the data leave open keeps the URDF's values: "
+            f"{listed(undetermined, _NAMED)}"
         )
     if witness is not None and not witness.is_against:
         reasons.append(witness.message)

@@ -89,9 +89,16 @@ class Witness:
         if self.is_stated:
             return f"the scale rests on the mass that was stated: {self.figures}"
         if self.agrees:
+            rests = "the scale of the torques rests on the URDF's gravity and total mass, which"
+            if self._off_whole <= _AGREES:
+                return f"{rests} agree within 5 %: {self.figures}"
+            before, after, payload = self.masses
             return (
-                "the scale of the torques rests on the URDF's gravity and total mass, which agree "
-                f"within 5 %: {self.figures}"
+                f"{rests} agree within 5 % only beside a load of {payload:+.3g} kg on the last "
+                f"link that the URDF does not have: without it gravity torque {self.scale:.2f} x "
+                f"the URDF's, total mass {after - payload:.4g} kg against the URDF's "
+                f"{before:.4g} kg; with it {self.figures}. If no such load was mounted, check the "
+                "gains of the torques"
             )
         hint = ""
         if self.has_one_factor:
@@ -112,7 +119,15 @@ class Witness:
         if not before > 0:
             return np.inf
         with_load = max(abs((after - payload) / before - 1.0), abs((self.scale or 1.0) - 1.0))
-        return min(with_load, max(abs(after / before - 1.0), abs(self.factor - 1.0)))
+        return min(with_load, self._off_whole)
+
+    @property
+    def _off_whole(self) -> float:
+        """How far gravity and total mass are off as they are [-]."""
+        before, after, _ = self.masses
+        if not before > 0:
+            return np.inf
+        return max(abs(after / before - 1.0), abs(self.factor - 1.0))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as result.json has them."""

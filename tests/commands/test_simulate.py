@@ -65,7 +65,9 @@ def by_name(entries):
 def test_identify_finds_the_truth_that_stands_beside_the_log(folder, ur5, capsys):
     code, truth = simulated(folder, "--rate", "200", "--seed", "4", "--urdf", f"{folder}/true.urdf")
     assert code == 0
-    assert "written" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "written" in said
+    assert "no noise was added to the torques" in said
     log = read_log(folder / "log.parquet", ur5.joints)
     assert (len(log.t), truth["samples"], truth["duration"]) == (1601, 1601, 8.0)
     found = identify(ur5, [log], friction="viscous+coulomb", doctor=False)
@@ -108,6 +110,12 @@ def test_a_file_states_the_plant_and_flags_stand_over_it(folder, capsys):
     own = truth["model"]["own_terms"]["elbow_joint"]
     assert own == [{"term": "Stribeck", "speed": 0.2}]
     assert truth["following"][1]["rms"] > 0.01  # PD alone sags
+
+
+def test_a_log_with_noise_is_not_said_to_have_none(folder, capsys):
+    words = ["--rate", "50", "--controller", "perfect", "--duration", "1"]
+    assert simulated(folder, *words, "--torque-noise", "0.02", out="noisy.csv")[0] == 0
+    assert "no noise" not in capsys.readouterr().out
 
 
 def test_a_motion_of_positions_alone_is_splined_and_a_recorded_one_smoothed(folder, ur5):

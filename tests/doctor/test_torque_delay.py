@@ -89,7 +89,7 @@ def test_a_delay_is_said_at_three_sigma_if_it_helps_elsewhere(
 ):
     parabola = ((torque_delay._GRID - delay) / delay) ** 2
     squares = np.tile(1 - share * (1 - parabola), (6, 8, 1))
-    misfit = torque_delay._Misfit(squares, np.ones(6))
+    misfit = torque_delay._Misfit(squares, np.ones(6), ur5.joints)
     monkeypatch.setattr(torque_delay, "_misfit", lambda *_: misfit)
     (finding,) = found(ur5, clean_log(ur5, 100, duration=2.0))
     assert finding.severity == severity
@@ -119,3 +119,32 @@ def test_a_model_of_one_joint_is_not_judged():
     log = clean_log(whole, 100, duration=8.0)
     model = RobotModel.from_urdf(whole.tree.path, joints=["elbow_joint"])
     assert found(model, log.select(["elbow_joint"])) == []
+
+
+def test_one_joint_with_a_delay_of_its_own_is_named_and_does_not_count_for_the_others(ur5):
+    log = clean_log(ur5, 100, duration=8.0)
+    clean = found(ur5, log)
+    assert [f.code for f in clean] == ["torque_delay"]
+    tau = log.tau.copy()
+    tau[:, 4] = delayed(log, 0.06).tau[:, 4]
+    own, common = found(ur5, replace(log, tau=tau))
+    assert (own.code, own.severity) == ("joint_torque_delay", "warning")
+    assert own.where == "run.csv: wrist_2_joint"
+    assert own.evidence["delay"] == pytest.approx(0.06, abs=0.006)
+    assert own.evidence["gain"] > 0.8
+    assert common.severity == "note"
+    # the other five are as in the clean log, whose delay the wrist's moves
+    assert common.evidence["delay"] == pytest.approx(clean[0].evidence["delay"], abs=3e-3)
+    # all 30 ms late, and one more by 60
+    tau = delayed(log, 0.03).tau.copy()
+    tau[:, 4] = delayed(log, 0.09).tau[:, 4]
+    own, common = found(ur5, replace(log, tau=tau))
+    assert own.where == "run.csv: wrist_2_joint"
+    assert own.evidence["delay"] == pytest.approx(0.09, abs=0.006)
+    assert "the other joints by 2" in own.message
+    assert common.evidence["delay"] == pytest.approx(clean[0].evidence["delay"] + 0.03, abs=3e-3)
+    tau = log.tau.copy()
+    tau[:, 2] = delayed(log, -0.1).tau[:, 2]
+    own, _ = found(ur5, replace(log, tau=tau))
+    assert own.where == "run.csv: elbow_joint"
+    assert "100 ms or more early" in own.message

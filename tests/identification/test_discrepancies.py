@@ -82,6 +82,9 @@ def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
          "torque_scale", "elbow_joint", 0.3, "about 1."),
         (lambda log, one: replace(times(log, t=1.1), v=None),
          "time_scale", "all joints", 1.1**2 - 1, "time stamps run 1."),
+        # of joints at the end of the chain half of the 0.5: the other half is in the masses
+        (lambda log, one: times(log, tau=np.where(np.arange(6) < 3, 1.0, 1.5)),
+         "torque_scale", "wrist_1_joint, wrist_2_joint, wrist_3_joint", 0.25, "are at least 1."),
     ],
 )  # fmt: skip
 def test_what_is_stated_wrongly_is_named_with_its_size(model, change, code, where, size, words):
@@ -113,3 +116,15 @@ def test_a_base_that_is_not_level_is_named(model):
     assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.1)
     stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
     np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)
+
+
+def test_a_small_share_of_the_residual_is_named_if_recordings_kept_apart_show_it(model):
+    def change(log):
+        rng = np.random.default_rng(int(log.name[3]))
+        noise = 0.1 * log.tau.std(axis=0) * rng.standard_normal(log.tau.shape)
+        return replace(log, tau=log.tau + noise, t=1.1 * log.t, v=None)
+
+    (first, *_) = found(model, change)
+    assert (first.code, first.where) == ("time_scale", "all joints")
+    assert 3 < first.evidence["share_pct"] < 10
+    assert first.evidence["size"] == pytest.approx(0.21, rel=0.25)

@@ -7,6 +7,7 @@ from helpers.synthetic import exact_log, truth
 
 from robotid.identification.pipeline import identify
 from robotid.identification.settings import EstimatorSettings
+from robotid.identification.witness import Witness
 from robotid.logs.settings import SignalSettings
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
@@ -56,6 +57,17 @@ def test_a_load_in_the_hand_is_no_other_scale(ur5):
     assert not found.witness.has_one_factor
     assert found.verdict.status == "good", found.verdict.reasons
     assert "could not be checked" in found.verdict.reasons[-1]
+
+
+def test_a_load_that_is_left_out_is_said_with_its_mass_and_both_figures():
+    loaded = Witness(scale=1.01, factor=1.37, masses=(20.0, 24.9, 4.7), unexplained=(0.2, 0.01))
+    assert loaded.agrees
+    message = loaded.message
+    assert "only beside a load of +4.7 kg on the last link" in message
+    assert "without it gravity torque 1.01 x the URDF's, total mass 20.2 kg" in message
+    assert "with it gravity torque 1.37 x the URDF's, total mass 24.9 kg" in message
+    alike = replace(loaded, factor=1.04, masses=(20.0, 20.9, 0.5))
+    assert "agree within 5 %: gravity torque 1.04 x" in alike.message
 
 
 def test_without_gravity_nothing_bears_witness(ur5):
