@@ -286,7 +286,7 @@ def refine_steps(
     step = dt / np.ceil(dt / simulator.robot.step - 1e-9)
     finest, now = step / _FINEST, simulator
     while True:
-        half = replace(simulator, fine=LoopedRobot(model, step=0.5 * step))
+        half = replace(simulator, fine=LoopedRobot(model, step=0.5 * step, corrects=True))
         change, error = estimator.moved(now, half, theta)
         share = float(np.max(np.abs(change) / np.maximum(error, 1e-300), initial=0.0))
         if share <= _MOVED or 0.5 * step < finest:

@@ -201,7 +201,7 @@ class LoopSimulator:
             for starts in tries:
                 tried = [replace(w, given=x) for w, x in zip(windows, starts, strict=True)]
                 try:
-                    outs = self.robot.roll_out(loops, tried)
+                    outs = (self.fine or self.robot).roll_out(loops, tried)
                 except NotConvergedError:
                     continue  # these starts cannot be rolled out; others can
                 for k, out in enumerate(outs):
