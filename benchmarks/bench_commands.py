@@ -16,8 +16,8 @@ drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff fr
 with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. --driven: again without
 commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %.
 --held: the planar arm and the leg, a plant of 0.1 ms with commands held for 4 ms, logged at 250 Hz,
-positions rounded to the steps of an encoder, one delay of the robot. Times are of the processor, all threads together, where they do not say otherwise: other loads of the machine add
-little.
+positions rounded to the steps of an encoder, one delay of the robot. Times are of the processor,
+all threads together, where they do not say otherwise: other loads of the machine add little.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
