@@ -2,6 +2,7 @@
 
     ROBOTID_DATA=folder python benchmarks/bench_commands.py [--quick] [--out FOLDER]
         [--go2] [--so101] [--arms] [--rollouts] [--coverage RUNS [--with-torque] [--driven]]
+        [--held RUNS [--bits BITS]]
 
 Without a part named, roll-outs and 20 runs of coverage. --go2: fitted to the first 14.09 s of a
 chirp of twelve joints, beside mujoco.sysid on the same bodies, which starts its roll-out of the
@@ -13,9 +14,10 @@ and offset; and the last with what friction other windows confirm. The simulated
 --coverage: MuJoCo rolls out a robot with known
 drives on a multi-sine of 10 s at 500 Hz, at a step of 0.05 ms and with stiff friction, encoders
 with noise of 0.3 mrad; gains are stated, bodies are those of the URDF. --driven: again without
-commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %. Times are of the
-processor, all threads together, where they do not say otherwise: other loads of the machine add
-little.
+commands, the torque drives: logs as of the simulated arm at 250 Hz, the noise 5 %.
+--held: the planar arm and the leg, a plant of 0.1 ms with commands held for 4 ms, logged at 250 Hz,
+positions rounded to the steps of an encoder, one delay of the robot. Times are of the processor,
+all threads together, where they do not say otherwise: other loads of the machine add little.
 """
 
 import setting  # noqa: I001 -- pins the threads of BLAS before numpy is imported
@@ -60,6 +62,7 @@ from robotid.simulation.loops import LoopedRobot, Window, open_loops
 FINE = 5e-5  # [s] step of the plant
 STEP = 5e-4  # [s] of our roll-outs beside it
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)  # impedance of its friction
+HELD_RATE, HELD_STEP = 250.0, 1e-4  # [Hz], [s]: of commands that are held, and of their plant
 RATE, DURATION, NOISE = 500.0, 10.0, 3e-4  # [Hz], [s], [rad]
 TORQUE_NOISE = 2e-3  # [rad]: times kp
 REACH = 1.96
@@ -109,6 +112,8 @@ def main():
     parser.add_argument(
         "--driven", action="store_true", help="of --coverage, again driven by the logged torque"
     )
+    parser.add_argument("--held", type=int, metavar="RUNS", help="the same of held commands")
+    parser.add_argument("--bits", type=int, default=14, help="of the encoders of --held, a turn")
     parser.add_argument("--sysid-steps", type=int, default=30, help="most steps; 0: as published")
     parser.add_argument("--out", type=Path, help="folder that bench_commands.json is written to")
     options = parser.parse_args()
@@ -122,6 +127,12 @@ def main():
             lambda: coverage(
                 options.robots, options.coverage, with_torque=options.with_torque,
                 driven=options.driven,
+            )
+        ),
+        "held": options.held
+        and (
+            lambda: coverage(
+                [r for r in options.robots if r != "arm"], options.held, bits=options.bits
             )
         ),
     }  # fmt: skip
@@ -510,14 +521,18 @@ def drive_pi(plant):
     return pi
 
 
-def coverage(robots, runs, seconds=DURATION, *, with_torque=False, driven=False):
+def coverage(
+    robots, runs, seconds=DURATION, *, with_torque=False, driven=False, bits=None
+):  # fmt: skip
     """Print how well intervals hold the truth, by robot and kind of parameter; return the rows."""
     print(f"| robot, {runs} runs | parameter | values | mean error over scatter | error said over "
           "scatter | 95 % intervals hold | said, over no torque's | error, likewise |")  # fmt: skip
     print("|---" * 8 + "|")
     rows = []
     for name in robots:
-        rows += coverage_rows(name, covered(name, runs, seconds))
+        how = {} if bits is None else {"run": held_run, "bits": bits}
+        label = name if bits is None else f"{name}, {bits} bits"
+        rows += coverage_rows(label, covered(name, runs, seconds, **how))
         if with_torque:
             alone = covered(name, runs, seconds, finds_all=True)
             rows += coverage_rows(f"{name}, all found", alone)
@@ -530,12 +545,12 @@ def coverage(robots, runs, seconds=DURATION, *, with_torque=False, driven=False)
     return rows
 
 
-def covered(name, runs, seconds, **how):
+def covered(name, runs, seconds, run=None, **how):
     """Return errors and standard errors by kind of parameter, each of shape (2, values)."""
     found, begun = {}, time.process_time()
     for seed in range(runs):
         rng = np.random.default_rng([17, seed])
-        for kind, error, said in one_run(name, rng, seconds, **how):
+        for kind, error, said in (run or one_run)(name, rng, seconds, **how):
             found.setdefault(kind, []).append((error, said))
     print(f"{name}: {(time.process_time() - begun) / runs:.1f} s of processor a run",
           file=sys.stderr)  # fmt: skip
@@ -627,6 +642,34 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
         yield kind, theta - true, said
 
 
+def held_run(name, rng, seconds, *, bits):
+    """Yield the same of a plant whose commands are held and whose encoders have steps."""
+    plant = mujoco_plant.plant(name, rng, delay=HELD_STEP * rng.integers(40, 121))
+    t = np.arange(round(seconds * HELD_RATE)) / HELD_RATE
+    q_ref = mujoco_plant.multisine(t, plant.middle, plant.reach, rng)
+    robot = stiff(mujoco_plant.loaded(plant, HELD_RATE, HELD_STEP), HELD_STEP)
+    q, _, _ = mujoco_plant.rolled_out(robot, q_ref, HELD_RATE)
+    turn = 2 * np.pi / 2**bits
+    q = turn * np.round(q / turn)
+    log = Log(t, q, 0 * q, plant.model.joints, q_ref=q_ref, has_torque=False)
+    gains = {key: {d.joint: getattr(d, key) for d in plant.drives} for key in ("kp", "kd")}
+    first = plant.model.joints[0]
+    loop = LoopSettings(**gains, groups={first: [first]})
+    settings = SimulationSettings(bodies=0.0)
+    found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
+    estimate, truth = found.fitted.estimate, plant.truth
+    truth["robot.delay"] = plant.drives[0].delay
+    for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
+        yield key.rpartition(".")[2], theta - truth[key], said
+
+
+def stiff(robot, step):
+    """Return MuJoCo's robot with friction as stiff as a step allows."""
+    robot.dof_solref[:] = 2 * step, 1.0
+    robot.dof_solimp[:] = STIFF
+    return robot
+
+
 def with_drawn_bodies(plant, rng, spread):
     """Return a plant whose bodies differ from the URDF's, and how, by name of the coordinate."""
     robot = LoopedRobot(plant.model)
@@ -645,9 +688,7 @@ def plant_log(plant, rng, seconds, noise=NOISE, *, torque=False):
     """
     t = np.arange(round(seconds * RATE)) / RATE
     q_ref = mujoco_plant.multisine(t, plant.middle, plant.reach, rng)
-    robot = mujoco_plant.loaded(plant, RATE, FINE)
-    robot.dof_solref[:] = 2 * FINE, 1.0
-    robot.dof_solimp[:] = STIFF
+    robot = stiff(mujoco_plant.loaded(plant, RATE, FINE), FINE)
     q, force, _ = mujoco_plant.rolled_out(robot, q_ref, RATE)
     q = q + noise * rng.standard_normal(q.shape)
     level = TORQUE_NOISE * np.array([drive.kp for drive in plant.drives])

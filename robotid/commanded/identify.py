@@ -1,8 +1,9 @@
 """identify_commands(): from a model and logs of commands to drives, loops, bodies and trust."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,12 @@ _FROM_PRIOR = 0.9  # ... above this share, what was assumed of it
 _TOGETHER = 0.98  # correlation from which two parameters are told together only
 _SOFT = 0.5  # of what a step should correct: a loop that leaves more is soft
 _MISSED = 0.5  # of a torque, that a loop which gives it does not miss
+_MOVED = 0.2  # of a standard error, that halving the steps may move a parameter
+_KNOWN = 0.1  # of the range of delays that one joint's response leaves: a smaller error settles it
+_STATED_SCALE = (
+    "positions do not show the scale: all drive and inertial parameters scale with kp as stated "
+    "(kp stated 20 % too large makes all 20 % too large); log a torque to test it"
+)
 _NAMED = 8  # parameters that a sentence names
 
 
@@ -107,7 +114,15 @@ class Commanded:
             is_kept=bool(self.kept),
             is_settled=self.fitted.estimate.converged,
             alarms=self.alarms,
+            cautions=[f.message for f in self.findings if f.code in ("at_bound", "coarse_steps")],
+            scale=_STATED_SCALE if self.is_scaled_by_gain else "",
         )
+
+    @property
+    def is_scaled_by_gain(self) -> bool:
+        """Whether stated gains alone set the scale: no torque was logged that shows it."""
+        simulator = self.fitted.simulator
+        return self.loop.kind != "torque" and self.has_gains and not simulator.knows_torques
 
 
 def identify_commands(
@@ -183,7 +198,8 @@ def identify_commands(
         findings=tuple(examined),
         alarms=tuple(finding.message for finding in alarming(examined, ignore)),
     )
-    return replace(found, findings=by_severity([*examined, *_findings(found)]))
+    settled = [_settled_delay(finding, found) for finding in examined]
+    return replace(found, findings=by_severity([*settled, *_findings(found)]))
 
 
 def _others(model: RobotModel, loop: LoopSettings, fitted: Fitted) -> dict[str, Loops]:
@@ -249,6 +265,9 @@ def _findings(found: Commanded) -> Iterator[Finding]:
             "armature; state kp in [controller], or log a torque, to tell them apart",
         )
     yield from _torques_missed(found)
+    if found.is_scaled_by_gain:
+        yield Finding("scale", "note", "controller", _STATED_SCALE)
+    yield from _coarse_steps(estimate.details)
     yield from _at_bound(estimate.details["at_bound"])
     for told_names in found.told_together:
         told = listed(told_names, _NAMED)
@@ -272,16 +291,57 @@ def _findings(found: Commanded) -> Iterator[Finding]:
     yield from map(_friction_found, (t for t in found.fitted.tried if t.is_chosen))
 
 
+def _settled_delay(finding: Finding, found: Commanded) -> Finding:
+    """Return a finding of the logs; "slow_command" as a note where the delay is known after all."""
+    if finding.code != "slow_command":
+        return finding
+    estimate, unknowns = found.fitted.estimate, found.fitted.simulator.unknowns
+    errors = [
+        float(error)
+        for unknown, error in zip(unknowns, estimate.std_error, strict=True)
+        if unknown.what == "delay"
+    ]
+    span = finding.evidence["longest"] - finding.evidence["shortest"]
+    error = max(errors, default=0.0)
+    if error > _KNOWN * span:
+        return finding
+    how = "it is stated" if not errors else f"the fit finds it to +- {1e3 * error:.2g} ms"
+    message = (
+        f"the command ends below the bandwidth of the loop, up to "
+        f"{finding.evidence['frequency']:.2g} Hz: the response of one joint does not show its "
+        f"delay, but {how} with the gains and bodies of the model, and is as good as these. A "
+        "chirp beyond the bandwidth of the loop, or steps, would show it by itself"
+    )
+    evidence = {**finding.evidence, "std_error": error}
+    return replace(finding, severity="note", message=message, evidence=evidence)
+
+
+def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield that smaller steps of the integration would still move the estimate, if they would."""
+    halving = float(details.get("halving", 0.0))
+    if halving > 1.0:
+        yield Finding(
+            "coarse_steps",
+            "warning",
+            "fit",
+            f"halving the steps of {1e3 * details['step']:.2g} ms moves a parameter by "
+            f"{halving:.1f} standard errors, wanted at most {_MOVED}; this is counted in the "
+            "standard errors. Set a smaller step under [estimator]",
+            {"halving": halving},
+        )
+
+
 def _at_bound(names: Sequence[str]) -> Iterator[Finding]:
     """Yield which parameters came out as 0."""
     at_zero = [name for name in names if name.rpartition(".")[2] not in ("kp", "limit")]
     if at_zero:
         yield Finding(
             "at_bound",
-            "note",
+            "warning",
             listed(at_zero, _NAMED),
-            f"{listed(at_zero, _NAMED)} came out as 0, the least that can be: the motion shows "
-            "none, or another parameter has taken it",
+            f"{listed(at_zero, _NAMED)} came out as 0, the smallest possible value: the motion "
+            "shows none, or a stated gain or delay is wrong; leave the delay out of [controller], "
+            "so that it is found, and compare the stated gains with those of the drive",
         )
     if any(name.endswith("delay") for name in at_zero):
         yield Finding(

@@ -23,6 +23,8 @@ def judge_open_loops(
     is_kept: bool,
     is_settled: bool = True,
     alarms: Sequence[str] = (),
+    cautions: Sequence[str] = (),
+    scale: str = "",
 ) -> Verdict:
     """Return the verdict: by open loops on logs kept apart, and by plainer models on the same.
 
@@ -32,6 +34,8 @@ def judge_open_loops(
         is_kept: Whether the logs were kept apart from the fit.
         is_settled: Whether the fit has settled.
         alarms: Faults of the logs that make the result wrong.
+        cautions: What keeps a result from being good, whatever its open loops are.
+        scale: What the scale of all parameters rests on, if nothing measured shows it.
     """
     told = [[run for run in runs if _is_told(run, j)] for j in range(len(joints))]
     by_joint = {
@@ -62,6 +66,10 @@ def judge_open_loops(
             f"open loops miss at most {100 * worst:.2g} % of the motion of any joint on logs kept "
             "apart, and less than plainer models"
         ]
+    if cautions:
+        reasons = [*cautions, *(reasons if status != "good" else [])]
+        status = min(status, "usable", key=rank.__getitem__)
+    reasons += [scale] if scale else []
     if alarms:
         status, reasons = "poor", [*alarms, *(reasons if status != "good" else [])]
     return Verdict(status, tuple(reasons), by_joint, alarms=tuple(alarms))

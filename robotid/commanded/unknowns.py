@@ -115,6 +115,8 @@ class LoopSimulator:
             motion changes.
         behind: How many rows the command that a torque follows is behind it, shape (n,), as of
             ``drive_torques``; None if no torques of roll-outs are compared.
+        fine: The robot at smaller steps, whose roll-outs are compared; derivatives stay those of
+            ``robot``. None: its own are.
     """
 
     robot: LoopedRobot
@@ -125,6 +127,7 @@ class LoopSimulator:
     velocities: bool = False
     error: str = "output"
     behind: Array | None = None
+    fine: LoopedRobot | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -198,7 +201,7 @@ class LoopSimulator:
             for starts in tries:
                 tried = [replace(w, given=x) for w, x in zip(windows, starts, strict=True)]
                 try:
-                    outs = self.robot.roll_out(loops, tried)
+                    outs = (self.fine or self.robot).roll_out(loops, tried)
                 except NotConvergedError:
                     continue  # these starts cannot be rolled out; others can
                 for k, out in enumerate(outs):
@@ -291,15 +294,22 @@ class LoopSimulator:
         loops, (_, directions) = self.loops(theta), self._bodies(theta)
         columns, owners = self._columns(loops) if with_slopes else ([], np.array([], dtype=int))
         rolls = (with_slopes or with_starts) and self.error != "direct"
-        outs = self.robot.roll_out(
-            loops,
-            self.windows,
-            [*columns, *self._starts()] if rolls else (),
-            directions,
-            with_speeds=self.velocities or self.behind is not None,
-        )
+        if not rolls or self.fine is not None:
+            outs = (self.fine or self.robot).roll_out(loops, self.windows)
         if rolls:
-            return [part for out in outs for part in self._parts(out, loops, columns, owners)]
+            ways = self.robot.roll_out(
+                loops,
+                self.windows,
+                [*columns, *self._starts()],
+                directions,
+                with_speeds=self.velocities or self.behind is not None,
+            )
+            errors = [self._error(out, loops) for out in (ways if self.fine is None else outs)]
+            return [
+                part
+                for out, error in zip(ways, errors, strict=True)
+                for part in self._parts(out, error, loops, columns, owners)
+            ]
         everything, none = np.arange(self._outputs), np.array([], dtype=int)
         if not with_slopes:
             return [Residual(self._error(out, loops), None, everything, none) for out in outs]
@@ -340,10 +350,10 @@ class LoopSimulator:
         return error
 
     def _parts(
-        self, out: RollOut, loops: Loops, columns: list[Column], owners: Array
+        self, out: RollOut, error: Array, loops: Loops, columns: list[Column], owners: Array
     ) -> Iterator[Residual]:
-        """Yield the residuals of a roll-out's parts, with all that they change with."""
-        error, wanted, n = self._error(out, loops), [*columns, *self._starts()], len(loops.kp)
+        """Yield the errors of a roll-out's parts, with all that they change with."""
+        wanted, n = [*columns, *self._starts()], len(loops.kp)
         torques = None if self.behind is None else drive_torques(out, loops, self.behind)
         for joints, places, slopes in out.slopes:
             k = len(joints)

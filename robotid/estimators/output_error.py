@@ -232,6 +232,28 @@ class OutputError:
         H, g = self._normal(simulator, self.weights(simulator, theta), theta, frees=True)
         return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
 
+    def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
+        """Return how far other residuals move the estimate, to first order, and its errors.
+
+        Args:
+            simulator: What rolls out.
+            other: The same with other residuals, as of smaller steps.
+            theta: Parameters near the estimate, shape (c,).
+
+        Returns:
+            Change of the parameters, and standard errors as if whitened residuals of ``other`` were
+            independent, both of shape (c,).
+        """
+        weights = self.weights(other, theta)
+        (H, g), (_, changed) = (self._normal(s, weights, theta) for s in (simulator, other))
+        free = theta > simulator.lowest
+        scale = 1.0 / np.sqrt(np.diag(H)[free])
+        inverse = scipy.linalg.pinvh(H[np.ix_(free, free)] * np.outer(scale, scale))
+        change, error = np.zeros_like(theta), np.zeros_like(theta)
+        change[free] = scale * (inverse @ (scale * (changed - g)[free]))
+        error[free] = scale * np.sqrt(np.diag(inverse))
+        return change, error
+
     def _normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
     ) -> tuple[Array, Array]:

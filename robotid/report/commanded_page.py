@@ -479,6 +479,13 @@ def _undetermined(content: Mapping[str, Any]) -> str:
     if names:
         items = "".join(f"<li>{escape(name)}</li>" for name in names)
         parts.append(f"<p>The logs leave these open:</p>\n<ul>{items}</ul>\n")
+    elif alike := [f for f in content["warnings"] if f["code"] == "commands_alike"]:
+        names = escape(listed([f["where"] for f in alike]))
+        parts.append(
+            "<p>Every parameter has a standard error by this model, but some commands are "
+            f"proportional (commands_alike: {names}): effects of one joint on another are not "
+            "distinguishable from its own.</p>\n"
+        )
     else:
         parts.append("<p>The logs determine all that was to be found.</p>\n")
     for entry in structure.get("not_told_apart", []):

@@ -13,6 +13,10 @@ friction and offset, r and w the commands as they are on average over the step; 
 q += dt u and v += (u - v) / theta. Newton's method ends at rounding error, so that the
 sensitivities, by the implicit function theorem, are those of the numbers that come out.
 
+Torques of gravity and speeds so are exact to first order only. ``corrects`` solves each step once
+more, with M and h at the middle q + theta dt u, u of the solution: exact to second order, but where
+friction reverses within the step. Such roll-outs have no sensitivities.
+
 Friction that a joint takes up over a way, x z, has z as a further state: over a step, at the speed
 u, its equation is linear and solved exactly. What acts is the z of the instant t + theta dt.
 
@@ -578,6 +582,19 @@ def _advance(work, n, at, step):
 
 
 @compiled
+def _centre(work, n, at, step, parents, joints, bodies, zeros, a):
+    """Write M and h of the middle of the step, where the speeds of a solution lead to."""
+    q, u, middle, h, M = at[0], at[2], at[3], at[4], at[5]
+    for i in range(n):
+        for lane in range(LANES):
+            ahead = THETA * step[lane] * _get(work, u + i, lane)
+            _put(work, middle + i, lane, _get(work, q + i, lane) + ahead)
+        _place(work, (i + 1) * _BODY, joints[i], middle + i, zeros[i])
+    _inverse_dynamics(work, parents, joints, bodies, u, a, h)
+    _mass_matrix(work, parents, joints, bodies, M)
+
+
+@compiled
 def _propagate(work, n, at, sweeps, columns, drives, terms, step, command, parents, joints, works):
     """Advance the sensitivities S of q and v, shape (2n, P), over a step that is solved."""
     q, v, u, middle, h, M, G, H, by_q, gains, load, loss, held, memory, grip = at
@@ -827,7 +844,7 @@ def _begin(work, n, at, sweeps, columns, terms, gravity, start, out_S):
 @compiled
 def roll_out(
     parents, joints, zeros, bodies, is_below, gravity, drives, codes, shapes, values, first,
-    columns, directions, command, steps, ticks, every, start, out_q, out_v, out_S, work,
+    columns, directions, command, steps, ticks, every, start, out_q, out_v, out_S, work, corrects,
 ):  # fmt: skip
     """Roll out a block of lanes; return the first step that had no solution, -1 if all had.
 
@@ -859,6 +876,7 @@ def roll_out(
         out_S: Sensitivities of position, shape (N, n, P, LANES), or of position and then of speed,
             shape (N, 2n, P, LANES); written.
         work: Work space of ``work_size``.
+        corrects: Whether each step is solved once more, at its middle; without columns alone.
     """
     n, P = len(parents), len(columns)
     q = (n + 1) * _BODY
@@ -889,6 +907,10 @@ def roll_out(
         _mass_matrix(work, parents, joints, bodies, M)
         if not _newton(work, n, at, drives, terms, step, command[k]):
             return k
+        if corrects:
+            _centre(work, n, at, step, parents, joints, bodies, zeros, a)
+            if not _newton(work, n, at, drives, terms, step, command[k]):
+                return k
         if memory >= 0:
             _remember(work, n, at, terms, step)
         if P:

@@ -233,12 +233,13 @@ class _Part:
 class LoopedRobot:
     """A robot whose drives close their loops, to be rolled out."""
 
-    def __init__(self, model: RobotModel, *, step: float = 2e-3) -> None:
+    def __init__(self, model: RobotModel, *, step: float = 2e-3, corrects: bool = False) -> None:
         """Flatten a robot.
 
         Args:
             model: The robot.
             step: Longest step of the integration [s].
+            corrects: Whether each step is solved once more, at its middle; it has no derivatives.
 
         Raises:
             MissingDependencyError: If Numba is not installed.
@@ -255,7 +256,7 @@ class LoopedRobot:
             )
         if (why := why_not(model)) is not None:
             raise SettingsError(f"{model.name} cannot be rolled out: {why}")
-        self.model, self.step = model, step
+        self.model, self.step, self.corrects = model, step, corrects
         self._parts = _parts(flatten(model))
         self._gravity = np.array(model.pin_model.gravity.linear)
 
@@ -377,7 +378,7 @@ class LoopedRobot:
             part.parents, part.constants, loops.zero[own], loops.bodies[part.bodies],
             part.is_below, self._gravity, drives, codes, shapes, loops.values[places],
             first, columns, along, command, steps, ticks, every, start, q, v, S,
-            np.zeros(lanes.work_size(n, len(columns), int(remembers.sum()))),
+            np.zeros(lanes.work_size(n, len(columns), int(remembers.sum()))), self.corrects,
         )  # fmt: skip
         if failed >= 0 or not (np.abs(v) < _FASTEST).all():
             raise NotConvergedError(

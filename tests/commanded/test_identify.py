@@ -12,6 +12,7 @@ from robotid.commanded.second_order import SecondOrder
 from robotid.commanded.settings import LoopSettings
 from robotid.commanded.term_choice import _Fold, _gains
 from robotid.exceptions import DataError
+from robotid.findings import Finding
 from robotid.identification.settings import SimulationSettings
 from robotid.logs.data import Log
 from robotid.robot.drives import Coulomb, Offset, PositionCoulomb, Presliding, Viscous
@@ -184,6 +185,56 @@ def test_a_joint_whose_inertia_does_not_show_begins_as_the_fastest_loop(leg):
     loops = replace(stated_, armature=np.array([1e-12, 0.01, 1e-6]))
     plain = SecondOrder(None, np.zeros(0), loops, np.ones(3))
     np.testing.assert_allclose(plain.inertia, [1 / 96**2, 0.01, 50 / 96**2])
+
+
+def test_steps_that_are_too_long_are_halved():
+    rng = np.random.default_rng(3)
+    robot = plant("planar", rng)
+    log, truth = recorded(robot, rng, duration=4.0, rate=250.0, noise=1e-4, step=1e-4)
+    settings = SimulationSettings(window=1.0, lead=0.3, bodies=0.0)
+    loop = stated(robot)
+    fitted = identify_commands(robot.model, [log], [], loop, settings, chooses=False).fitted
+    estimate = fitted.estimate
+    assert fitted.simulator.fine is not None
+    assert fitted.simulator.fine.step == pytest.approx(estimate.details["step"])
+    assert estimate.details["step"] < 1e-3
+    errors = (estimate.theta - [truth[name] for name in estimate.names]) / estimate.std_error
+    assert np.sqrt(np.mean(errors**2)) < 1.7
+
+
+def test_a_stated_delay_that_is_wrong_is_no_good_result(leg):
+    robot, log, kept = leg
+    wrong = stated(robot, delay=0.03)
+    found = identify_commands(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    [bound] = [f for f in found.findings if f.code == "at_bound"]
+    assert bound.severity == "warning"
+    assert "armature" in bound.message
+    assert "leave the delay out of [controller]" in bound.message
+    assert found.verdict.status != "good"
+    assert bound.message in found.verdict.reasons
+
+
+def test_a_stated_gain_is_named_as_what_the_scale_rests_on(found):
+    [scale] = [f for f in found.findings if f.code == "scale"]
+    assert scale.severity == "note"
+    assert "scale with kp as stated" in scale.message
+    assert found.verdict.reasons[-1] == scale.message
+
+
+def test_a_slow_command_does_not_contradict_the_delay_that_was_found(leg, found):
+    robot, log, _ = leg
+    evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}
+    slow = Finding("slow_command", "warning", "log", "any delay explains it", evidence)
+    again = identify_commands(
+        robot.model, [log], [], stated(robot), SETTINGS, chooses=False, examined=[slow]
+    )
+    [settled] = [f for f in again.findings if f.code == "slow_command"]
+    assert settled.severity == "note"
+    assert "any delay" not in settled.message
+    names, errors = found.fitted.estimate.names, found.fitted.estimate.std_error
+    worst = max(e for n, e in zip(names, errors, strict=True) if n.endswith("delay"))
+    assert settled.evidence["std_error"] == pytest.approx(worst)
+    assert f"{1e3 * worst:.2g} ms" in settled.message
 
 
 def test_joints_of_a_group_share_their_drive(leg):

@@ -11,7 +11,7 @@ from helpers.pages import chart, charts, tables
 from robotid.exceptions import DataError
 from robotid.export.result import load_result
 from robotid.identification.advice import Origin
-from robotid.report.commanded_page import Followed, write_commanded_report
+from robotid.report.commanded_page import Followed, _undetermined, write_commanded_report
 
 ERRORS = {"rmse": (2e-3, 4e-3, 8e-3), "command_rmse": (0.02, 0.05, 0.08), "urdf_rmse": (0.01,) * 3}
 REASON = "the calf is <i>off</i>"
@@ -124,6 +124,17 @@ def test_drives_have_their_errors_and_what_cannot_be_told_is_named(page, content
     said = page[page.index("The logs leave these open") :]
     assert "FL_calf.Ixx" in said
     assert "kp of every joint, kd of every joint, masses of the URDF" in said
+
+
+def test_proportional_commands_leave_no_claim_that_all_is_determined():
+    alike = {"code": "commands_alike", "severity": "warning", "where": "log: all", "message": "x"}
+    content = {"structure": {"undetermined": []}, "warnings": []}
+    content["simulation"] = {"controller": {"kind": "torque"}}
+    claim = "The logs determine all that was to be found"
+    assert claim in _undetermined(content)
+    text = _undetermined({**content, "warnings": [alike]})
+    assert claim not in text
+    assert "some commands are proportional (commands_alike: log: all)" in text
 
 
 def test_findings_and_commands_are_shown(page):

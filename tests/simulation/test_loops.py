@@ -146,6 +146,21 @@ def test_an_arm_moves_as_a_stiff_integration_of_pinocchio_says(ur5):
     assert errors[2] < 0.7 * errors[1] < 0.7**2 * errors[0]
 
 
+def test_steps_that_are_solved_once_more_are_exact_to_second_order(planar):
+    loops = replace(loops_of(planar, kp=200.0), values=np.zeros(2 * len(VALUES)))
+    loops = replace(loops, armature=np.full(2, 0.1), kd=np.full(2, 10.0))
+    log = commanded(planar, reach=1.0)
+    window = [Window(log, 0, 0, len(log.t))]
+
+    def moved(step, corrects):
+        return LoopedRobot(planar, step=step, corrects=corrects).roll_out(loops, window)[0].q
+
+    exact = moved(1e-5, True)
+    wrong = {c: [np.abs(moved(h, c) - exact).max() for h in (1e-3, 5e-4)] for c in (True, False)}
+    assert wrong[True][0] / wrong[True][1] == pytest.approx(4.0, rel=0.1)
+    assert wrong[True][1] < 0.5 * wrong[False][1]
+
+
 def test_a_gear_loses_a_share_of_its_load(planar):
     log = commanded(planar, 0.1, reach=0.8)
     loops = loops_of(planar, (Viscous(), LoadFriction()), (2.0, 0.2), kp=300.0)
