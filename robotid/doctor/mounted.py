@@ -55,7 +55,7 @@ def check_unmounted_parts(probe: Probe, share: Array, name: str) -> Iterator[Fin
         size = probe.model.layout.n_inertial
         pi[size - 10 : size] -= parameters
         if pi[size - 10] > 0 and parameters[0] > _LIGHT * arm:
-            lighter = replace(probe, model=probe.model.with_parameters(pi))
+            lighter = probe.of(probe.model.with_parameters(pi))
             left = _misfit_without_load(load_model(lighter, share))
             trials.append((left, links, float(parameters[0])))
     left, links, mass = min(trials, default=(np.inf, [], 0.0))

@@ -150,6 +150,14 @@ class Probe:
         """
         return np.column_stack([np.cos(self.q[:, j]), np.sin(self.q[:, j])])
 
+    def of(self, model: RobotModel) -> "Probe":
+        """Return the same motion of another robot.
+
+        Args:
+            model: The robot, of the same joints and bodies.
+        """
+        return replace(self, model=model, parts=replace(self.parts, model=model))
+
     def at(self, rows: Array) -> "Probe":
         """Return the probe at other rows of the same motion, computed anew.
 

@@ -30,6 +30,7 @@ from robotid.identification.bands import (
     REACH,
     FrictionCurve,
     TorqueBand,
+    expected_band,
     fitted_moments,
     recording_bands,
     usual_friction,
@@ -484,10 +485,11 @@ class Identification:
         """Return how far the torques predicted for a recording can be trusted.
 
         Args:
-            evaluation: One of the recordings.
+            evaluation: One of the recordings; of another one, the band has the fit's noise.
         """
-        every = (*self.fitted, *self.validation)
-        return self._bands[next(k for k, e in enumerate(every) if e is evaluation)]
+        every = zip((*self.fitted, *self.validation), self._bands, strict=True)
+        own = next((band for e, band in every if e is evaluation), None)
+        return expected_band(self, evaluation) if own is None else own
 
     @cached_property
     def _bands(self) -> tuple[TorqueBand, ...]:

@@ -479,7 +479,7 @@ def _undetermined(content: Mapping[str, Any]) -> str:
     if names:
         items = "".join(f"<li>{escape(name)}</li>" for name in names)
         parts.append(f"<p>The logs leave these open:</p>\n<ul>{items}</ul>\n")
-    elif alike := [f for f in content["warnings"] if f["code"] == "commands_alike"]:
+    elif alike := [f for f in content.get("warnings", ()) if f["code"] == "commands_alike"]:
         names = escape(listed([f["where"] for f in alike]))
         parts.append(
             "<p>Every parameter has a standard error by this model, but some commands are "

@@ -53,9 +53,9 @@ def test_predicted_torque_is_the_regressor_times_the_parameters(case, rng):
 
 def test_inverse_dynamics_takes_few_possible_robots_and_rows_the_rest(panda, rng, monkeypatch):
     calls = []
-    real = prediction._inverse_dynamics
+    real = prediction.inverse_dynamics
     monkeypatch.setattr(
-        prediction, "_inverse_dynamics", lambda *args: calls.append(args) or real(*args)
+        prediction, "inverse_dynamics", lambda *args: calls.append(args) or real(*args)
     )
     trajectory = motion(panda, rng, 5)
     possible, heavier, base_only = vectors(panda, rng)
