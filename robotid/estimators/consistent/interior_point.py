@@ -232,7 +232,8 @@ class _System:
         slope = weight * svec(R.swapaxes(1, 2) @ problem.P_inverse @ R).reshape(-1)
         gradient = A_z.T @ residual + np.concatenate([slope, np.sqrt(weight) * drives])
         ratio = point.multipliers / point.s
-        H = A_z.T @ A_z + (G_z.T * ratio) @ G_z
+        rows = np.concatenate([A_z, np.sqrt(ratio)[:, None] * G_z])
+        H = rows.T @ rows
         H[np.diag_indices(len(x))] += 1.0
         divergence = (
             np.vdot(problem.P_inverse, J) - np.linalg.slogdet(problem.P_inverse @ J)[1].sum()
