@@ -19,6 +19,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 from robotid.robot.examples import example_urdf
@@ -46,12 +47,15 @@ def commands(tree, data):
     yield "preview", ["preview", urdf, "OUT/../excite/m.csv", "--json"]
     arm = ["identify", urdf, "OUT/../simulate/log.csv", "--out", "OUT"]
     yield "small", arm
+    yield "small wls", [*arm, "--estimator", "wls"]
+    yield "compare", ["compare", "OUT/../small", "OUT/../small wls", "--json"]
     loads = ["ident_20200219_14harm.parquet", "ident_20200219_14harm_load.parquet"]
     free, loaded = (ur10e / file for file in loads)
-    yield "payload", ["payload", robot, loaded, "--reference", free, "--json"]
-    yield "doctor", ["doctor", robot, free, "--json"]
+    gains = tomllib.loads((tree / "tests/jobs/ur10e.toml").read_text())["torque"]["gains"]
+    stated = [word for joint, gain in gains.items() for word in ("--gain", f"{joint}={gain}")]
+    yield "payload", ["payload", robot, loaded, "--reference", free, "--json", *stated]
+    yield "doctor", ["doctor", robot, free, "--json", *stated]
     yield "validate", ["validate", "OUT/../ur10e", ur10e / "val_ptp10.parquet", "--json"]
-    yield "compare", ["compare", "OUT/../ur10e", "OUT/../tx40", "--json"]
     for form, file in (
         ("mjcf", "x.xml"),
         ("sdf", "x.sdf"),
@@ -90,7 +94,7 @@ def run(tree, folder, names):
             continue
         own = folder / name
         own.mkdir(parents=True)
-        line = [str(word).replace("OUT", str(own), 1) for word in words]
+        line = [str(word).replace("OUT/..", str(folder)).replace("OUT", str(own)) for word in words]
         done = subprocess.run(
             [sys.executable, "-m", "robotid", *line],
             env=env,
