@@ -18,6 +18,7 @@ from robotid.commanded.unknowns import with_terms
 from robotid.commanded.zeros import CLEAR, parallel_axes
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
+from robotid.identification.bands import REACH
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import Verdict, alarming
 from robotid.logs.data import Log
@@ -78,6 +79,18 @@ class Commanded:
         _, slopes = self.fitted.simulator.standard(self.model, estimate.theta)
         covariance: Array = slopes @ estimate.covariance @ slopes.T
         return covariance
+
+    @cached_property
+    def standard_reach(self) -> Array:
+        """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
+
+        The quantile is that of the unknown, of those it follows from, whose standard error has the
+        fewest degrees of freedom.
+        """
+        estimate = self.fitted.estimate
+        _, slopes = self.fitted.simulator.standard(self.model, estimate.theta)
+        reach: Array = np.where(slopes != 0.0, estimate.reach, REACH).max(axis=1, initial=REACH)
+        return reach
 
     @cached_property
     def shrunk(self) -> Array:
