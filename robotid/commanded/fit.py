@@ -9,6 +9,7 @@ from robotid._typing import Array, ProgressCallback, ignore_progress, report_sta
 from robotid.commanded.drive_torques import find_gains, measured_motion
 from robotid.commanded.driven import identified_rows, torque_rows
 from robotid.commanded.errors import DRIFTS
+from robotid.commanded.gain_check import GainScale, gain_scale
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
@@ -71,6 +72,7 @@ class Fitted:
         encoders: How encoders stand to the URDF's joints.
         tried: Which terms were tried, and what they gained.
         linear: What the rows of torque tell by themselves, where the torque drives the robot.
+        scale: What bodies and torques show of stated gains; None where gains are found.
     """
 
     simulator: LoopSimulator
@@ -79,6 +81,7 @@ class Fitted:
     encoders: Encoders
     tried: tuple[Tried, ...]
     linear: Identification | None = None
+    scale: GainScale | None = None
 
     @property
     def loops(self) -> Loops:
@@ -159,9 +162,13 @@ def fit_loops(
             rows = torque_rows(identified_rows(own, logs, signals), begun.share)
             simulator = replace(simulator, torque=rows)
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+    scale = None
     if begun.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
-    return Fitted(simulator, estimate, begun.plain, begun.encoders, tuple(tried), begun.linear)
+        if _is_stated(loop.kp, model).all() and simulator.error == "output":
+            scale = gain_scale(simulator, estimator, estimate)
+    chosen = (begun.encoders, tuple(tried), begun.linear, scale)
+    return Fitted(simulator, estimate, begun.plain, *chosen)
 
 
 @dataclass(frozen=True, eq=False)

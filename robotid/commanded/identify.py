@@ -40,6 +40,7 @@ _STATED_SCALE = (
     "positions do not show the scale: all drive and inertial parameters scale with kp as stated "
     "(kp stated 20 % too large makes all 20 % too large); log a torque to test it"
 )
+_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # keep a result from being good
 _NAMED = 8  # parameters that a sentence names
 
 
@@ -127,7 +128,7 @@ class Commanded:
             is_kept=bool(self.kept),
             is_settled=self.fitted.estimate.converged,
             alarms=self.alarms,
-            cautions=[f.message for f in self.findings if f.code in ("at_bound", "coarse_steps")],
+            cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
             scale=_STATED_SCALE if self.is_scaled_by_gain else "",
         )
 
@@ -280,6 +281,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
     yield from _torques_missed(found)
     if found.is_scaled_by_gain:
         yield Finding("scale", "note", "controller", _STATED_SCALE)
+    yield from _gains_contradicted(found)
     yield from _coarse_steps(estimate.details)
     yield from _at_bound(estimate.details["at_bound"])
     for told_names in found.told_together:
@@ -342,6 +344,35 @@ def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
             "standard errors. Set a smaller step under [estimator]",
             {"halving": halving},
         )
+
+
+def _gains_contradicted(found: Commanded) -> Iterator[Finding]:
+    """Yield that bodies or logged torques show other gains than those that were stated."""
+    scale, joints = found.fitted.scale, found.model.joints
+    if scale is None or not (scale.is_common_wrong or scale.wrong):
+        return
+    shows = "the logged torques" if found.fitted.simulator.knows_torques else "weight and inertia"
+    rows, own, where = scale.wrong, scale.change, listed([joints[j] for j in scale.wrong], _NAMED)
+    if scale.is_common_wrong:
+        rows, own, where = (
+            list(range(len(joints))),
+            np.full(len(joints), scale.common),
+            "controller",
+        )
+    worst = max(rows, key=lambda j: abs(own[j]))
+    change, kp = float(own[worst]), found.fitted.loops.kp
+    error = scale.common_error if scale.is_common_wrong else float(scale.error[worst])
+    agreeing = listed([f"{joints[j]} = {kp[j] * (1.0 + own[j]):.3g}" for j in rows], _NAMED)
+    yield Finding(
+        "gains_contradicted",
+        "warning",
+        where,
+        f"{shows} show gains of {1.0 + change:.2f} +- {error:.2g} times those stated, wanted 1: "
+        f"kp would agree with {agreeing}, kd likewise. Compare kp and kd in [controller] with "
+        "those of the drives (units, gear), or the masses of the URDF; all drive parameters scale "
+        "with them",
+        {"scale": 1.0 + change, "std_error": error},
+    )
 
 
 def _at_bound(names: Sequence[str]) -> Iterator[Finding]:

@@ -33,7 +33,9 @@ _UPHILL = 1e-2  # relative increase that a step with inexact derivatives may cos
 _NEAR = 1e-2  # of a standard error, squared, that such a step ends at
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
 _NO_TRACE = 1e-3  # noise levels that a start moves a window by, below which it is no matter
-_STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
+#: Rows are cut into so many stretches, to see how their scores scatter: few enough that each is
+#: longer than an encoder shows the same step while a joint turns back.
+_STRETCHES = 48
 _LOST = 1e-6  # share of its prior's variance, below which a direction's gain in knowledge is none
 
 
@@ -235,7 +237,7 @@ class OutputError:
             simulator: What rolls out.
             theta: Parameters that fit best with the starts as they are, shape (c,).
         """
-        H, g = self._normal(simulator, self.weights(simulator, theta), theta, frees=True)
+        H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
 
     def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
@@ -267,7 +269,7 @@ class OutputError:
         """
         weights = self.weights(other, theta)
         (H, g), (_, changed) = (
-            self._normal(s, weights, theta, frees=True) for s in (simulator, other)
+            self.normal(s, weights, theta, frees=True) for s in (simulator, other)
         )
         free = theta > simulator.lowest
         scale = 1.0 / np.sqrt(np.diag(H)[free])
@@ -277,10 +279,17 @@ class OutputError:
         error[free] = scale * np.sqrt(np.diag(inverse))
         return change, error
 
-    def _normal(
+    def normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
     ) -> tuple[Array, Array]:
-        """Return H = A'A and A'b of the linearised problem, prior included."""
+        """Return H = A'A and A'b of the linearised problem, prior included.
+
+        Args:
+            simulator: What rolls out.
+            weights: As of ``weights``.
+            theta: Parameters, shape (c,).
+            frees: Whether what starts of windows could do is taken out.
+        """
         return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
     def _descend(
@@ -303,7 +312,7 @@ class OutputError:
         highest = 1.0 if is_exact else 1.0 + _UPHILL
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
-            H, g = self._normal(simulator, weights, theta, frees=self.frees)
+            H, g = self.normal(simulator, weights, theta, frees=self.frees)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.lowest, damping)
                 new = self._cost(simulator, weights, trial)
