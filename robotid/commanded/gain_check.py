@@ -35,15 +35,16 @@ class GainScale:
     common_error: float
 
     @property
-    def is_common_wrong(self) -> bool:
-        """Whether one factor of all gains is not 1."""
-        return _is_wrong(self.common, self.common_error)
+    def is_wrong(self) -> bool:
+        """Whether one factor of all gains is not 1, and every joint by itself shows it.
 
-    @property
-    def wrong(self) -> list[int]:
-        """Joints whose own gains do not agree."""
-        pairs = enumerate(zip(self.change.tolist(), self.error.tolist(), strict=True))
-        return [j for j, own in pairs if _is_wrong(*own)]
+        Where joints show different ones, the model lacks something else: no gain is concluded.
+        """
+        agree = np.abs(self.change - self.common) <= _DIFFERS * np.hypot(
+            self.error, self.common_error
+        )
+        is_other = abs(self.common) > max(_DIFFERS * self.common_error, _LARGE)
+        return bool(is_other and agree.all())
 
 
 def gain_scale(simulator: LoopSimulator, estimator: OutputError, estimate: Estimate) -> GainScale:
@@ -98,7 +99,3 @@ def _last(H: Array, g: Array, n: int) -> tuple[Array, Array]:
     x, variance = scale * (inverse @ (scale * g)), np.diag(inverse) * scale**2
     is_open = (V[:, ~kept] ** 2).sum(axis=1) > 1e-6
     return x[-n:], np.where(is_open, np.inf, np.sqrt(variance))[-n:]
-
-
-def _is_wrong(change: float, error: float) -> bool:
-    return abs(change) > max(_DIFFERS * error, _LARGE)

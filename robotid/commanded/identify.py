@@ -349,29 +349,21 @@ def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
 def _gains_contradicted(found: Commanded) -> Iterator[Finding]:
     """Yield that bodies or logged torques show other gains than those that were stated."""
     scale, joints = found.fitted.scale, found.model.joints
-    if scale is None or not (scale.is_common_wrong or scale.wrong):
+    if scale is None or not scale.is_wrong:
         return
     shows = "the logged torques" if found.fitted.simulator.knows_torques else "weight and inertia"
-    rows, own, where = scale.wrong, scale.change, listed([joints[j] for j in scale.wrong], _NAMED)
-    if scale.is_common_wrong:
-        rows, own, where = (
-            list(range(len(joints))),
-            np.full(len(joints), scale.common),
-            "controller",
-        )
-    worst = max(rows, key=lambda j: abs(own[j]))
-    change, kp = float(own[worst]), found.fitted.loops.kp
-    error = scale.common_error if scale.is_common_wrong else float(scale.error[worst])
-    agreeing = listed([f"{joints[j]} = {kp[j] * (1.0 + own[j]):.3g}" for j in rows], _NAMED)
+    factor, error = 1.0 + scale.common, scale.common_error
+    kp = zip(joints, (factor * found.fitted.loops.kp).tolist(), strict=True)
+    agreeing = listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED)
     yield Finding(
         "gains_contradicted",
         "warning",
-        where,
-        f"{shows} show gains of {1.0 + change:.2f} +- {error:.2g} times those stated, wanted 1: "
+        "controller",
+        f"{shows} show gains of {factor:.2f} +- {error:.2g} times those stated, wanted 1: "
         f"kp would agree with {agreeing}, kd likewise. Compare kp and kd in [controller] with "
         "those of the drives (units, gear), or the masses of the URDF; all drive parameters scale "
         "with them",
-        {"scale": 1.0 + change, "std_error": error},
+        {"scale": factor, "std_error": error},
     )
 
 
