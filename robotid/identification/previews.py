@@ -550,7 +550,7 @@ def _errors(
     bounds = {**choice.constraints, "extent": "none"}
     settings = replace(choice, prior_weight=weight, constraints=bounds)
     fit = replace(consistent_fit(settings, model, mapping, known), plausible_weight=plausible)
-    C = fit.programme.covariance_at_prior(weight, fit.rows(factors, said.sigma))
+    C = fit.programme.covariance(weight, fit.rows(factors, said.sigma))
     R, meat = factors.weighted(said.sigma)[:-1, :-1], said.meat(K, said.sigma)
     covariance = about_prior(C, K, said.share**2 * meat, R, said.share, fit.pull)
     estimate = replace(

@@ -212,7 +212,9 @@ class BoundedSettings(EstimatorSettings):
         among=("auto", "cv", "evidence"),
         within=_FINITE,
     )
-    solver: str = setting("clarabel", "solver of the cone programme", among=("clarabel", "scs"))
+    solver: str = setting(
+        "clarabel", "cone solver, of priors that are not entropic", among=("clarabel", "scs")
+    )
     check: bool = setting(False, "whether the other solver solves it, too")
     draws: int = setting(
         64,

@@ -1,29 +1,22 @@
 """The convex programme of a consistent fit: data and prior over the cone, at any weight."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 
 from robotid._typing import Array
 from robotid.estimators.consistent.cones import Cone, ConeSolution, Subspace, least_squares, nearest
-from robotid.estimators.consistent.penalties import Penalty
+from robotid.estimators.consistent.interior_point import EntropicProblem
+from robotid.estimators.consistent.penalties import Entropic, Penalty
 from robotid.exceptions import NotConvergedError
 from robotid.regressor.factors import Factors
 
 __all__ = ["Programme"]
 
-_STEPS = 400  # of Newton's method at one weight
-_SETTLED = 1e-12  # decrease of the objective below which it has converged, relative
-_NEAR = 1e-6  # ... and below which the steps are computed exactly
-_ROUGH = 0.1  # ... and at which it goes on to a smaller weight, in units of the penalty
-_HEAVY = 100.0  # weight at which a fit stays near its prior, from which Newton's method sets out
-_DECADE = 10.0
-_PATIENCE = 25  # steps from a weight to a lighter one before a shorter way is tried
-_SHORTEST = 1.05  # ratio of weights below which it is given up
-_HALVINGS = 40
-_ROOM = 0.1  # share of the prior's pseudo-inertias that the first point has at least
-_INSIDE = 0.9  # share of the way to where a penalty is infinite that a step goes at most
+_EXACT = 1e-12  # decrease of the objective by another step at which a fit is exact, relative
+_ROUGH = 1e-6  # ... and at which it will do for a prediction
 _NOISE_STEPS, _NOISE_SETTLED = 50, 1e-4  # a noise level need not be known better
 _FLOOR = 1e-6  # smallest noise level, as a share of the torque: noise-free data have none
 _LEAST_FREEDOM = 0.1  # share of the rows that are left to tell the noise
@@ -39,7 +32,7 @@ class Programme:
         penalty: Distance from the prior.
         cone: The inequalities.
         space: What the equalities leave.
-        solver: "clarabel" or "scs".
+        solver: "clarabel" or "scs", of priors that are not entropic and of the check.
         max_iterations: Bound on the iterations of each solve.
     """
 
@@ -57,46 +50,58 @@ class Programme:
         return self.cone.linear if self.penalty.keeps_positive else self.cone
 
     def minimise(
-        self, rows: Array, weight: float, *, is_exact: bool = True, start: Array | None = None
-    ) -> tuple[ConeSolution, Array]:
-        """Return the minimum.
+        self,
+        rows: Array,
+        weight: float,
+        *,
+        is_exact: bool = True,
+        start: ConeSolution | None = None,
+    ) -> ConeSolution:
+        """Return the minimum, its x being pi, shape (p,).
 
-        A penalty that is not quadratic is minimised by Newton's method: its expansion to second
-        order is a fit like any other, and a step keeps to the cone since that is convex. It sets
-        out near the prior, at a weight that outweighs what the data say against it, and goes down
-        by decades: from afar a light one would creep along the boundary. Or from a start.
+        A quadratic penalty is a problem of the cone solver; the entropic one has a method of its
+        own, ``EntropicProblem``.
 
         Args:
             rows: Information on the base parameters, shape (k, b + 1).
             weight: Weight of the penalty [-].
             is_exact: Whether to solve beyond 1e-3 standard deviations.
-            start: Minimum of nearly the same rows, at up to ten times the weight, shape (p,).
-
-        Returns:
-            The solution, its x being pi, shape (p,); and the covariance without the inequalities.
+            start: Minimum of nearly the same rows, or at another weight.
 
         Raises:
-            NotConvergedError: If the cone solver or Newton's method does not solve it.
+            NotConvergedError: If it is not solved.
         """
-        centre = self.penalty.centre
-        if self.penalty.is_quadratic:
-            solution, R = self._expanded(rows, weight, centre, self.cone, is_exact)
-            return solution, self._covariance(R)
-        if start is None:
-            heavy = max(weight, _HEAVY, self._against(rows, centre))
-            solution, _, steps = self._settle(rows, heavy, self._start(rows, heavy), _ROUGH * heavy)
-        else:
-            solution, heavy, steps = ConeSolution(start, 0, ""), _DECADE * weight, 0
-        solution, count = self._lighten(rows, heavy, weight, solution)
-        steps += count
-        value = self.objective(rows, solution.x, weight)
-        solution, R, count = self._settle(rows, weight, solution, _NEAR * (1.0 + value))
-        if is_exact:
-            steps += count
-            tolerance = _SETTLED * (1.0 + value)
-            solution, R, count = self._settle(rows, weight, solution, tolerance, is_exact=True)
-        message = f"{solution.message}, after {steps + count} Newton steps"
-        return replace(solution, message=message), self._covariance(R)
+        if not isinstance(self.penalty, Entropic):
+            return self.expanded(rows, weight, self.penalty.centre, is_exact=is_exact)
+        tolerance = _EXACT if is_exact else _ROUGH
+        if start is not None:
+            start = replace(start, x=start.x / self.scale)
+        A, d = rows[:, :-1] @ self.K * self.scale, rows[:, -1]
+        try:
+            solution = self._entropic.minimise(A, d, weight, tolerance, start)
+        except NotConvergedError:
+            # the cone solver knows whether the bounds leave room for possible bodies
+            self.expanded(rows, weight, self.penalty.centre, within=self.cone)
+            raise
+        return replace(solution, x=solution.x * self.scale)
+
+    @cached_property
+    def _entropic(self) -> EntropicProblem:
+        """The problem of the entropic penalty, in units of the scale."""
+        penalty, space, cone = self.penalty, self.space, self.cone.linear
+        assert isinstance(penalty, Entropic)
+        size = len(penalty.held)
+        return EntropicProblem(
+            scale=self.scale,
+            held=penalty.held / self.scale[:size],
+            P=penalty.prior,
+            centre=penalty.centre / self.scale,
+            stiffness=np.sqrt(penalty.precision) * self.scale[size:],
+            G=cone.G,
+            h=cone.h,
+            N=space.fixed,
+            origin=space.origin,
+        )
 
     def redrawn(
         self,
@@ -148,21 +153,6 @@ class Programme:
             lowest + noise, cone.restrict(Subspace(at, inverse)), max_iterations=self.max_iterations
         )
         return self.scale * (y @ prior.T), failures
-
-    def _start(self, rows: Array, weight: float) -> ConeSolution:
-        """Return a first point whose bodies have room, a tenth of the prior's, if bounds allow."""
-        centre = self.penalty.centre
-        inside = self.cone.around(centre / self.scale, _ROOM)
-        try:
-            return self._expanded(rows, weight, centre, inside, False)[0]
-        except NotConvergedError:  # bounds leave no such room
-            return self._expanded(rows, weight, centre, self.cone, False)[0]
-
-    def _against(self, rows: Array, pi: Array) -> float:
-        """Return by how much the squares of the residual exceed those of least squares."""
-        A, d = rows[:, :-1], rows[:, -1]
-        best = np.linalg.lstsq(A, d, rcond=None)[0]
-        return float(np.sum((A @ (self.K @ pi - best)) ** 2))
 
     def objective(self, rows: Array, pi: Array, weight: float) -> float:
         """Return what is minimised: the squares of the residual plus the weighted penalty [-].
@@ -231,91 +221,48 @@ class Programme:
                 break
         return sigma
 
-    def covariance_at_prior(self, weight: float, rows: Array | None = None) -> Array:
-        """Return the covariance, shape (p, p), with the penalty expanded at its centre.
+    def covariance(
+        self, weight: float, rows: Array | None = None, pi: Array | None = None
+    ) -> Array:
+        """Return the covariance without the inequalities, shape (p, p).
 
         Args:
             weight: Weight of the penalty [-].
             rows: Information on the base parameters, shape (k, b + 1); that of the prior alone if
                 None.
+            pi: Where the penalty is expanded, shape (p,); None: at its centre.
         """
-        S = np.sqrt(weight) * self._scaled_root(self.penalty.centre)
+        S = np.sqrt(weight) * self._scaled_root(self.penalty.centre if pi is None else pi)
         data = [] if rows is None else [rows[:, :-1] @ self.K * self.scale]
         stacked = np.vstack([*data, S]) @ self.space.basis
-        return self._covariance(scipy.linalg.qr(stacked, mode="r")[0][: stacked.shape[1]])
+        R = scipy.linalg.qr(stacked, mode="r")[0][: stacked.shape[1]]
+        inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
+        spread = self.scale[:, None] * self.space.basis @ inverse
+        covariance: Array = spread @ spread.T
+        return covariance
 
-    def _lighten(
-        self, rows: Array, heavy: float, weight: float, solution: ConeSolution
-    ) -> tuple[ConeSolution, int]:
-        """Go from near the minimum at a heavy weight to near that at a weight; count the steps.
-
-        By decades, or less where a decade takes too many steps.
-        """
-        ratio, steps = _DECADE, 0
-        while heavy > weight:
-            lighter = max(heavy / ratio, weight)
-            value = self.objective(rows, solution.x, lighter)
-            rough = max(_ROUGH * lighter, _NEAR * (1.0 + value))
-            try:
-                moved, _, count = self._settle(rows, lighter, solution, rough, limit=_PATIENCE)
-            except NotConvergedError:
-                ratio = np.sqrt(ratio)
-                if ratio < _SHORTEST:
-                    raise
-                steps += _PATIENCE
-            else:
-                solution, heavy, steps = moved, lighter, steps + count
-        return solution, steps
-
-    def _settle(
+    def expanded(
         self,
         rows: Array,
         weight: float,
-        start: ConeSolution,
-        tolerance: float,
+        pi: Array,
         *,
-        limit: int = _STEPS,
-        is_exact: bool = False,
-    ) -> tuple[ConeSolution, Array, int]:
-        """Go from a point of the cone to the minimum at a weight; return also R and the steps."""
-        pi, value, before = start.x, self.objective(rows, start.x, weight), np.inf
-        for step in range(1, limit + 1):
-            solution, R = self._expanded(rows, weight, pi, self.binding, is_exact)
-            direction = solution.x - pi
-            decrease = float(np.sum((R @ self.space.basis.T @ (direction / self.scale)) ** 2))
-            share, lower = self._along(rows, weight, pi, direction, value)
-            pi, value = pi + share * direction, lower
-            # steps that no longer shrink are as short as the solver can tell
-            is_stuck = decrease <= _NEAR * (1.0 + value) and decrease > 0.5 * before
-            if decrease <= tolerance or share == 0 or is_stuck:
-                return replace(solution, x=pi), R, step
-            before = decrease
-        raise NotConvergedError(
-            f"the fit still changes after {limit} Newton steps at a prior weight of {weight:g}; "
-            "use the 'euclidean' prior or a larger weight",
-            "max_iterations",
-        )
+        is_exact: bool = True,
+        within: Cone | None = None,
+    ) -> ConeSolution:
+        """Return the minimum with the penalty expanded at a point, by the cone solver.
 
-    def _along(
-        self, rows: Array, weight: float, pi: Array, direction: Array, value: float
-    ) -> tuple[float, float]:
-        """Return the share of a step that lowers the objective, and the objective there."""
-        share = min(1.0, _INSIDE * self.penalty.reach(pi, direction))
-        best, lowest = 0.0, value
-        for _ in range(_HALVINGS):
-            lower = self.objective(rows, pi + share * direction, weight)
-            if best > 0 and lower >= lowest:
-                break
-            if lower <= lowest:
-                best, lowest = share, lower
-            share *= 0.5
-        return best, lowest
+        Args:
+            rows: Information on the base parameters, shape (k, b + 1).
+            weight: Weight of the penalty [-].
+            pi: The point, shape (p,).
+            is_exact: As of ``minimise``.
+            within: The inequalities; None: those that can bind.
 
-    def _expanded(
-        self, rows: Array, weight: float, pi: Array, cone: Cone, is_exact: bool
-    ) -> tuple[ConeSolution, Array]:
-        """Minimise with the penalty expanded at pi; return also R, R^T R half the Hessian."""
-        triangle, cone = self._system(rows, weight, pi, cone)
+        Raises:
+            NotConvergedError: If the cone solver does not solve it.
+        """
+        triangle, cone = self._system(rows, weight, pi, self.binding if within is None else within)
         solution = least_squares(
             triangle[:, :-1],
             triangle[:, -1],
@@ -326,7 +273,7 @@ class Programme:
         )
         space = self.space
         x = solution.x if len(triangle) == len(pi) else space.origin + space.basis @ solution.x
-        return replace(solution, x=x * self.scale), triangle[:, :-1]
+        return replace(solution, x=x * self.scale)
 
     def _system(self, rows: Array, weight: float, pi: Array, cone: Cone) -> tuple[Array, Cone]:
         """Return the triangle [R d] and a cone of what the equalities leave, expanded at pi."""
@@ -347,10 +294,3 @@ class Programme:
         """Return the root of half the Hessian of the penalty in units of the scale."""
         scaled: Array = self.penalty.root(pi) * self.scale
         return scaled
-
-    def _covariance(self, R: Array) -> Array:
-        """Return (R^T R)^-1 of a triangular R, from what the equalities leave to all of pi."""
-        inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
-        spread = self.scale[:, None] * self.space.basis @ inverse
-        covariance: Array = spread @ spread.T
-        return covariance

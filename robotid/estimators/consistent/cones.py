@@ -5,7 +5,7 @@ Linear inequalities, pseudo-inertias and equalities; Clarabel, and SCS as a seco
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,6 +79,13 @@ class Subspace:
         basis[touched, len(free) :] = inner
         return cls(origin, basis)
 
+    @cached_property
+    def fixed(self) -> Array:
+        """Directions that are held, shape (p, p - r), orthonormal."""
+        p, r = self.basis.shape
+        fixed: Array = np.zeros((p, 0)) if r == p else scipy.linalg.null_space(self.basis.T)
+        return fixed
+
 
 @dataclass(frozen=True, eq=False)
 class Cone:
@@ -117,15 +124,6 @@ class Cone:
     def linear(self) -> "Cone":
         """Its linear rows alone."""
         return Cone(self.G, self.h, self.S[:0], self.s[:0], self.labels[: len(self.h)])
-
-    def around(self, x: Array, share: float) -> "Cone":
-        """Return the points whose matrices are at least a share of those of a point.
-
-        Args:
-            x: The point, shape (p,).
-            share: The share [-].
-        """
-        return Cone(self.G, self.h, self.S, self.s - share * (self.S @ x + self.s), self.labels)
 
     def matrices(self, x: Array) -> Array:
         """Return the matrices S_i(x), shape (m, 4, 4).
@@ -204,10 +202,15 @@ def svec(S: Array) -> Array:
     Args:
         S: Symmetric matrices, shape (..., k, k).
     """
-    k = S.shape[-1]
-    weight = np.where(np.eye(k, dtype=bool), 1.0, np.sqrt(2.0))
+    rows, columns, weight = _upper(S.shape[-1])
+    return S[..., rows, columns] * weight
+
+
+@cache
+def _upper(k: int) -> tuple[Array, Array, Array]:
+    """Return rows and columns of an upper triangle by columns, and the weights of its entries."""
     columns, rows = np.tril_indices(k)  # (j, i) with i <= j
-    return (S * weight)[..., rows, columns]
+    return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
 
 
 def unsvec(vector: Array) -> Array:
@@ -216,8 +219,8 @@ def unsvec(vector: Array) -> Array:
     Args:
         vector: Vectors of 10 entries, one after the other, shape (10 m,).
     """
-    columns, rows = np.tril_indices(_SIZE)
-    entries = vector.reshape(-1, _ENTRIES) / np.where(rows == columns, 1.0, np.sqrt(2.0))
+    rows, columns, weight = _upper(_SIZE)
+    entries = vector.reshape(-1, _ENTRIES) / weight
     S = np.zeros((len(entries), _SIZE, _SIZE))
     S[:, rows, columns] = S[:, columns, rows] = entries
     return S
@@ -231,11 +234,13 @@ class ConeSolution:
         x: The point, shape (p,).
         n_iter: Iterations of the solver.
         message: Name of the solver and its status.
+        multipliers: Those of the linear rows, shape (k,), if the solver states them.
     """
 
     x: Array
     n_iter: int
     message: str
+    multipliers: Array | None = None
 
 
 def least_squares(

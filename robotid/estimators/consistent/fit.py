@@ -62,7 +62,7 @@ class Consistent(BatchEstimator):
         metric: How the distance from the prior is measured: "euclidean",
             "riemannian" or "entropic"; see ``make_penalty``.
         constraints: Bounds beside physical consistency.
-        solver: "clarabel" or "scs".
+        solver: "clarabel" or "scs", of priors that are not entropic and of the check.
         choice: How ``prior_weight`` was chosen, if it was.
         check: Whether the other solver solves it, too; its difference is stated in the details.
 
@@ -116,7 +116,8 @@ class Consistent(BatchEstimator):
         wls = self._wls(factors)
         sigma = self.noise(factors, wls.sigma)
         rows = self.rows(factors, sigma)
-        solution, covariance = self.programme.minimise(rows, self.prior_weight)
+        solution = self.programme.minimise(rows, self.prior_weight)
+        covariance = self.programme.covariance(self.prior_weight, rows, solution.x)
         details = self._details(solution.x)
         if self.check:
             details["check"] = self._second_opinion(rows, solution.x, factors)
@@ -156,11 +157,11 @@ class Consistent(BatchEstimator):
                 "or 'kalman', which have one"
             )
         rows = _information_rows(estimate, known)  # (k, b + 1)
-        solution, covariance = self.programme.minimise(rows, self.prior_weight)
+        solution = self.programme.minimise(rows, self.prior_weight)
         return replace(
             estimate,
             theta=solution.x,
-            covariance=covariance,
+            covariance=self.programme.covariance(self.prior_weight, rows, solution.x),
             names=self.layout.names,
             undetermined=self.undetermined(rows, estimate.names),
             n_iter=estimate.n_iter + solution.n_iter,
@@ -239,7 +240,7 @@ class Consistent(BatchEstimator):
     @property
     def spread_before(self) -> Array:
         """Plausible standard deviation of each parameter by the prior alone, shape (p,)."""
-        covariance = self.programme.covariance_at_prior(self.prior_weight / self.pull)
+        covariance = self.programme.covariance(self.prior_weight / self.pull)
         spread: Array = np.sqrt(np.diag(covariance))
         return spread
 
@@ -291,7 +292,7 @@ class Consistent(BatchEstimator):
         (other,) = (name for name in SOLVERS if name != self.solver)
         try:
             programme = replace(self.programme, solver=other)
-            solution, _ = programme.minimise(rows, self.prior_weight)
+            solution = programme.expanded(rows, self.prior_weight, pi)
         except NotConvergedError as error:
             return {"solver": other, "status": error.status}
         objective = self.objective(rows, pi)

@@ -22,6 +22,7 @@ from robotid.robot.parameters import (
 
 __all__ = [
     "METRICS",
+    "Entropic",
     "Penalty",
     "Quadratic",
     "WeightChoice",
@@ -102,15 +103,6 @@ class Penalty(ABC):
         H: Array = 2.0 * S.T @ S
         return H
 
-    def reach(self, pi: Array, step: Array) -> float:
-        """Return the largest multiple of a step at which the value is finite.
-
-        Args:
-            pi: Standard parameters with a finite value, shape (p,).
-            step: Change of them, shape (p,).
-        """
-        return float("inf")
-
 
 @dataclass(frozen=True, eq=False)
 class Quadratic(Penalty):
@@ -138,7 +130,7 @@ class Quadratic(Penalty):
 
 
 @dataclass(frozen=True, eq=False)
-class _Entropic(Penalty):
+class Entropic(Penalty):
     """2 sum_i d(J_i || P_i) of the bodies, and |(pi - centre) / std|^2 of the drives.
 
     d(J || P) = tr(P^-1 J) - log det(P^-1 J) - 4 is the Bregman divergence of -log det, half the
@@ -164,8 +156,7 @@ class _Entropic(Penalty):
         return float(2.0 * divergence + self.precision @ self._drives(pi) ** 2)
 
     def gradient(self, pi: Array) -> Array:
-        J, P = self._rest(pi), self._rest(self.centre)
-        slope = np.linalg.inv(P) - np.linalg.inv(J)
+        slope = np.linalg.inv(self.prior) - np.linalg.inv(self._rest(pi))
         inertial = 2.0 * np.einsum("nij,kij->nk", slope, pseudo_inertia_basis()).reshape(-1)
         return np.concatenate([inertial, 2.0 * self.precision * self._drives(pi)])
 
@@ -174,17 +165,15 @@ class _Entropic(Penalty):
         S: Array = scipy.linalg.block_diag(*metric_root(L), np.diag(np.sqrt(self.precision)))
         return S
 
-    def reach(self, pi: Array, step: Array) -> float:
-        L = self._prior_factor @ np.linalg.cholesky(self._ratio(pi))
-        # J + s D is positive definite while 1 + s eig(L^-1 D L^-T) > 0
-        D = _whitened(pseudo_inertia(step[: len(self.held)]), L)
-        lowest = float(np.linalg.eigvalsh(D)[:, 0].min())
-        return -1.0 / lowest if lowest < 0 else float("inf")
+    @cached_property
+    def prior(self) -> Array:
+        """The pseudo-inertias P of the prior beside what is held, shape (n, 4, 4)."""
+        return self._rest(self.centre)
 
     @cached_property
     def _prior_factor(self) -> Array:
         """The factors L of the priors P = L L^T of the bodies."""
-        return np.linalg.cholesky(self._rest(self.centre))
+        return np.linalg.cholesky(self.prior)
 
     def _ratio(self, pi: Array) -> Array:
         """Return L^-1 J L^-T of each body: free of units, 1 at the prior P = L L^T."""
@@ -230,7 +219,7 @@ def make_penalty(
     repaired = np.concatenate([np.concatenate(rest) + held, prior[size:]])
     precision = prior_std[size:] ** -2.0
     if metric == "entropic":
-        return _Entropic(repaired, precision, held)
+        return Entropic(repaired, precision, held)
     M = scipy.linalg.block_diag(*pull_back_metric(P), np.diag(precision))
     return Quadratic(repaired, M)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotid._typing import Array
+from robotid.estimators.consistent.cones import ConeSolution
 from robotid.estimators.consistent.fit import Consistent
 from robotid.estimators.consistent.penalties import WeightChoice
 from robotid.exceptions import DataError, NotConvergedError
@@ -88,17 +89,17 @@ def contradicted_extents(fit: Consistent, stretches: Sequence[Factors]) -> tuple
     rows = fit.rows(whole, sigma)
     free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
     try:
-        solution, covariance = free.programme.minimise(rows, 1.0, is_exact=False)
+        solution = free.programme.minimise(rows, 1.0, is_exact=False)
     except NotConvergedError:  # bodies run away: that contradicts no extent
         return ()
-    G = cone.G / fit.prior_std
+    G, covariance = cone.G / fit.prior_std, free.programme.covariance(1.0, rows, solution.x)
     error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", G, covariance, G), 0.0))
     beyond = G @ solution.x + cone.h < -_BEYOND * error
     outside = [label for label, is_out in zip(cone.labels, beyond, strict=True) if is_out]
     bodies = tuple(body for body in fit.layout.bodies if f"extent {body}" in outside)
     if not bodies or len(stretches) < 2:
         return bodies
-    starts = [solution.x] * len(stretches)
+    starts = [solution] * len(stretches)
     try:
         unbound = _held_out(free, stretches, sigma, 1.0, starts)[0].sum(axis=1)
     except NotConvergedError:
@@ -139,8 +140,8 @@ def _held_out(
     stretches: Sequence[Factors],
     sigma: Array,
     weight: float,
-    starts: Sequence[Array] | None,
-) -> tuple[Array, list[Array]]:
+    starts: Sequence[ConeSolution] | None,
+) -> tuple[Array, list[ConeSolution]]:
     """Return the errors of ``held_out_errors``, and the fits that made them, to start others."""
     if len(stretches) < 2:
         raise DataError(
@@ -151,10 +152,10 @@ def _held_out(
     for k, kept in enumerate(stretches):
         others = merge([*stretches[:k], *stretches[k + 1 :]])
         start = None if starts is None else starts[k]
-        solution, _ = fit.programme.minimise(
+        solution = fit.programme.minimise(
             fit.rows(others, sigma), weight, is_exact=False, start=start
         )
-        fits.append(solution.x)
+        fits.append(solution)
         squares.append(kept.residual_squares(fit.K @ solution.x) / sigma**2)
     rows = np.sum([kept.rows for kept in stretches], axis=0)  # (n,)
     return np.array(squares) / np.maximum(rows, 1), fits

@@ -155,15 +155,3 @@ def test_the_held_share_of_a_body_is_no_part_of_the_distance(prior, std):
     free, with_held = (penalty_of("entropic", prior, std, h) for h in (None, held))
     # the rest is half as large, so that the same change is twice as much of it
     assert with_held.value(pi) > 3 * free.value(pi)
-
-
-def test_a_step_reaches_as_far_as_the_bodies_stay_possible(prior, std, rng):
-    penalty = penalty_of("entropic", prior, std)
-    for _ in range(10):
-        step = std * rng.standard_normal(len(prior))
-        reach = penalty.reach(prior, step)
-        assert np.isfinite(penalty.value(prior + 0.999 * reach * step))
-        assert penalty.value(prior + 1.001 * reach * step) == np.inf
-    heavier = np.concatenate([prior[:20], np.zeros(2)])
-    assert penalty.reach(prior, heavier) == np.inf
-    assert penalty_of("euclidean", prior, std).reach(prior, step) == np.inf

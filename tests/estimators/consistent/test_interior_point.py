@@ -1,0 +1,146 @@
+"""The fit with the entropic prior against its conditions of optimality, Clarabel, and limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotid.estimators import Consistent
+from robotid.estimators.consistent.constraints import Constraints
+from robotid.exceptions import NotConvergedError
+from robotid.regressor.base_parameters import structural_mapping
+from robotid.robot.examples import example_urdf
+from robotid.robot.model import RobotModel
+from robotid.robot.parameters import inertial_from_pseudo_inertia, pseudo_inertia
+from robotid.robot.prior import prior_spread
+
+ROBOTS = ("ur10_robot.urdf", "panda.urdf", "double_pendulum.urdf")
+
+
+def possible(prior, size, std, rng):
+    """Return parameters that are not the prior's, of possible bodies and drives."""
+    half = np.linalg.cholesky(pseudo_inertia(prior[:size]) + 1e-6 * np.eye(4))
+    turned = half @ (np.eye(4) + 0.2 * rng.standard_normal(half.shape))
+    bodies = [inertial_from_pseudo_inertia(J) for J in turned @ turned.swapaxes(1, 2)]
+    drives = prior[size:] + std[size:] * np.abs(rng.standard_normal(len(prior) - size))
+    return np.concatenate([*bodies, drives * (rng.random(len(drives)) < 0.7)])
+
+
+def random_fit(file, rng, **settings):
+    """Return a fit to random data, of which some directions say little, and their rows."""
+    model = RobotModel.from_urdf(example_urdf(file))
+    K, prior = structural_mapping(model).K, model.standard_parameters()
+    std = prior_spread(model, np.full((3, len(model.joints)), 300.0), 100)
+    fit = Consistent(model.layout, K, prior, std, metric="entropic", **settings)
+    pi = possible(prior, fit.layout.n_inertial, std, rng)
+    unit = np.linalg.norm(K * std, axis=1)
+    R = 10.0 ** rng.uniform(-1.0, 3.0, (len(K), 1)) * rng.standard_normal((len(K), len(K))) / unit
+    return fit, np.column_stack([R, R @ (K @ pi) + rng.standard_normal(len(K))])
+
+
+def slope(fit, rows, weight, pi):
+    """Return the gradient of half the objective, in units of the spread."""
+    D = rows[:, :-1] @ fit.K
+    data = D.T @ (D @ pi - rows[:, -1])
+    return (data + 0.5 * weight * fit.penalty.gradient(pi)) * fit.prior_std
+
+
+@pytest.mark.parametrize("file", ROBOTS)
+@pytest.mark.parametrize("weight", [0.1, 1.0, 100.0])
+def test_the_slope_is_held_by_the_inequalities_that_bind(file, weight, rng):
+    fit, rows = random_fit(file, rng)
+    found = fit.programme.minimise(rows, weight)
+    cone, x = fit.programme.cone.linear, found.x / fit.prior_std
+    slack, multipliers = cone.G @ x + cone.h, found.multipliers
+    gradient = slope(fit, rows, weight, found.x)
+    np.testing.assert_allclose(
+        gradient,
+        cone.G.T @ multipliers,
+        atol=1e-7 * np.abs(slope(fit, rows, weight, fit.prior)).max(),
+    )
+    assert slack.min() > -1e-9
+    assert multipliers.min() >= 0
+    assert (multipliers * slack).max() < 1e-5  # of an objective of some hundreds
+    assert np.isfinite(fit.penalty.value(found.x))
+
+
+@pytest.mark.parametrize("file", ROBOTS)
+@pytest.mark.parametrize("share", [None, (0.9, 0.9), (0.8, 0.9)])
+def test_clarabel_would_not_go_on_from_it(file, share, rng):
+    fit, rows = random_fit(file, rng)
+    whole = fit.prior[: fit.layout.n_inertial : 10].sum()
+    low, high = (0.0, np.inf) if share is None else (share[0] * whole, share[1] * whole)
+    fit = replace(fit, constraints=Constraints(total_mass=(low, high)))
+    found = fit.programme.minimise(rows, 1.0)
+    again = fit.programme.expanded(rows, 1.0, found.x)
+    spread = np.sqrt(np.diag(fit.programme.covariance(1.0, rows, found.x)))
+    moved = np.abs(again.x - found.x) / np.maximum(spread, 1e-9 * fit.prior_std)
+    assert moved.max() < 1e-5
+    total = found.x[: fit.layout.n_inertial : 10].sum()
+    assert low - 1e-9 <= total <= high + 1e-9
+
+
+def test_what_equalities_hold_stays_and_the_rest_is_the_minimum_beside_it(rng):
+    fit, rows = random_fit("ur10_robot.urdf", rng)
+    body = fit.layout.bodies[2]
+    fit = replace(
+        fit, constraints=Constraints(pinned=(body,), mass={fit.layout.bodies[4]: (1.5, 1.5)})
+    )
+    found = fit.programme.minimise(rows, 1.0)
+    np.testing.assert_allclose(found.x[20:30], fit.prior[20:30], atol=1e-9)
+    assert found.x[40] == pytest.approx(1.5, abs=1e-9)
+    held = fit.programme.space.fixed  # along all others the slope is that of the inequalities
+    gradient = slope(fit, rows, 1.0, found.x) - fit.programme.cone.linear.G.T @ found.multipliers
+    along = gradient - held @ (held.T @ gradient)
+    assert np.abs(along).max() < 1e-7 * np.abs(slope(fit, rows, 1.0, fit.prior)).max()
+
+
+def test_without_data_the_prior_is_found(rng):
+    fit, rows = random_fit("panda.urdf", rng)
+    found = fit.programme.minimise(0.0 * rows, 1.0)
+    np.testing.assert_allclose(found.x, fit.penalty.centre, atol=1e-6)
+
+
+@pytest.mark.parametrize(("weight", "most"), [(10.0, 9), (1.0, 7), (0.1, 5)])
+def test_a_start_near_the_minimum_saves_steps_and_changes_nothing(weight, most, rng):
+    fit, rows = random_fit("panda.urdf", rng)
+    cold = fit.programme.minimise(rows, 0.1)
+    near = fit.programme.minimise(rows, weight)
+    warm = fit.programme.minimise(rows, 0.1, start=near)
+    np.testing.assert_allclose(warm.x / fit.prior_std, cold.x / fit.prior_std, atol=1e-7)
+    # as many as it takes today: wrong corrections and starts find the minimum, too, but later
+    assert cold.n_iter <= 15
+    assert warm.n_iter <= most
+
+
+def test_a_rough_fit_is_right_to_a_hundredth_of_a_spread(rng):
+    fit, rows = random_fit("ur10_robot.urdf", rng)
+    rough, exact = (fit.programme.minimise(rows, 1.0, is_exact=e) for e in (False, True))
+    spread = np.sqrt(np.diag(fit.programme.covariance(1.0, rows, exact.x)))
+    assert np.abs((rough.x - exact.x) / spread).max() < 0.1
+    assert rough.n_iter < exact.n_iter
+
+
+def test_a_share_that_is_held_is_left_to_the_bodies(rng):
+    fit, rows = random_fit("double_pendulum.urdf", rng)
+    held = np.zeros(fit.layout.n_inertial)
+    held[:10] = 0.5 * fit.prior[:10]
+    found = replace(fit, held=held).programme.minimise(rows, 1.0)
+    rest = found.x[:10] - held[:10]
+    assert rest[0] > 0
+    gradient = slope(replace(fit, held=held), rows, 1.0, found.x)
+    assert np.abs(gradient - fit.programme.cone.linear.G.T @ found.multipliers).max() < 1e-6 * (
+        np.abs(slope(fit, rows, 1.0, fit.prior)).max()
+    )
+
+
+def test_bounds_that_contradict_each_other_are_named(rng):
+    fit, rows = random_fit("ur10_robot.urdf", rng)
+    far = fit.layout.bodies[2]
+    apart = Constraints(
+        com={far: (-np.eye(3)[:1], np.array([-5.0]))},
+        extent={far: np.array([[-0.1] * 3, [0.1] * 3])},
+    )
+    fit = replace(fit, constraints=apart)
+    with pytest.raises(NotConvergedError, match=r"no parameters meet all constraints .*extent"):
+        fit.programme.minimise(rows, 1.0)
