@@ -546,15 +546,15 @@ def coverage(
 
 
 def covered(name, runs, seconds, run=None, **how):
-    """Return errors and standard errors by kind of parameter, each of shape (2, values)."""
+    """Return errors, standard errors and reaches by kind of parameter, of shape (3, values)."""
     found, begun = {}, time.process_time()
     for seed in range(runs):
         rng = np.random.default_rng([17, seed])
-        for kind, error, said in (run or one_run)(name, rng, seconds, **how):
-            found.setdefault(kind, []).append((error, said))
+        for kind, *own in (run or one_run)(name, rng, seconds, **how):
+            found.setdefault(kind, []).append(own)
     print(f"{name}: {(time.process_time() - begun) / runs:.1f} s of processor a run",
           file=sys.stderr)  # fmt: skip
-    return {kind: np.array(pairs).T for kind, pairs in found.items()}
+    return {kind: np.array(own).T for kind, own in found.items()}
 
 
 def driven_errors(name, runs, seconds):
@@ -573,16 +573,16 @@ def driven_errors(name, runs, seconds):
             )  # fmt: skip
             estimate, linear = found.fitted.estimate, found.fitted.linear
             kinds = [(key, key.rpartition(".")[2]) for key in estimate.names]
-            for (key, kind), theta, said in zip(
-                kinds, estimate.theta, estimate.std_error, strict=True
+            for (key, kind), theta, *said in zip(
+                kinds, estimate.theta, estimate.std_error, estimate.reach, strict=True
             ):
-                errors[way].setdefault(kind, []).append((theta - plant.truth[key], said))
+                errors[way].setdefault(kind, []).append((theta - plant.truth[key], *said))
         place = linear.model.layout.names.index
         for key, kind in kinds:
             error = linear.standard[place(key)] - plant.truth[key]
             said = np.sqrt(linear.standard_covariance[place(key), place(key)])
             if kind != "armature":  # which rows tell with the bodies alone
-                errors["torque rows alone"].setdefault(kind, []).append((error, said))
+                errors["torque rows alone"].setdefault(kind, []).append((error, said, REACH))
     return {
         way: {kind: np.array(pairs).T for kind, pairs in own.items()} for way, own in errors.items()
     }
@@ -591,18 +591,18 @@ def driven_errors(name, runs, seconds):
 def coverage_rows(name, found, alone=None):
     """Print and return a row for each kind of parameter; alone: of the same runs without torque."""
     rows = []
-    for kind, (error, said) in found.items():
+    for kind, (error, said, reach) in found.items():
         row = {
             "robot": name,
             "parameter": kind,
             "values": len(error),
             "bias": float(np.mean(error / said)),
             "said": float(1.0 / np.std(error / said)),
-            "held": float(np.mean(np.abs(error) <= REACH * said)),
+            "held": float(np.mean(np.abs(error) <= reach * said)),
         }
         less = "| | |"
         if alone and kind in alone and kind != "viscous":  # which stood for kd, too
-            before, said_before = alone[kind]
+            before, said_before, _ = alone[kind]
             row["said_less"] = float(np.exp(np.mean(np.log(said / said_before))))
             row["less"] = float(np.sqrt(np.mean((error / said_before) ** 2)
                                         / np.mean((before / said_before) ** 2)))  # fmt: skip
@@ -614,7 +614,7 @@ def coverage_rows(name, found, alone=None):
 
 
 def one_run(name, rng, seconds, *, finds_all=False, torque=False):
-    """Yield kind, error and standard error of each parameter of a run.
+    """Yield kind, error, standard error and its reach of each parameter of a run.
 
     Where all is found, bodies are drawn about the URDF's, by as much as they are taken to be
     unknown, and no gain is stated. Without torque, that of the speed is counted as friction.
@@ -634,12 +634,13 @@ def one_run(name, rng, seconds, *, finds_all=False, torque=False):
     loop = LoopSettings(**gains, groups={first: [first]}, delays="group")
     found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
     estimate = found.fitted.estimate
-    for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
+    found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    for key, theta, *said in found:
         joint, _, kind = key.rpartition(".")
         true = truth[key]
         if kind == "viscous" and finds_all and f"{joint}.kd" not in estimate.names:
             true += truth[f"{joint}.kd"]
-        yield kind, theta - true, said
+        yield kind, theta - true, *said
 
 
 def held_run(name, rng, seconds, *, bits):
@@ -659,8 +660,9 @@ def held_run(name, rng, seconds, *, bits):
     found = identify_commands(plant.model, [log], [], loop, settings, chooses=False)
     estimate, truth = found.fitted.estimate, plant.truth
     truth["robot.delay"] = plant.drives[0].delay
-    for theta, said, key in zip(estimate.theta, estimate.std_error, estimate.names, strict=True):
-        yield key.rpartition(".")[2], theta - truth[key], said
+    found = zip(estimate.names, estimate.theta, estimate.std_error, estimate.reach, strict=True)
+    for key, theta, *said in found:
+        yield key.rpartition(".")[2], theta - truth[key], *said
 
 
 def stiff(robot, step):

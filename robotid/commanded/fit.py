@@ -9,6 +9,7 @@ from robotid._typing import Array, ProgressCallback, ignore_progress, report_sta
 from robotid.commanded.drive_torques import find_gains, measured_motion
 from robotid.commanded.driven import identified_rows, torque_rows
 from robotid.commanded.errors import DRIFTS
+from robotid.commanded.gain_check import GainScale, gain_scale
 from robotid.commanded.second_order import SecondOrder, fit_second_order
 from robotid.commanded.settings import LoopSettings, groups_of
 from robotid.commanded.term_choice import Tried, candidates, choose
@@ -55,6 +56,8 @@ _WINDOW, _LEAD = 2.5, 0.6  # [s] of what follows commands, if not stated
 _BOTH = 2.0  # one torque's noise is in its rows and in what it drives: each counts by half
 _MOVED = 0.2  # of a standard error, that halving the steps may move a parameter
 _FINEST = 16.0  # times smaller steps at most
+_SETTLING = 4  # steps of parameters and starts of windows together, at most ...
+_RAISED = 1e-2  # ... none of which raises the logarithm of what remains by more than that
 _PASSES = 2  # of choosing terms and fitting again
 
 
@@ -69,6 +72,7 @@ class Fitted:
         encoders: How encoders stand to the URDF's joints.
         tried: Which terms were tried, and what they gained.
         linear: What the rows of torque tell by themselves, where the torque drives the robot.
+        scale: What bodies and torques show of stated gains; None where gains are found.
     """
 
     simulator: LoopSimulator
@@ -77,6 +81,7 @@ class Fitted:
     encoders: Encoders
     tried: tuple[Tried, ...]
     linear: Identification | None = None
+    scale: GainScale | None = None
 
     @property
     def loops(self) -> Loops:
@@ -157,9 +162,13 @@ def fit_loops(
             rows = torque_rows(identified_rows(own, logs, signals), begun.share)
             simulator = replace(simulator, torque=rows)
         estimate = estimator.fit(simulator, theta, exact=simulator.exact)
+    scale = None
     if begun.linear is None:
         simulator, estimate = refine_steps(simulator, estimator, estimate)
-    return Fitted(simulator, estimate, begun.plain, begun.encoders, tuple(tried), begun.linear)
+        if _is_stated(loop.kp, model).all() and simulator.error == "output":
+            scale = gain_scale(simulator, estimator, estimate)
+    chosen = (begun.encoders, tuple(tried), begun.linear, scale)
+    return Fitted(simulator, estimate, begun.plain, *chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,12 +301,42 @@ def refine_steps(
         if share <= _MOVED or 0.5 * step < finest:
             break
         step, now = 0.5 * step, half
-    if now is not simulator:
-        now = now.begun_better(theta)
-        estimate = estimator.fit(now, theta, exact=now.exact)
+    now, estimate = _settled(now, estimator, estimate)
     covariance = estimate.covariance + np.outer(change, change)
     details = {**estimate.details, "step": step, "halving": share}
     return now, replace(estimate, covariance=covariance, details=details)
+
+
+def _settled(
+    simulator: LoopSimulator, estimator: OutputError, estimate: Estimate
+) -> tuple[LoopSimulator, Estimate]:
+    """Return the estimate beside which the starts of windows fit best, and these windows.
+
+    Starts and steps of both together take turns until a step moves no parameter by more than 0.2
+    standard errors. Where such a step raises what remains, as it may from far away, or where
+    derivatives are not exact, it is a fit from the best starts.
+
+    Args:
+        simulator: What rolls out.
+        estimator: The estimator.
+        estimate: The estimate of earlier starts, or of larger steps.
+    """
+    if simulator.exact is not None:
+        simulator = simulator.begun_better(estimate.theta)
+        return simulator, estimator.fit(simulator, estimate.theta, exact=simulator.exact)
+    level, first = np.inf, estimate.theta
+    for _ in range(_SETTLING):
+        begun = simulator.begun_better(estimate.theta)
+        found = estimator.settle(begun, estimate)
+        before, level = level, float(np.mean(np.log(found.sigma)))
+        if level > before + _RAISED:
+            simulator = simulator.begun_better(first)
+            return simulator, estimator.fit(simulator, first)
+        change = np.abs(found.theta - estimate.theta)
+        simulator, estimate = begun, found
+        if (change <= _MOVED * found.std_error).all():
+            break
+    return simulator, estimate
 
 
 def _check_settings(

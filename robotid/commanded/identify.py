@@ -18,6 +18,7 @@ from robotid.commanded.unknowns import with_terms
 from robotid.commanded.zeros import CLEAR, parallel_axes
 from robotid.exceptions import DataError
 from robotid.findings import Finding, by_severity, listed
+from robotid.identification.bands import REACH
 from robotid.identification.settings import SimulationSettings
 from robotid.identification.verdict import Verdict, alarming
 from robotid.logs.data import Log
@@ -39,6 +40,7 @@ _STATED_SCALE = (
     "positions do not show the scale: all drive and inertial parameters scale with kp as stated "
     "(kp stated 20 % too large makes all 20 % too large); log a torque to test it"
 )
+_CAUTIONS = ("at_bound", "coarse_steps", "gains_contradicted")  # keep a result from being good
 _NAMED = 8  # parameters that a sentence names
 
 
@@ -80,6 +82,18 @@ class Commanded:
         return covariance
 
     @cached_property
+    def standard_reach(self) -> Array:
+        """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
+
+        The quantile is that of the unknown, of those it follows from, whose standard error has the
+        fewest degrees of freedom.
+        """
+        estimate = self.fitted.estimate
+        _, slopes = self.fitted.simulator.standard(self.model, estimate.theta)
+        reach: Array = np.where(slopes != 0.0, estimate.reach, REACH).max(axis=1, initial=REACH)
+        return reach
+
+    @cached_property
     def shrunk(self) -> Array:
         """How far the data shrink what each unknown may be, shape (c,): 1 not at all [-]."""
         estimate = self.fitted.estimate
@@ -114,7 +128,7 @@ class Commanded:
             is_kept=bool(self.kept),
             is_settled=self.fitted.estimate.converged,
             alarms=self.alarms,
-            cautions=[f.message for f in self.findings if f.code in ("at_bound", "coarse_steps")],
+            cautions=[f.message for f in self.findings if f.code in _CAUTIONS],
             scale=_STATED_SCALE if self.is_scaled_by_gain else "",
         )
 
@@ -267,6 +281,7 @@ def _findings(found: Commanded) -> Iterator[Finding]:
     yield from _torques_missed(found)
     if found.is_scaled_by_gain:
         yield Finding("scale", "note", "controller", _STATED_SCALE)
+    yield from _gains_contradicted(found)
     yield from _coarse_steps(estimate.details)
     yield from _at_bound(estimate.details["at_bound"])
     for told_names in found.told_together:
@@ -329,6 +344,27 @@ def _coarse_steps(details: Mapping[str, Any]) -> Iterator[Finding]:
             "standard errors. Set a smaller step under [estimator]",
             {"halving": halving},
         )
+
+
+def _gains_contradicted(found: Commanded) -> Iterator[Finding]:
+    """Yield that bodies or logged torques show other gains than those that were stated."""
+    scale, joints = found.fitted.scale, found.model.joints
+    if scale is None or not scale.is_wrong:
+        return
+    shows = "the logged torques" if found.fitted.simulator.knows_torques else "weight and inertia"
+    factor, error = 1.0 + scale.common, scale.common_error
+    kp = zip(joints, (factor * found.fitted.loops.kp).tolist(), strict=True)
+    agreeing = listed([f"{joint} = {value:.3g}" for joint, value in kp], _NAMED)
+    yield Finding(
+        "gains_contradicted",
+        "warning",
+        "controller",
+        f"{shows} show gains of {factor:.2f} +- {error:.2g} times those stated, wanted 1: "
+        f"kp would agree with {agreeing}, kd likewise. Compare kp and kd in [controller] with "
+        "those of the drives (units, gear), or the masses of the URDF; all drive parameters scale "
+        "with them",
+        {"scale": factor, "std_error": error},
+    )
 
 
 def _at_bound(names: Sequence[str]) -> Iterator[Finding]:

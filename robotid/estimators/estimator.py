@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from robotid._typing import Array
+from robotid.estimators.stretches import quantile
 from robotid.exceptions import DataError
 from robotid.pages.html import code, number, table
 from robotid.regressor.factors import Factors, compress
@@ -81,6 +82,15 @@ class Estimate:
         # exact data leave a variance of rounding size, of either sign
         errors: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return errors
+
+    @property
+    def reach(self) -> Array:
+        """How many standard errors a 95 % interval reaches, by Student's quantile, shape (c,).
+
+        ``details`` has the degrees of freedom, ``freedom``, of errors that a scatter told.
+        """
+        freedom = self.details.get("freedom", np.inf)
+        return quantile(np.broadcast_to(np.asarray(freedom, dtype=float), len(self.theta)))
 
     @property
     def _line(self) -> str:

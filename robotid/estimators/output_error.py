@@ -7,9 +7,9 @@ beside what drifts.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -23,6 +23,7 @@ from robotid.regressor.factors import Factors, triangle_of
 __all__ = ["OutputError", "Residual", "Simulator", "linearised"]
 
 _CAUTIOUS = 1e-3  # damping of a step, with which what nothing tells stays where it is
+_NEARLY_FREE = 1e-6  # the same of the last step, from near the minimum
 _STEPS = 25  # of the damped Gauss-Newton method in a round
 _ROUNDS = 5  # of whitening and noise levels ...
 _SETTLED = 2e-2  # ... until they change by less than that
@@ -32,7 +33,9 @@ _UPHILL = 1e-2  # relative increase that a step with inexact derivatives may cos
 _NEAR = 1e-2  # of a standard error, squared, that such a step ends at
 _MOST_RHO = 0.95  # beyond it, whitening takes away what stays: offsets and gains
 _NO_TRACE = 1e-3  # noise levels that a start moves a window by, below which it is no matter
-_STRETCHES = 96  # that the rows are cut into, to see how their scores scatter
+#: Rows are cut into so many stretches, to see how their scores scatter: few enough that each is
+#: longer than an encoder shows the same step while a joint turns back.
+_STRETCHES = 48
 _LOST = 1e-6  # share of its prior's variance, below which a direction's gain in knowledge is none
 
 
@@ -182,7 +185,10 @@ class OutputError:
             if rounds > 1 and converged and max(change, _rho_change(before, weights)) < _SETTLED:
                 break
             converged = False
-        return self._estimate(simulator, weights, theta, converged, count, rounds, exact)
+        state = "settled" if converged else "not settled"
+        message = f"{self.name}, {count} steps in {rounds} rounds, {state}"
+        how = {"converged": converged, "n_iter": count, "message": message}
+        return self._estimate(simulator, weights, theta, how, exact=exact)
 
     def weights(self, simulator: Simulator, theta: Array) -> "_Weights":
         """Return correlation and level of the residuals, which they are weighed by.
@@ -192,8 +198,10 @@ class OutputError:
             theta: Parameters, shape (c,).
         """
         found = simulator.residuals(theta, with_slopes=False, with_starts=self.frees)
-        if self.frees:
-            found = [replace(r, e=_freed(r)) for r in found]
+        return self._weigh([replace(r, e=_freed(r)) for r in found] if self.frees else found)
+
+    def _weigh(self, found: Sequence[Residual]) -> "_Weights":
+        """Return correlation and level of residuals."""
         n = 1 + max(int(r.joints.max()) for r in found)
         rho, sigma = np.zeros(n), np.ones(n)
         most = np.full(n, _MOST_RHO) if self.most is None else self.most
@@ -229,8 +237,23 @@ class OutputError:
             simulator: What rolls out.
             theta: Parameters that fit best with the starts as they are, shape (c,).
         """
-        H, g = self._normal(simulator, self.weights(simulator, theta), theta, frees=True)
+        H, g = self.normal(simulator, self.weights(simulator, theta), theta, frees=True)
         return _bounded_step(H, g, theta, simulator.lowest, _CAUTIOUS)
+
+    def settle(self, simulator: Simulator, estimate: Estimate) -> Estimate:
+        """Return the estimate after a step that moves it and the starts of windows together.
+
+        A fit with starts that stay ends where these bind it: they suit the noise as it was with
+        earlier parameters. The errors of an estimate are those of one whose starts are free.
+
+        Args:
+            simulator: What rolls out, from starts that suit the estimate.
+            estimate: As of ``fit``, with exact derivatives.
+        """
+        found = simulator.residuals(estimate.theta, with_slopes=True)
+        weights = self._weigh([replace(r, e=_freed(r)) for r in found])
+        how = {key: getattr(estimate, key) for key in ("converged", "n_iter", "message")}
+        return self._estimate(simulator, weights, estimate.theta, how, found=found)
 
     def moved(self, simulator: Simulator, other: Simulator, theta: Array) -> tuple[Array, Array]:
         """Return how far other residuals move the estimate, to first order, and its errors.
@@ -245,7 +268,9 @@ class OutputError:
             independent, both of shape (c,).
         """
         weights = self.weights(other, theta)
-        (H, g), (_, changed) = (self._normal(s, weights, theta) for s in (simulator, other))
+        (H, g), (_, changed) = (
+            self.normal(s, weights, theta, frees=True) for s in (simulator, other)
+        )
         free = theta > simulator.lowest
         scale = 1.0 / np.sqrt(np.diag(H)[free])
         inverse = scipy.linalg.pinvh(H[np.ix_(free, free)] * np.outer(scale, scale))
@@ -254,17 +279,18 @@ class OutputError:
         error[free] = scale * np.sqrt(np.diag(inverse))
         return change, error
 
-    def _normal(
+    def normal(
         self, simulator: Simulator, weights: _Weights, theta: Array, *, frees: bool = False
     ) -> tuple[Array, Array]:
-        """Return H = A'A and A'b of the linearised problem, prior included."""
-        tau = 1.0 / simulator.prior_std**2
-        H, g = np.diag(tau), tau * (simulator.prior - theta)
-        for A, b, columns in linearised(simulator, weights, theta, frees=frees):
-            H[np.ix_(columns, columns)] += A.T @ A
-            g[columns] += A.T @ b
-        A, b = simulator.rows(theta)
-        return H + A.T @ A, g + A.T @ b
+        """Return H = A'A and A'b of the linearised problem, prior included.
+
+        Args:
+            simulator: What rolls out.
+            weights: As of ``weights``.
+            theta: Parameters, shape (c,).
+            frees: Whether what starts of windows could do is taken out.
+        """
+        return _summed(simulator, theta, linearised(simulator, weights, theta, frees=frees))
 
     def _descend(
         self,
@@ -286,7 +312,7 @@ class OutputError:
         highest = 1.0 if is_exact else 1.0 + _UPHILL
         for step in range(1, self.steps + 1):
             self.progress("fitting loops", step, self.steps, "steps")
-            H, g = self._normal(simulator, weights, theta, frees=self.frees)
+            H, g = self.normal(simulator, weights, theta, frees=self.frees)
             while True:
                 trial = _bounded_step(H, g, theta, simulator.lowest, damping)
                 new = self._cost(simulator, weights, trial)
@@ -307,27 +333,37 @@ class OutputError:
         simulator: Simulator,
         weights: _Weights,
         theta: Array,
-        converged: bool,
-        steps: int,
-        rounds: int,
-        exact: Simulator | None,
+        how: Mapping[str, Any],
+        *,
+        exact: Simulator | None = None,
+        found: Sequence[Residual] | None = None,
     ) -> Estimate:
-        """Return the estimate, its errors from how much the scores of stretches scatter."""
-        H, _ = self._normal(simulator, weights, theta, frees=True)
-        known = 1.0 / simulator.prior_std**2
-        scale = 1.0 / np.sqrt(np.diag(H))
-        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-        bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
-        rows = sum(r.e.size for r in simulator.residuals(theta, with_slopes=False))
+        """Return the estimate, its errors from how much the scores of stretches scatter.
+
+        With residuals found, it is that after a step of parameters and starts together.
+        """
+        moves = found is not None
+        if found is None:
+            found = simulator.residuals(theta, with_slopes=True)
+        parts = list(_whitened(found, weights, frees=True))
+        rows = sum(r.e.size for r in found)
         if rows < len(theta):
             raise DataError(
                 f"{rows} samples of position for {len(theta)} parameters; record a longer motion"
             )
-        stretches = _stretches(simulator, weights, theta, are_windows=self.frees)
+        H, g = _summed(simulator, theta, parts)
+        change = np.zeros_like(theta)
+        if moves:
+            change = _bounded_step(H, g, theta, simulator.lowest, _NEARLY_FREE) - theta
+        known = 1.0 / simulator.prior_std**2
+        scale = 1.0 / np.sqrt(np.diag(H))
+        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+        bread = (vectors / np.maximum(values, 1e-13)) @ vectors.T * np.outer(scale, scale)
+        stretches = _stretches(parts, len(theta), are_windows=self.frees)
         meat, inflation, freedom = H - np.diag(known), 1.0, np.full(len(theta), np.inf)
         if len(stretches) >= FEWEST_STRETCHES:
-            found = scatter(stretches, np.zeros(len(theta)), np.ones(1), bread)
-            meat, inflation, freedom = found.meat, found.inflation, found.freedom()
+            seen = scatter(stretches, change, np.ones(1), bread)
+            meat, inflation, freedom = seen.meat, seen.inflation, seen.freedom()
             further = simulator.rows(theta)[0]
             meat = meat + further.T @ further
         left = 0.0
@@ -335,41 +371,53 @@ class OutputError:
             C = _cross(simulator, exact, weights, theta) + np.diag(known)
             left = float(np.abs(np.linalg.eigvals(np.eye(len(theta)) - bread @ C)).max())
             bread = np.linalg.inv(C)
-        covariance = bread @ (meat + np.diag(known)) @ bread.T
         # never better known than independent rows would make it
         independent = np.diag(bread @ H @ bread.T)
-        spread = np.sqrt(np.maximum(np.diag(covariance), independent))
-        correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
-        covariance = correlation * np.outer(spread, spread)
         gained = 1.0 - independent * known  # of each parameter's prior variance
         undetermined = tuple(
             name for name, share in zip(simulator.names, gained, strict=True) if share < _LOST
         )
-        state = "settled" if converged else "not settled"
+        theta = theta + change
+        is_low = theta <= simulator.lowest
         return Estimate(
             theta=theta,
-            covariance=covariance,
+            covariance=_at_least(bread @ (meat + np.diag(known)) @ bread.T, independent),
             names=simulator.names,
             sigma=weights.sigma / np.sqrt(self.inflation),
             rank=len(theta) - len(undetermined),
             condition=float(np.sqrt(values[-1] / max(values[0], 1e-300))),
             undetermined=undetermined,
-            converged=converged and left < 1.0,
-            n_iter=steps,
-            message=f"{self.name}, {steps} steps in {rounds} rounds, {state}",
             prior_std=simulator.prior_std,
             details={
                 "correlation": weights.rho,
                 "inflation": inflation * self.inflation,
                 "freedom": freedom,
                 "left": left,
-                "at_bound": tuple(
-                    name
-                    for name, x, low in zip(simulator.names, theta, simulator.lowest, strict=True)
-                    if x <= low
-                ),
+                "at_bound": tuple(np.array(simulator.names)[is_low].tolist()),
             },
+            **{**how, "converged": how["converged"] and left < 1.0},
         )
+
+
+def _at_least(covariance: Array, variance: Array) -> Array:
+    """Return a covariance with variances of at least some size, correlations as they are."""
+    own = np.sqrt(np.diag(covariance))
+    wider = np.maximum(own, np.sqrt(variance)) / own
+    grown: Array = covariance * np.outer(wider, wider)
+    return grown
+
+
+def _summed(
+    simulator: Simulator, theta: Array, parts: Iterable[tuple[Array, Array, Array]]
+) -> tuple[Array, Array]:
+    """Return H = A'A and A'b of linearised rows, further ones and the prior included."""
+    tau = 1.0 / simulator.prior_std**2
+    H, g = np.diag(tau), tau * (simulator.prior - theta)
+    for A, b, columns in parts:
+        H[np.ix_(columns, columns)] += A.T @ A
+        g[columns] += A.T @ b
+    A, b = simulator.rows(theta)
+    return H + A.T @ A, g + A.T @ b
 
 
 def _squares(arrays: Iterable[Array]) -> float:
@@ -391,7 +439,14 @@ def linearised(
         theta: Parameters, shape (c,).
         frees: Whether what the start of a window could do is taken out of its rows.
     """
-    for r in simulator.residuals(theta, with_slopes=True):
+    yield from _whitened(simulator.residuals(theta, with_slopes=True), weights, frees=frees)
+
+
+def _whitened(
+    found: Iterable[Residual], weights: _Weights, *, frees: bool
+) -> Iterable[tuple[Array, Array, Array]]:
+    """Yield the whitened rows of residuals; see ``linearised``."""
+    for r in found:
         b = weights.whiten(r.e, r.joints)
         A = weights.whiten(_given(r), r.joints).reshape(b.size, -1)
         b = b.reshape(-1)
@@ -456,15 +511,14 @@ def _bounded_step(H: Array, g: Array, theta: Array, lowest: Array, damping: floa
 
 
 def _stretches(
-    simulator: Simulator, weights: _Weights, theta: Array, *, are_windows: bool
+    found: Sequence[tuple[Array, Array, Array]], c: int, *, are_windows: bool
 ) -> list[Factors]:
-    """Return the factors of the whitened rows, stretch by stretch.
+    """Return the factors of the whitened rows of c parameters, stretch by stretch.
 
     Windows in which nothing takes back what drifts are stretches as they are: what is wrong early
     stays until their end.
     """
-    found = list(linearised(simulator, weights, theta, frees=True))
-    c, total = len(theta), sum(len(b) for _, b, _ in found)
+    total = sum(len(b) for _, b, _ in found)
     stretches: list[Factors] = []
     for A, b, columns in found:
         cuts = max(1, round(_STRETCHES * len(b) / total))

@@ -83,17 +83,18 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
     """
     layout, sources = found.model.layout, found.sources
     errors, covariance = found.standard_error, found.standard_covariance
+    reach = found.standard_reach
     drives: dict[str, dict[str, Any]] = {drive.name: {} for drive in layout.drives}
     for k, (d, term) in enumerate(layout.drive_parameters, start=layout.n_inertial):
         name, least = layout.drives[d].name, 0.0 if term.is_nonnegative else -math.inf
         source = "bound" if found.at_bound[k] else sources[k]
         drives[name][layout.names[k].removeprefix(f"{name}.")] = _range(
-            found.standard[k], errors[k], source, least=least
+            found.standard[k], errors[k], source, least=least, reach=float(reach[k])
         ) | {"unit": layout.units[k]}
     return {
         "robot": found.model.name,
         "confidence": 0.95,
-        "bodies": body_ranges(found.model, found.standard, covariance, sources),
+        "bodies": body_ranges(found.model, found.standard, covariance, sources, reach),
         "drives": drives,
         **projected_ranges(found),
         "undetermined": list(found.determination.undetermined),
@@ -101,7 +102,7 @@ def parameter_ranges(found: Identification) -> dict[str, Any]:
 
 
 def body_ranges(
-    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str]
+    model: RobotModel, standard: Array, covariance: Array, sources: Sequence[str], reach: Array
 ) -> dict[str, dict[str, Any]]:
     """Return the ranges of links, without ends where a link was not identified.
 
@@ -110,6 +111,7 @@ def body_ranges(
         standard: Standard parameters, shape (p,), SI units.
         covariance: Of them, shape (p, p); 0 of what was not identified.
         sources: What determined each.
+        reach: How many standard errors the interval of each reaches, shape (p,).
 
     Raises:
         ModelError: If a link or a drive would be physically impossible.
@@ -117,7 +119,9 @@ def body_ranges(
     own, bodies = link_parameters(model, standard), {}
     for i, body in enumerate(model.layout.bodies):
         part = slice(10 * i, 10 * i + 10)
-        bodies[body] = _body(own[body], covariance[part, part], sources[part])
+        bodies[body] = _body(
+            own[body], covariance[part, part], sources[part], float(reach[part].max())
+        )
     return bodies
 
 
@@ -136,8 +140,11 @@ def projected_ranges(found: Identification) -> dict[str, Any]:
     for drive in drives:
         C = found.standard_covariance[np.ix_(drive.own, drive.own)]
         errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
+        reach = float(found.standard_reach[drive.own].max())
         ranges[drive.name] = {
-            term: _range(value, error, "data", least=0.0 if term in _NOT_NEGATIVE else -math.inf)
+            term: _range(
+                value, error, "data", reach=reach, least=0.0 if term in _NOT_NEGATIVE else -math.inf
+            )
             for (term, value), error in zip(drive.values.items(), errors, strict=True)
             if error > 0
         }
@@ -162,6 +169,7 @@ def stated_ranges(content: Mapping[str, Any]) -> dict[str, Any]:
             math.inf if error is None else error,
             _source(entry),
             is_positive=term == "kp",
+            reach=entry.get("reach") or REACH,
             least=0.0 if term in _NOT_NEGATIVE else -math.inf,
         )
         drives.setdefault(drive, {})[term] = ends | {"unit": entry["unit"]}
@@ -198,7 +206,7 @@ def ranges_text(ranges: Mapping[str, Any]) -> str:
     return yaml_text(ranges, head)
 
 
-def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any]:
+def _body(pi: Array, covariance: Array, sources: Sequence[str], reach: float) -> dict[str, Any]:
     """Return the ranges of a link of ten parameters, shape (10,), with covariance (10, 10)."""
     m, c = pi[0], pi[1:4] / pi[0]
     moments, V = principal_moments(pi)
@@ -215,7 +223,7 @@ def _body(pi: Array, covariance: Array, sources: Sequence[str]) -> dict[str, Any
     origins += [_joint_source(sources)] * 6
     x, y, z, w = Rotation.from_matrix(V).as_quat()
     mass, *rest = (
-        _range(value, error, origin, is_positive=not 1 <= k <= 3)
+        _range(value, error, origin, is_positive=not 1 <= k <= 3, reach=reach)
         for k, (value, error, origin) in enumerate(zip(values, errors, origins, strict=True))
     )
     return {
@@ -239,10 +247,16 @@ def _source(entry: Mapping[str, Any]) -> str:
 
 
 def _range(
-    value: float, error: float, source: str, *, is_positive: bool = False, least: float = -math.inf
+    value: float,
+    error: float,
+    source: str,
+    *,
+    is_positive: bool = False,
+    least: float = -math.inf,
+    reach: float = REACH,
 ) -> dict[str, Any]:
     """Return the range of a figure; without ends if its standard error is not known."""
-    nominal, half = float(value), REACH * float(error)
+    nominal, half = float(value), reach * float(error)
     if not math.isfinite(half):
         return {"nominal": nominal, "source": source}
     low = nominal * math.exp(-half / nominal) if is_positive else max(nominal - half, least)

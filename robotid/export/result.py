@@ -265,11 +265,13 @@ def _commanded_standard(found: Commanded) -> list[dict[str, Any]]:
     """Return the entries of all standard parameters, drives last."""
     layout, prior = found.model.layout, found.model.standard_parameters()
     errors = np.sqrt(np.maximum(np.diag(found.standard_covariance), 0.0))
+    reach = found.standard_reach.tolist()
     return [
         {
             "name": name,
             "value": float(found.standard[i]),
             "std_error": float(errors[i]) if errors[i] > 0 else None,
+            "reach": reach[i] if errors[i] > 0 else None,
             "unit": layout.units[i],
             "prior": float(prior[i]),
             "source": _source_of(found, name, errors[i]),
@@ -306,7 +308,9 @@ def _commanded_ranges(
     return {
         "robot": found.model.name,
         "confidence": 0.95,
-        "bodies": body_ranges(found.model, found.standard, covariance, sources),
+        "bodies": body_ranges(
+            found.model, found.standard, covariance, sources, found.standard_reach
+        ),
         "drives": {},
         "undetermined": [
             *(name for name, i, variance in kept if i < size and not variance > 0),
@@ -360,10 +364,12 @@ def _loop_parameters(found: Commanded) -> list[dict[str, Any]]:
     """Return gains, delay, limit and zero of each joint, those that were stated without error."""
     if found.loop.kind == "torque":
         return []
-    loops, simulator = found.fitted.loops, found.fitted.simulator
+    loops, estimate = found.fitted.loops, found.fitted.estimate
     errors = {
-        (unknown.what, j): float(error)
-        for unknown, error in zip(simulator.unknowns, found.fitted.estimate.std_error, strict=True)
+        (unknown.what, j): (float(error), float(reach))
+        for unknown, error, reach in zip(
+            found.fitted.simulator.unknowns, estimate.std_error, estimate.reach, strict=True
+        )
         for j in unknown.joints
     }
     entries = []
@@ -376,9 +382,10 @@ def _loop_parameters(found: Commanded) -> list[dict[str, Any]]:
         for what, unit in units.items():
             value = float(getattr(loops, what)[j])
             if math.isfinite(value):
-                error = errors.get((what, j))
+                error, reach = errors.get((what, j), (None, None))
                 entries.append(
                     {"name": f"{joint.name}.{what}", "value": value, "std_error": error,
+                     "reach": reach,
                      "unit": unit, "source": "stated" if error is None else "data"}
                 )  # fmt: skip
     return entries

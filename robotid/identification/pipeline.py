@@ -462,14 +462,23 @@ class Identification:
         return tuple(names.tolist())
 
     @property
-    def standard_interval(self) -> Array:
-        """95 % interval of each standard parameter, shape (p, 2), by the prior; infinite at bounds.
+    def standard_reach(self) -> Array:
+        """How many standard errors the 95 % interval of each standard parameter reaches, (p,).
 
         The quantile is that of the base parameter, of those it is part of, whose standard error has
         the fewest degrees of freedom.
         """
         own = np.where(self.mapping.K != 0.0, self.errors.reach[:, None], REACH)  # (b, p)
-        half = own.max(axis=0) * self.standard_error
+        reach: Array = own.max(axis=0)
+        return reach
+
+    @property
+    def standard_interval(self) -> Array:
+        """95 % interval of each standard parameter, shape (p, 2), by the prior; infinite at bounds.
+
+        It reaches as far as ``standard_reach`` says.
+        """
+        half = self.standard_reach * self.standard_error
         return np.column_stack([self.standard - half, self.standard + half])
 
     @property

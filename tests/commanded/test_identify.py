@@ -221,6 +221,25 @@ def test_a_stated_gain_is_named_as_what_the_scale_rests_on(found):
     assert found.verdict.reasons[-1] == scale.message
 
 
+def test_stated_gains_that_the_bodies_contradict_are_named(leg, found):
+    robot, log, kept = leg
+    assert not [f for f in found.findings if f.code == "gains_contradicted"]
+    scale = found.fitted.scale
+    assert (np.abs(scale.change) < 4.0 * scale.error).all()
+    assert abs(scale.common) < 4.0 * scale.common_error < 0.05
+    gains = {k: {d.joint: 1.25 * getattr(d, k) for d in robot.drives} for k in ("kp", "kd")}
+    wrong = stated(robot, **gains)
+    other = identify_commands(robot.model, [log], [kept], wrong, SETTINGS, chooses=False)
+    [named] = [f for f in other.findings if f.code == "gains_contradicted"]
+    assert named.severity == "warning"
+    assert named.where == "controller"
+    assert named.evidence["scale"] == pytest.approx(0.8, abs=0.08)
+    kp = 1.25 * robot.drives[0].kp * named.evidence["scale"]
+    assert f"{robot.drives[0].joint} = {kp:.3g}" in named.message
+    assert other.verdict.status != "good"
+    assert named.message in other.verdict.reasons
+
+
 def test_a_slow_command_does_not_contradict_the_delay_that_was_found(leg, found):
     robot, log, _ = leg
     evidence = {"frequency": 2.0, "shortest": 0.0, "longest": 0.09}

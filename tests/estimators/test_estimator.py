@@ -1,6 +1,7 @@
 """What an estimate shows of itself, and what estimators say of themselves."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,6 +25,12 @@ ESTIMATE = Estimate(
 
 def test_each_parameter_has_its_own_error():
     np.testing.assert_array_equal(ESTIMATE.std_error, ERROR)
+
+
+def test_intervals_reach_students_quantile():
+    np.testing.assert_allclose(ESTIMATE.reach, 1.959964, rtol=1e-6)
+    few = replace(ESTIMATE, details={"freedom": np.array([12.0, 4.0, np.inf])})
+    np.testing.assert_allclose(few.reach, [2.178813, 2.776445, 1.959964], rtol=1e-6)
 
 
 def test_text_states_value_and_error_of_each_parameter():

@@ -283,6 +283,26 @@ def test_what_a_window_starts_with_changes_nothing_where_starts_are_free(rng):
     assert np.abs(held.theta - exact.theta).max() > 1e-3
 
 
+def test_a_step_of_parameters_and_starts_together_settles_what_held_starts_bind(rng):
+    lag = lagging(rng)
+    fades = 0.97 ** np.arange(lag.told.shape[1])
+    off = lag.measured + rng.standard_normal((len(lag.told), 1)) * fades
+    simulator = Started(**{**vars(lag), "measured": off})
+    exact = OutputError(frees=True).fit(simulator, START)
+    held = OutputError().fit(simulator, START)
+    assert (np.abs(held.theta - exact.theta) > 0.5 * exact.std_error).any()
+    settled = OutputError().settle(simulator, held)
+    assert np.abs((settled.theta - exact.theta) / exact.std_error).max() < 0.02
+    np.testing.assert_allclose(settled.sigma, exact.sigma, rtol=5e-3)
+    near = OutputError().settle(simulator, exact)
+    np.testing.assert_allclose(settled.std_error, near.std_error, rtol=0.02)
+    assert (settled.n_iter, settled.message) == (held.n_iter, held.message)
+    low = replace(simulator, lowest=np.array([-np.inf, -np.inf, 0.2]))
+    settled = OutputError().settle(low, replace(held, theta=np.array([1.5, 0.3, 0.2001])))
+    assert settled.theta[2] == 0.2
+    assert settled.details["at_bound"] == ("offset",)
+
+
 def test_residuals_of_larger_variance_count_less_beside_further_rows(rng):
     lag = lagging(rng)
     row = np.array([[30.0, 0.0, 0.0, 30.0 * 1.6]])  # says 1.6 of the gain, which is 1.5
