@@ -411,13 +411,29 @@ _CAUSES = {
 #: What names a cause but has nothing to type: its message says what to do.
 _AS_FOUND = (
     "angle_scale",
+    "bound_binds",
+    "com_outside",
+    "constant_torque",
+    "density",
     "drift",
     "gravity",
+    "gravity_compensated",
+    "gyration",
     "held_torque",
+    "joint_axis",
+    "joint_order",
     "joint_origin",
+    "joint_torque_delay",
+    "mass_matrix",
     "payload",
+    "position_order",
+    "position_sign",
+    "solvers_differ",
     "time_scale",
+    "torque_order",
+    "torque_sign",
     "unmounted_part",
+    "unsigned_torque",
 )
 #: Codes that name what is wrong with a joint, and those that only say that something is.
 _NAMED_CAUSES = (*_CAUSES, *_AS_FOUND, "clipped", "payload_change", "position_offset")

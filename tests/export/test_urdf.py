@@ -447,7 +447,7 @@ def test_every_kind_of_robot_survives_the_round_trip(ur5, panda, tmp_path, rng):
 
 def test_a_real_robot_with_locked_joints_survives_the_round_trip(recordings, tmp_path, rng):
     arm = [f"arm_{i}_joint" for i in range(1, 8)]
-    path = recordings / "tiago" / "robot.urdf"
+    path = recordings / "tiago" / "robot_hey5.urdf"
     model = RobotModel.from_urdf(path, joints=arm, locked={"torso_lift_joint": 0.2})
     pi = possible_parameters(model, rng)
     sidecar = write_urdf(model, pi, tmp_path / "tiago.urdf")

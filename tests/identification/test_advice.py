@@ -14,6 +14,7 @@ from robotid.findings import Finding
 from robotid.identification.advice import Origin, next_steps
 from robotid.identification.candidates import CANDIDATES, JointMotion, couplings, ripples
 from robotid.identification.misfit import Misfit, misfit_findings, setting_of
+from robotid.identification.verdict import DOUBTFUL
 from robotid.robot.examples import example_urdf
 
 JOB = Origin(("my job.toml",), "out")
@@ -230,6 +231,17 @@ def test_a_setting_is_a_line_of_the_job_file_or_a_flag(identified, code, evidenc
         table,
         "robotid identify 'my job.toml' --out out",
     )
+
+
+@pytest.mark.parametrize("code", sorted({*DOUBTFUL, "payload"} - {"total_mass"}))
+def test_whatever_leaves_a_result_in_doubt_has_a_step(identified, code):
+    """Findings whose remedy is no setting are said again in their own words."""
+    calm = {step.words for step in next_steps(told(identified), JOB)}
+    found = told(identified, warning(code, delay=0.01, size=0.1, mass=1.0))
+    own = [step for step in next_steps(found, JOB) if step.words not in calm]
+    assert own, code
+    if code in ("joint_torque_delay", "joint_axis", "torque_sign"):
+        assert own[0].words == f"{code.capitalize()} is so; do something."
 
 
 def test_what_two_steps_ask_to_be_typed_is_typed_last(identified):
