@@ -10,11 +10,8 @@ from robotid.commands.job import Job, LogEntry
 from robotid.commands.logs import job_of_result, survey_logs
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
-from robotid.identification.drive_choice import wanted_families
-from robotid.identification.payload_fit import fit_payloads
-from robotid.identification.pipeline import with_drives
+from robotid.identification.payload_fit import fit_payloads, own_friction
 from robotid.identification.recordings import Recordings
-from robotid.identification.settings import ConsistentSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.drives import DriveTerm
 from robotid.robot.model import RobotModel
@@ -118,9 +115,4 @@ def _chosen_terms(
     if not any(job.friction.values()):
         return {}
     (surveyed,) = survey_logs(job, model, entries)
-    reference = Recordings(model, structural_mapping(model), surveyed)
-    # which friction there is asks for no shape of bodies, and a quadratic fit always settles
-    choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
-    return with_drives(
-        reference, choice, wanted_families(job.friction, model.joints)
-    ).model.layout.own
+    return own_friction(Recordings(model, structural_mapping(model), surveyed), job.friction)

@@ -81,8 +81,9 @@ class TwoRuns:
     def compare(self) -> Compared:
         """Fit both runs at once, and the unknown gains with them.
 
-        Standard errors come from the scatter of the stretches' scores, and are at least those of
-        rows that are independent by ``share``; of fewer than 12 stretches, they are these.
+        Standard errors come from the scatter of the scores of stretches and of joints, and are at
+        least those of rows that are independent by ``share``; of fewer than 12 stretches, they are
+        these.
 
         Raises:
             NotConvergedError: If the gains do not settle.
@@ -258,19 +259,44 @@ class TwoRuns:
     def _errors(
         self, gain: Array, at: Array | None, solution: Array, bread: Array
     ) -> tuple[Array, Array]:
-        """Return covariance and degrees of freedom; the prior adds its own uncertainty."""
+        """Return covariance and degrees of freedom; the prior adds its own uncertainty.
+
+        Scores are compared stretch by stretch, which shows what changes with time, and joint by
+        joint of each run, which shows what does not: a gain, friction of the day. Of a parameter
+        the larger error counts. Few parts scatter less than they should by chance: it is never
+        less than noise would make it.
+        """
         if len(self.reference) + len(self.loaded) < FEWEST_STRETCHES:
             return bread, np.full(len(solution), np.inf)
-        runs = enumerate((self.reference, self.loaded))
+        runs = list(enumerate((self.reference, self.loaded)))
         stretches = [self._extended(f, loaded, gain, at) for loaded, run in runs for f in run]
-        sigma, apart = np.abs(gain) * self._noise, self.share * bread
-        found = scatter(stretches, solution, sigma, apart)
-        meat, size = self.share**2 * found.meat, len(self.mean)
-        meat[:size, :size] += self.precision
-        covariance = bread @ meat @ bread
-        # few stretches scatter less than they should by chance: never less than noise would
+        covariance, freedom = self._scattered(stretches, gain, solution, bread)
+        whole = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
+        joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
+        if len(joints) >= FEWEST_STRETCHES:
+            other, few = self._scattered(joints, gain, solution, bread)
+            grown = np.sqrt(np.maximum(np.diag(other) / np.diag(covariance), 1.0))
+            covariance = covariance * np.outer(grown, grown)
+            freedom = np.where(grown > 1.0, few, freedom)
         short = np.sqrt(np.maximum(np.diag(bread) / np.diag(covariance), 1.0))
-        return covariance * np.outer(short, short), replace(found, bread=apart).freedom()
+        return covariance * np.outer(short, short), freedom
+
+    def _scattered(
+        self, parts: Sequence[Factors], gain: Array, solution: Array, bread: Array
+    ) -> tuple[Array, Array]:
+        """Return covariance and degrees of freedom by the scores of some parts of the rows."""
+        apart, size = self.share * bread, len(self.mean)
+        found = scatter(parts, solution, np.abs(gain) * self._noise, apart)
+        meat = self.share**2 * found.meat
+        meat[:size, :size] += self.precision
+        return bread @ meat @ bread, replace(found, bread=apart).freedom()
+
+
+def _of_joint(factors: Factors, joint: int) -> Factors:
+    """Return the rows of one joint alone."""
+    triangles = [R if j == joint else 0.0 * R for j, R in enumerate(factors.triangles)]
+    rows = np.where(np.arange(len(factors.rows)) == joint, factors.rows, 0)
+    return replace(factors, triangles=tuple(triangles), rows=rows)
 
 
 def payload_runs(

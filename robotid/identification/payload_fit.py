@@ -1,7 +1,7 @@
 """What hangs on a link: a run with it against a run without, and gains from a known mass."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +14,31 @@ from robotid.estimators.stretches import quantile
 from robotid.estimators.two_runs import Compared, TwoRuns, payload_runs
 from robotid.exceptions import DataError, NotConvergedError, SettingsError
 from robotid.findings import listed
-from robotid.identification.pipeline import robot_of
+from robotid.identification.drive_choice import wanted_families
+from robotid.identification.pipeline import robot_of, with_drives
 from robotid.identification.recordings import Recordings
+from robotid.identification.settings import ConsistentSettings
 from robotid.identification.survey import hold_log
 from robotid.logs.read import Readable, read_logs
 from robotid.logs.settings import SignalSettings
 from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.factors import join
 from robotid.robot.bodies import link_transfer
+from robotid.robot.drives import AUTO, DriveTerm
 from robotid.robot.model import RobotModel
 from robotid.robot.parameters import (
     ParameterLayout,
 )
 from robotid.robot.prior import payload_spread, prior_spread
 
-__all__ = ["Gain", "Payload", "PayloadFit", "fit_payloads", "identify_payload"]
+__all__ = [
+    "Gain",
+    "Payload",
+    "PayloadFit",
+    "fit_payloads",
+    "identify_payload",
+    "own_friction",
+]
 
 _SURE = 3.0  # standard errors that a mass has at least
 _MASS = 0.3  # largest standard error of a mass that counts as determined, of that mass,
@@ -207,6 +217,7 @@ def identify_payload(
     masses: Mapping[str, float] | None = None,
     unknown_gains: Sequence[str] = (),
     signals: SignalSettings | None = None,
+    friction: str | Mapping[str, str] = AUTO,
 ) -> PayloadFit:
     """Identify what hangs on links in some logs and not in others.
 
@@ -223,6 +234,8 @@ def identify_payload(
         unknown_gains: Joints whose ``tau`` in the logs is a current of unknown gain. A known mass,
             or a joint whose gain is known, sets their scale.
         signals: How logs become trajectories; the defaults if None.
+        friction: Friction beside the model's, as of ``identify``; what is to be chosen is chosen on
+            the reference.
 
     Returns:
         The payloads, each with intervals, physically possible, and the gains.
@@ -242,12 +255,14 @@ def identify_payload(
         require_kind(value, kinds, name, wanted)
     model = robot_of(model, logs)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
+    wanted_families(friction, model.joints)
+    read = [
+        read_logs(given, model.joints, prismatic=model.layout.prismatic)
+        for given in (logs, reference)
+    ]
     loaded, without = (
         Recordings(model, mapping, [hold_log(model, log, settings) for log in some])
-        for some in (
-            read_logs(given, model.joints, prismatic=model.layout.prismatic)
-            for given in (logs, reference)
-        )
+        for some in read
     )
     for what, runs in (("logs", loaded), ("reference", without)):
         if not runs.fitted:
@@ -256,9 +271,41 @@ def identify_payload(
                 "without it"
             )
     links = tuple(links) or model.layout.bodies[-1:]
-    return fit_payloads(
-        loaded, without, links=links, masses=masses or {}, unknown_gains=unknown_gains
-    )
+
+    def fitted(runs: Sequence[Recordings]) -> PayloadFit:
+        return fit_payloads(*runs, links=links, masses=masses or {}, unknown_gains=unknown_gains)
+
+    found = fitted((loaded, without))
+    gain = np.array([found.gains[j].value if j in found.gains else 1.0 for j in model.joints])
+    judged = without
+    if found.gains:  # friction is a torque, not a current
+        torques = [replace(log, tau=gain * log.tau) for log in read[1]]
+        judged = replace(without, fitted=[hold_log(model, log, settings) for log in torques])
+    own = own_friction(judged, friction)
+    if not own:
+        return found
+    return fitted([run.with_model(model.with_terms(own)) for run in (loaded, without)])
+
+
+def own_friction(
+    reference: Recordings, friction: str | Mapping[str, str]
+) -> Mapping[str, tuple[DriveTerm, ...]]:
+    """Return the terms of friction that a reference has beside the model's, by drive.
+
+    Args:
+        reference: Recordings without payloads, torques in N m or N.
+        friction: As of ``identify``.
+
+    Raises:
+        DataError, NotConvergedError, RankDeficientError: As of ``identify``.
+        SettingsError: If a name or a joint is unknown.
+    """
+    wanted = wanted_families(friction, reference.model.joints)
+    if all(names == () for names in wanted.values()):
+        return {}
+    # which friction there is asks for no shape of bodies, and a quadratic fit always settles
+    choice = ConsistentSettings(prior="euclidean", prior_weight=1.0, draws=0)
+    return with_drives(reference, choice, wanted).model.layout.own
 
 
 def fit_payloads(

@@ -1,6 +1,7 @@
 """Payloads by the difference of two runs; the true torques come from RNEA of a model with it."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +19,9 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.regressor.torque import joint_torque_regressor
 from robotid.robot.drives import FAMILIES
 from robotid.robot.examples import example_urdf
+
+#: Friction is chosen where the test is about that.
+with_known_friction = partial(identify_payload, friction="viscous+coulomb")
 
 EXACT = SignalSettings(cutoff=None, trim=0.0, min_velocity=0.0)
 MASS, COM = 2.0, np.array([0.02, 0.03, 0.08])
@@ -64,7 +68,7 @@ def recorded(model, rng, links=("tool0",), noise=None, samples=1200, friction=1.
 
 def test_a_payload_on_a_link_that_is_fixed_to_a_moving_one_is_exact(ur5, rng):
     log, without = recorded(ur5, rng, links=["tool0"], friction=1.3)
-    payload = identify_payload(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
+    payload = with_known_friction(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
     assert payload.mass == pytest.approx(MASS, rel=1e-6)
     np.testing.assert_allclose(payload.com, COM, rtol=1e-5)
     np.testing.assert_allclose(payload.inertia, INERTIA, atol=1e-6)
@@ -72,7 +76,7 @@ def test_a_payload_on_a_link_that_is_fixed_to_a_moving_one_is_exact(ur5, rng):
     np.testing.assert_allclose(payload.inertia_at_link, at_link, atol=1e-6)
     assert payload.determined == ("mass", "com", "inertia")
     urdf = example_urdf("ur5_robot.urdf")
-    found = identify_payload(urdf, [log], [without], links=["tool0"], signals=EXACT)
+    found = with_known_friction(urdf, [log], [without], links=["tool0"], signals=EXACT)
     assert found["tool0"].mass == payload.mass
     said = str(found).splitlines()
     low, high = payload.mass_interval
@@ -90,7 +94,7 @@ def test_a_payload_on_a_link_that_is_fixed_to_a_moving_one_is_exact(ur5, rng):
 def test_two_payloads_at_once(panda, rng):
     links = ["panda_link5", "panda_hand"]
     log, without = recorded(panda, rng, links=links, mass=1.5)
-    found = identify_payload(panda, [log], [without], links=links, signals=EXACT)
+    found = with_known_friction(panda, [log], [without], links=links, signals=EXACT)
     assert [p.link for p in found.payloads] == links
     for payload in found.payloads:
         assert payload.mass == pytest.approx(1.5, rel=1e-6)
@@ -100,7 +104,9 @@ def test_two_payloads_at_once(panda, rng):
 def test_a_known_mass_is_kept_and_makes_the_rest_surer(ur5, rng):
     logs = recorded(ur5, rng, noise=LEVEL)
     free, known = (
-        identify_payload(ur5, logs[:1], logs[1:], links=["tool0"], masses=m, signals=EXACT)["tool0"]
+        with_known_friction(ur5, logs[:1], logs[1:], links=["tool0"], masses=m, signals=EXACT)[
+            "tool0"
+        ]
         for m in ({}, {"tool0": MASS})
     )
     assert (known.mass, known.mass_std_error) == (MASS, 0.0)
@@ -113,11 +119,11 @@ def test_intervals_hold_the_truth_of_payload_gains_and_robot(ur5):
     outside = []
     for seed in range(3):
         log, without = recorded(ur5, np.random.default_rng(seed), noise=LEVEL, friction=1.2)
-        free = identify_payload(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
+        free = with_known_friction(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
         low, high = free.mass_interval
         outside.append(not low < MASS < high)
         log, without = (replace(x, tau=x.tau / GAINS) for x in (log, without))
-        found = identify_payload(
+        found = with_known_friction(
             ur5, [log], [without], links=["tool0"], masses={"tool0": MASS},
             unknown_gains=ur5.joints, signals=EXACT,
         )  # fmt: skip
@@ -132,7 +138,7 @@ def test_intervals_hold_the_truth_of_payload_gains_and_robot(ur5):
 
 def test_gains_are_exact_without_noise_and_some_may_be_known(ur5, rng):
     log, without = (replace(x, tau=x.tau / GAINS) for x in recorded(ur5, rng, friction=1.2))
-    found = identify_payload(
+    found = with_known_friction(
         ur5, [log], [without], links=["tool0"], masses={"tool0": MASS},
         unknown_gains=ur5.joints, signals=EXACT,
     )  # fmt: skip
@@ -141,7 +147,7 @@ def test_gains_are_exact_without_noise_and_some_may_be_known(ur5, rng):
     one = np.where(np.arange(6) == 1, GAINS, 1.0)
     log, without = (replace(x, tau=x.tau * one) for x in (log, without))
     others = [joint for j, joint in enumerate(ur5.joints) if j != 1]
-    found = identify_payload(
+    found = with_known_friction(
         ur5, [log], [without], links=["tool0"], unknown_gains=others, signals=EXACT
     )
     assert found["tool0"].mass == pytest.approx(MASS, rel=1e-6)
@@ -160,7 +166,7 @@ def test_friction_that_grows_with_the_load_is_reckoned_with_the_payload(ur5, rng
     logs = with_friction(log, load_torque(ur5, log, "tool0")), with_friction(without)
     own = {joint: FAMILIES["load"].make({}) for joint in ur5.joints}
     found = [
-        identify_payload(model, logs[:1], logs[1:], links=["tool0"], signals=EXACT)["tool0"]
+        with_known_friction(model, logs[:1], logs[1:], links=["tool0"], signals=EXACT)["tool0"]
         for model in (ur5, ur5.with_terms(own))
     ]
     assert abs(found[0].mass - MASS) > 0.001
@@ -171,7 +177,7 @@ def test_friction_that_grows_with_the_load_is_reckoned_with_the_payload(ur5, rng
 
 def test_an_inertia_that_the_motion_does_not_show_is_refused(ur5, rng):
     (log, without) = recorded(ur5, rng, noise=LEVEL, inertia=1e-4 * np.eye(3))
-    payload = identify_payload(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
+    payload = with_known_friction(ur5, [log], [without], links=["tool0"], signals=EXACT)["tool0"]
     assert payload.determined == ("mass", "com")
     assert "the motion turns tool0 too little" in payload.reasons["inertia"]
     plain = payload.to_dict()
@@ -186,7 +192,7 @@ def test_an_inertia_that_the_motion_does_not_show_is_refused(ur5, rng):
 
 def test_nothing_is_told_from_nothing(ur5, rng):
     log, without = recorded(ur5, rng, links=[], noise=LEVEL)
-    payload = identify_payload(ur5, [log], [without], signals=EXACT)["wrist_3_link"]
+    payload = with_known_friction(ur5, [log], [without], signals=EXACT)["wrist_3_link"]
     assert abs(payload.mass) < 4 * payload.mass_std_error
     assert payload.determined == ("mass",)
 
@@ -196,7 +202,7 @@ def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
 
     def refused(error, match, logs=(log, without), **asked):
         with pytest.raises(error, match=match):
-            identify_payload(ur5, [logs[0]], [logs[1]], signals=EXACT, **asked)
+            with_known_friction(ur5, [logs[0]], [logs[1]], signals=EXACT, **asked)
 
     refused(DataError, "tool0 carries 2.* less than in the reference: .* swap", (without, log),
             links=["tool0"])  # fmt: skip
@@ -221,11 +227,13 @@ def test_the_load_of_a_ur10e_and_what_it_says_of_its_gains(recordings, monkeypat
     model, stated = job.model(), np.array([*job.gains.values()])
     files = [recordings / f"ur10e/ident_20200219_14harm{end}.parquet" for end in ("_load", "")]
     logs = [job.read(LogEntry(file), model) for file in files]
-    found = identify_payload(model, logs[:1], logs[1:], links=["tool0"], signals=job.signals)
+    found = with_known_friction(model, logs[:1], logs[1:], links=["tool0"], signals=job.signals)
     payload = found["tool0"]
-    assert 2.9 < payload.mass_interval[0] < payload.mass < payload.mass_interval[1] < 3.15
+    # what joints say of it differs more than stretches show: gains are not known to 1 %
+    assert 2.8 < payload.mass_interval[0] < 3.0 < payload.mass < 3.1
+    assert 3.1 < payload.mass_interval[1] < 3.3
     currents = [replace(log, tau=log.tau / stated) for log in logs]
-    found = identify_payload(
+    found = with_known_friction(
         model, currents[:1], currents[1:], links=["tool0"], masses={"tool0": 2.805},
         unknown_gains=model.joints, signals=job.signals,
     )  # fmt: skip
@@ -250,7 +258,7 @@ def test_a_joint_that_rests_but_for_a_few_rows_does_not_outweigh_the_others(ur5,
     without = Log(t, q, tau.reshape(q.shape), ur5.joints, v, a)
     loaded = replace(without, tau=without.tau + load_torque(ur5, without, "tool0"))
     runs = [replace(x, tau=x.tau + LEVEL * rng.standard_normal(q.shape)) for x in (loaded, without)]
-    found = identify_payload(ur5, runs[:1], runs[1:], links=["tool0"])["tool0"]
+    found = with_known_friction(ur5, runs[:1], runs[1:], links=["tool0"])["tool0"]
     assert found.mass_std_error < 0.1
     assert abs(found.mass - MASS) < 3 * found.mass_std_error
     assert (np.abs(found.com - COM) < 3 * found.com_std_error).all()
@@ -265,7 +273,7 @@ def test_errors_grow_with_the_correlation_of_the_noise(ur5):
         white.append(replace(log, tau=log.tau + e))
         coloured.append(replace(log, tau=log.tau + correlated))
     errors = [
-        identify_payload(ur5, [one], [other], links=["tool0"], signals=EXACT)[
+        with_known_friction(ur5, [one], [other], links=["tool0"], signals=EXACT)[
             "tool0"
         ].mass_std_error
         for one, other in (white, coloured)
@@ -273,3 +281,35 @@ def test_errors_grow_with_the_correlation_of_the_noise(ur5):
     # of a motion that is slow beside the noise; of this one, less
     most = np.sqrt((1 + rho) / (1 - rho))
     assert 0.4 * most < errors[1] / errors[0] < most
+
+
+def test_friction_of_the_reference_is_chosen_and_counts_in_both_runs(ur5, rng):
+    log, without = recorded(ur5, rng, samples=500)
+    pi = truth(ur5) * (np.arange(len(ur5.layout.names)) < ur5.layout.n_inertial)
+
+    def with_friction(x, extra=0.0):
+        rigid = (joint_torque_regressor(ur5, x.q, x.v, x.a) @ pi).reshape(x.tau.shape) + extra
+        return replace(x, tau=x.tau + 0.08 * np.sign(x.v) * np.abs(rigid))
+
+    logs = with_friction(log, load_torque(ur5, log, "tool0")), with_friction(without)
+    found = identify_payload(ur5, logs[:1], logs[1:], links=["tool0"], signals=EXACT)
+    assert {"shoulder_lift_joint", "elbow_joint"} <= found.model.layout.own.keys()
+    plain = with_known_friction(ur5, logs[:1], logs[1:], links=["tool0"], signals=EXACT)
+    errors = [abs(fit["tool0"].mass - MASS) for fit in (plain, found)]
+    assert errors[0] > 0.001 > 2 * errors[1]
+
+
+def test_joints_that_disagree_widen_the_interval(ur5):
+    rng = np.random.default_rng(3)
+    alike = recorded(ur5, rng, noise=LEVEL)
+    scale = np.array([1.0, 1.02, 0.97, 1.03, 0.98, 1.0])
+    apart = [replace(log, tau=scale * log.tau) for log in alike]
+    known, unsure = (
+        with_known_friction(ur5, logs[:1], logs[1:], links=["tool0"], signals=EXACT)["tool0"]
+        for logs in (alike, apart)
+    )
+    assert 3 * known.mass_std_error < unsure.mass_std_error < 0.1
+    low, high = unsure.mass_interval
+    assert low < MASS < high
+    # few joints tell it: the interval reaches further than 1.96 standard errors
+    assert (high - unsure.mass) / unsure.mass_std_error > 2.3
