@@ -237,13 +237,17 @@ def unwritten(identification: Identification, alarms: Sequence[Finding]) -> list
 
 
 def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]:
-    """Return a warning of locked joints whose positions nobody stated.
+    """Return a warning of locked joints whose positions matter and that nobody stated.
+
+    They matter where a joint that is identified carries them, or they carry it: how the legs stand
+    changes no torque of an arm. Of a floating base they all matter.
 
     Args:
         model: The robot.
         stated: Names of the locked joints that stand where the user says, or follow others.
     """
-    assumed = [name for name in model.locked if name not in stated]
+    beside = set(model.locked) if model.free_flyer else _in_line(model)
+    assumed = [name for name in model.locked if name not in stated and name in beside]
     if not assumed:
         return []
     message = (
@@ -251,6 +255,22 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
         "stand at 0; state their true positions with locked = { joint = position }"
     )
     return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
+
+
+def _in_line(model: RobotModel) -> set[str]:
+    """Return the joints that carry one that is identified, or are carried by one."""
+    above = {joint.child: joint for joint in model.tree.joints}
+    carriers: dict[str, set[str]] = {}
+    for joint in model.tree.joints:
+        own, link = carriers.setdefault(joint.name, set()), joint.parent
+        while link in above:
+            own.add(above[link].name)
+            link = above[link].parent
+    identified = set(model.joints)
+    carrying = set[str]().union(*(carriers[name] for name in identified))
+    # where a base stands changes no torque, only how it is turned
+    turning = {joint.name for joint in model.tree.joints if joint.type != "prismatic"}
+    return carrying & turning | {name for name, own in carriers.items() if own & identified}
 
 
 def log_findings(logs: Sequence[Log]) -> list[Finding]:
