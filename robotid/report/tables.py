@@ -95,12 +95,12 @@ def _change_section(found: Identification) -> str:
     lines = urdf_changes(found.model, found.standard)
     if not lines:
         return "<p>The URDF is no longer where it was read.</p>\n"
-    kinds = {"-": "del", "+": "ins"}
-    html = "".join(
-        f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n" if line[0] in kinds
-        else f"<strong>{escape(line.rpartition('@@ ')[2])}</strong>\n"
-        for line in lines[2:]
-    )  # fmt: skip
+    kinds, html, link = {"-": "del", "+": "ins"}, "", ""
+    for line in lines[2:]:
+        if line[0] in kinds:
+            html += f"<{kinds[line[0]]}>{escape(line)}</{kinds[line[0]]}>\n"
+        elif (name := line.rpartition("@@ ")[2]) != link:  # lines between that stay cut it in two
+            html, link = f"{html}<strong>{escape(name)}</strong>\n", name
     title = " and ".join(line.split(" ", 1)[1].strip() for line in lines[:2])
     return (
         f"<p>Of {escape(title)}; every other byte is the same.</p>\n"

@@ -112,7 +112,12 @@ def test_a_second_solver_that_fails_is_reported_with_its_status(ur5, rng, monkey
 def test_both_solvers_lead_to_the_same_result(ur5, rng):
     log = exact_log(ur5, truth(ur5), rng, noise=10 * NOISE)
     one, other = (
-        identify(ur5, [log], signals=EXACT, estimator=EstimatorSettings(solver=solver))
+        identify(
+            ur5,
+            [log],
+            signals=EXACT,
+            estimator=EstimatorSettings(prior="riemannian", solver=solver),
+        )
         for solver in ("clarabel", "scs")
     )
     assert "SCS: Solved" in other.estimate.message
