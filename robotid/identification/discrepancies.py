@@ -17,7 +17,7 @@ import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, listed
-from robotid.identification.misfit import Sample, chance, trials
+from robotid.identification.misfit import Sample, along, chance, trials
 from robotid.regressor.prediction import inverse_dynamics
 from robotid.robot.model import RobotModel
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["discrepancy_findings"]
 
 _STEP = 1e-5  # of a derivative [-, rad or m]
+_STEPS = 5  # of a position's zero, that is sought anew from where it was found
 _MOST = 3  # that are named of a result
 _CHANCE = 3e-4  # that one is named which is not there, each time that one is tried
 _LEAST = 0.1  # share of the squared residual from which one is named
@@ -73,7 +74,35 @@ def discrepancy_findings(identification: "Identification", sample: Sample | None
     if sample is None:
         return []
     own = list(_alterations(identification.model, identification.standard, sample))
-    return list(_found(sample, own))
+
+    def sharpened(found: _Alteration, size: float) -> tuple[float, float]:
+        return _offset(identification, sample, found.where, size)
+
+    return list(_found(sample, own, sharpened))
+
+
+def _offset(
+    identification: "Identification", sample: Sample, joint: str, size: float
+) -> tuple[float, float]:
+    """Return what is to be added to a joint's position, and its standard error [rad or m].
+
+    Torques are no straight line over a tenth of a radian: it is sought anew from where it was
+    found, until it stays.
+    """
+    model, pi = identification.model, identification.standard
+    only = np.eye(len(model.joints))[model.joints.index(joint)]
+    error = np.inf
+    for _ in range(_STEPS):
+        at = tuple(replace(m, q=m.q + size * only) for m in sample.at)
+        tau = _torques(model, pi, replace(sample, at=at))
+        there = along(sample, identification, at, tau)
+        beside = tuple(replace(m, q=m.q + _STEP * only) for m in at)
+        Z = (_torques(model, pi, replace(sample, at=beside)) - tau)[..., None] / _STEP
+        (step,), covariance = trials(there, slice(None), Z)[1].estimate([0], sample.fitted)
+        size, error = size + float(step), float(np.sqrt(covariance[0, 0]))
+        if abs(step) < 0.1 * error:
+            break
+    return size, error
 
 
 def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
@@ -144,7 +173,11 @@ def _pulled(model: RobotModel, axis: Array) -> RobotModel:
     return replace(model, pin_model=pin_model)
 
 
-def _found(sample: Sample, own: Sequence[_Alteration]) -> Iterator[Finding]:
+def _found(
+    sample: Sample,
+    own: Sequence[_Alteration],
+    sharpened: Callable[[_Alteration, float], tuple[float, float]],
+) -> Iterator[Finding]:
     """Yield what explains the residual, one after the other, beside what was found before."""
     Z = np.concatenate([alteration.Z for alteration in own], axis=2)
     ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
@@ -177,6 +210,8 @@ def _found(sample: Sample, own: Sequence[_Alteration]) -> Iterator[Finding]:
         least = best.least * (_FAINT_SIZE if is_faint else 1.0)
         if np.linalg.norm(size) < max(least, _SURE * float(np.linalg.norm(error))):
             return
+        if best.code == "position_offset" and len(chosen) == 1:
+            size, error = (np.array([x]) for x in sharpened(best, float(size[0])))
         yield _finding(best, size, error, share, [one for one in alike if one is not best])
 
 

@@ -363,7 +363,7 @@ def take_sample(identification: "Identification", *, is_steady: bool = True) -> 
     U = np.asarray(np.linalg.qr((mapping.K * identification.prior_std).T, mode="r"))
     W = weight[:, :, None] * (Y[:, :, mapping.independent] @ U.T)
     r = weight * r
-    by_stretch = [(W[k].reshape(-1, len(mapping.K)), r[k].ravel()) for k in stretches]
+    A, B = _products(W, r, stretches)
     return Sample(
         joints=model.joints,
         slides=np.isin(model.joints, list(model.layout.prismatic)),
@@ -378,8 +378,35 @@ def take_sample(identification: "Identification", *, is_steady: bool = True) -> 
         W=W,
         r=r,
         U=U,
-        A=np.array([W_k.T @ W_k for W_k, _ in by_stretch]),
-        B=np.array([W_k.T @ r_k for W_k, r_k in by_stretch]),
+        A=A,
+        B=B,
+    )
+
+
+def along(
+    sample: Sample, identification: "Identification", at: Sequence[Trajectory], tau: Array
+) -> Sample:
+    """Return the same rows with other positions than the recordings have.
+
+    Args:
+        sample: The rows.
+        identification: What was found.
+        at: The motions, as of ``Sample.at``.
+        tau: Torques of the estimate along them, shape (N, n) [N m or N].
+    """
+    model, independent = identification.model, identification.mapping.independent
+    Y = np.concatenate([_regressor(model, motion)[:, :, independent] for motion in at])
+    W = sample.weight[:, :, None] * (Y @ sample.U.T)
+    r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
+    A, B = _products(W, r, sample.stretches)
+    return replace(sample, at=tuple(at), W=W, r=r, A=A, B=B)
+
+
+def _products(W: Array, r: Array, stretches: Sequence[slice]) -> tuple[Array, Array]:
+    """Return W^T W and W^T r of each stretch, all joints together."""
+    pairs = [(W[k].reshape(-1, W.shape[2]), r[k].ravel()) for k in stretches]
+    return np.array([W_k.T @ W_k for W_k, _ in pairs]), np.array(
+        [W_k.T @ r_k for W_k, r_k in pairs]
     )
 
 

