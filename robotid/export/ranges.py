@@ -140,7 +140,7 @@ def projected_ranges(found: Identification) -> dict[str, Any]:
     for drive in drives:
         C = found.standard_covariance[np.ix_(drive.own, drive.own)]
         errors = np.sqrt(np.maximum(np.diag(drive.transfer @ C @ drive.transfer.T), 0.0))
-        reach = float(found.standard_reach[drive.own].max())
+        reach = float(found.standard_reach[list(drive.own)].max())
         ranges[drive.name] = {
             term: _range(
                 value, error, "data", reach=reach, least=0.0 if term in _NOT_NEGATIVE else -math.inf
