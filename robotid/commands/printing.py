@@ -504,7 +504,11 @@ def _print_one_payload(found: Mapping[str, Any]) -> None:
         print(f"  mass {found['mass']:g} kg, stated")
     else:
         low, high = (in_digits_of(end, found["mass_std_error"])[0] for end in (low, high))
-        print(f"  mass {mass} kg (95 % interval {low} to {high})")
+        say(
+            f"  mass {mass} kg (95 % interval {low} to {high}, in the scale of the torques: gains "
+            "that are too large make it too large)",
+            "  ",
+        )
     if found["com"] is not None:
         print(f"  centre of mass in the frame of {link} [m]")
         rows = [

@@ -68,6 +68,15 @@ def test_a_log_and_a_result_are_references_alike(files, capsys):
     assert "gains" not in found[0]
 
 
+def test_a_mass_is_said_to_be_in_the_scale_of_the_torques(files, capsys):
+    said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0")
+    mass, low, high = re.search(
+        r"mass ([.\d]+) kg \(95 % interval ([.\d]+) to ([.\d]+),", said
+    ).groups()
+    assert float(low) < float(mass) < float(high)
+    assert "in the scale of the torques" in " ".join(said.split())
+
+
 def test_the_text_says_what_a_controller_asks_for(files, capsys):
     said = asked(capsys, files / "loaded.csv", "--reference", files / "bare.csv", "--link", "tool0",
                  "--mass", "2")  # fmt: skip
