@@ -836,8 +836,9 @@ def _under_own_load(recordings: Recordings, choice: EstimatorSettings) -> Record
         recordings = recordings.with_model(model.with_reference(standard))
         loads = [_size_of(ground, x) for x in (moved, standard)]
         if (loads[0] <= _SETTLED * loads[1]).all():
-            if make_estimator(choice, model, mapping, before).reads == "factors":
-                estimate, _, _ = _run(choice, ground)
+            estimator = make_estimator(choice, model, mapping, before)
+            if estimator.reads == "factors":
+                estimate = estimator.fit(ground.factors)
                 standard, _ = standard_of(estimate, mapping, before.pi, before.spread)
             return recordings.with_model(model.with_reference(standard))
     raise NotConvergedError(
