@@ -97,8 +97,7 @@ def link_transfer(model: RobotModel, link: str) -> tuple[int, Array]:
     frame = model.pin_model.frames[model.pin_model.getFrameId(link, pin.FrameType.BODY)]
     # a pseudo-inertia moves with a homogeneous matrix H as H J H^T, massless links too
     H = frame.placement.homogeneous
-    moved = [inertial_from_pseudo_inertia(H @ B @ H.T) for B in pseudo_inertia_basis()]
-    return frame.parentJoint - 1, np.column_stack(moved)
+    return frame.parentJoint - 1, inertial_from_pseudo_inertia(H @ pseudo_inertia_basis() @ H.T).T
 
 
 def held_parameters(model: RobotModel) -> Array:

@@ -308,14 +308,17 @@ def pseudo_inertia(pi: Array) -> Array:
 
 
 def inertial_from_pseudo_inertia(J: Array) -> Array:
-    """Return the ten inertial parameters of one body; the inverse of ``pseudo_inertia``.
+    """Return the ten inertial parameters of each body, shape (..., 10).
+
+    It is the inverse of ``pseudo_inertia``.
 
     Args:
-        J: Pseudo-inertia, shape (4, 4).
+        J: Pseudo-inertias, shape (..., 4, 4).
     """
-    sigma = J[:3, :3]
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = np.trace(sigma) * np.eye(3) - sigma
-    return np.array([J[3, 3], *J[:3, 3], xx, xy, yy, xz, yz, zz])
+    trace = np.trace(J[..., :3, :3], axis1=-2, axis2=-1)[..., None, None]
+    inertia = trace * np.eye(3) - J[..., :3, :3]
+    i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)  # xx xy yy xz yz zz
+    return np.concatenate([J[..., 3, 3, None], J[..., :3, 3], inertia[..., i, j]], axis=-1)
 
 
 def _by_body(pi: Array | Sequence[float]) -> Array:

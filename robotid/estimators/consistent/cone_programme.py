@@ -138,6 +138,8 @@ class Programme:
             constrained inverse problems, section 3.
         """
         triangle, cone = self._system(rows, weight, pi, self.binding)
+        # rounding decides on the signs of rows, and of eigenvectors, but not of these
+        triangle = np.sign(np.diag(triangle))[:, None] * triangle
         R, space = triangle[:, :-1], self.space
         at = space.basis.T @ (pi / self.scale - space.origin)
         inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
@@ -147,7 +149,8 @@ class Programme:
         # the score of the prior: weight H (pi - truth), the truth of covariance pull / (weight H)
         S = np.sqrt(pull * weight) * self._scaled_root(pi) @ prior
         size, axes = np.linalg.eigh(data.T @ meat @ data + S.T @ S)
-        noise = rng.standard_normal((draws, len(R))) * np.sqrt(np.maximum(size, 0.0)) @ axes.T
+        root = axes * np.sqrt(np.maximum(size, 0.0)) @ axes.T
+        noise = rng.standard_normal((draws, len(R))) @ root
         lowest = triangle[:, -1] - R @ at
         y, failures = nearest(
             lowest + noise, cone.restrict(Subspace(at, inverse)), max_iterations=self.max_iterations

@@ -215,8 +215,7 @@ def make_penalty(
         return Quadratic(prior, np.diag(prior_std**-2.0))
     size = layout.n_inertial
     P = _widened(pseudo_inertia(prior[:size] - held), body_units(prior_std[:size]))
-    rest = [inertial_from_pseudo_inertia(P_i) for P_i in P]
-    repaired = np.concatenate([np.concatenate(rest) + held, prior[size:]])
+    repaired = np.concatenate([inertial_from_pseudo_inertia(P).reshape(-1) + held, prior[size:]])
     precision = prior_std[size:] ** -2.0
     if metric == "entropic":
         return Entropic(repaired, precision, held)
