@@ -89,6 +89,18 @@ def test_where_no_bound_binds_it_is_the_covariance(inside, rng, meat_over_bread,
     assert np.sqrt(np.mean(difference**2)) < 0.03
 
 
+def test_rounding_does_not_change_what_is_drawn(inside, rng):
+    # rows of opposite sign, in another order, say the same; their factor has other signs
+    rows = information(inside, rng, 1.0)
+    turned = -rows[::-1]
+    meat = rows[:, :-1].T @ rows[:, :-1]
+    one, other = (
+        inside.programme.redrawn(x, 1.0, inside.prior, meat, 1.0, 20, np.random.default_rng(0))[0]
+        for x in (rows, turned)
+    )
+    np.testing.assert_allclose(other / inside.prior_std, one / inside.prior_std, atol=1e-6)
+
+
 def test_on_a_bound_half_of_the_fits_stay_there(inside, rng):
     # prior and data put a friction coefficient at its bound, and tell nothing else of it
     i = inside.layout.names.index("elbow_joint.viscous")
