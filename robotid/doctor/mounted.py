@@ -116,7 +116,8 @@ def check_payload_change(
         (last, np.full(10, np.nan), size),
         share=min(1.0, 2.0 * (signals.cutoff or np.inf) * seconds / whole.samples),
     )
-    found = runs.compare()
+    # whether there is one at all is asked of what changes with time; scales are tried below
+    found = runs.compare(by_joint=False)
     mass, error = float(found.theta[-10]), float(np.sqrt(found.covariance[-10, -10]))
     reach = -float(scipy.special.stdtrit(found.freedom[-10], _CHANCE)) * error
     if not max(reach, _NOTHING * size[0]) < abs(mass) < size[0]:

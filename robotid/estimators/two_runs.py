@@ -78,12 +78,15 @@ class TwoRuns:
     share: float
     unknown: Array
 
-    def compare(self) -> Compared:
+    def compare(self, *, by_joint: bool = True) -> Compared:
         """Fit both runs at once, and the unknown gains with them.
 
         Standard errors come from the scatter of the scores of stretches and of joints, and are at
         least those of rows that are independent by ``share``; of fewer than 12 stretches, they are
         these.
+
+        Args:
+            by_joint: Whether errors count what the joints of each run disagree about, too.
 
         Raises:
             NotConvergedError: If the gains do not settle.
@@ -109,7 +112,7 @@ class TwoRuns:
                 "richer motions of both runs, or state some of the gains",
                 "max_iterations",
             )
-        covariance, freedom = self._errors(gain, at, solution, bread)
+        covariance, freedom = self._errors(gain, at, solution, bread, by_joint)
         squares = self._both(gain, at).residual_squares(solution)
         torque = np.maximum(np.abs(gain) * np.sqrt(self._logged.torque_squares()), 1e-300)
         return Compared(theta, gain, covariance, freedom, np.sqrt(squares) / torque)
@@ -257,7 +260,7 @@ class TwoRuns:
         return inverse @ R[:-1, -1], inverse @ inverse.T
 
     def _errors(
-        self, gain: Array, at: Array | None, solution: Array, bread: Array
+        self, gain: Array, at: Array | None, solution: Array, bread: Array, by_joint: bool
     ) -> tuple[Array, Array]:
         """Return covariance and degrees of freedom; the prior adds its own uncertainty.
 
@@ -273,7 +276,7 @@ class TwoRuns:
         covariance, freedom = self._scattered(stretches, gain, solution, bread)
         whole = [self._extended(run, loaded, gain, at) for loaded, run in enumerate(self._whole)]
         joints = [_of_joint(run, j) for run in whole for j in range(len(gain))]
-        if len(joints) >= FEWEST_STRETCHES:
+        if by_joint and len(joints) >= FEWEST_STRETCHES:
             other, few = self._scattered(joints, gain, solution, bread)
             grown = np.sqrt(np.maximum(np.diag(other) / np.diag(covariance), 1.0))
             covariance = covariance * np.outer(grown, grown)

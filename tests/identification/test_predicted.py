@@ -203,7 +203,7 @@ def test_urdf_dynamics_and_ranges_have_the_projected_friction(found, loaded, tmp
     ).drives
     C = found.standard_covariance[np.ix_(projected.own, projected.own)]
     for row, (term, value) in zip(projected.transfer, projected.values.items(), strict=True):
-        half = 1.96 * np.sqrt(row @ C @ row)
+        half = found.standard_reach[list(projected.own)].max() * np.sqrt(row @ C @ row)
         assert ranges[ELBOW][term]["nominal"] == pytest.approx(value)
         assert ranges[ELBOW][term]["high"] == pytest.approx(value + half)
     assert set(ranges[ELBOW]) == {"viscous", "coulomb", "offset"}
