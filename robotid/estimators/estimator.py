@@ -87,7 +87,7 @@ class Estimate:
     def reach(self) -> Array:
         """How many standard errors a 95 % interval reaches, by Student's quantile, shape (c,).
 
-        ``details`` has the degrees of freedom, ``freedom``, of errors that a scatter told.
+        ``details`` has the degrees of freedom, ``freedom``, of errors from a scatter.
         """
         freedom = self.details.get("freedom", np.inf)
         return quantile(np.broadcast_to(np.asarray(freedom, dtype=float), len(self.theta)))

@@ -299,6 +299,28 @@ def test_friction_of_the_reference_is_chosen_and_counts_in_both_runs(ur5, rng):
     assert errors[0] > 0.001 > 2 * errors[1]
 
 
+def test_friction_of_currents_is_chosen_on_the_torques_that_the_gains_make(ur5, rng):
+    log, without = recorded(ur5, rng, samples=500)
+    pi = truth(ur5) * (np.arange(len(ur5.layout.names)) < ur5.layout.n_inertial)
+
+    def current(x, extra=0.0):
+        rigid = (joint_torque_regressor(ur5, x.q, x.v, x.a) @ pi).reshape(x.tau.shape) + extra
+        return replace(x, tau=(x.tau + 0.08 * np.sign(x.v) * np.abs(rigid)) / GAINS)
+
+    logs = current(log, load_torque(ur5, log, "tool0")), current(without)
+    asked = {"links": ["tool0"], "masses": {"tool0": MASS}, "unknown_gains": ur5.joints}
+    plain, found = (
+        fit(ur5, logs[:1], logs[1:], signals=EXACT, **asked)
+        for fit in (with_known_friction, identify_payload)
+    )
+    assert {"shoulder_lift_joint", "elbow_joint"} <= found.model.layout.own.keys()
+    errors = [
+        np.abs(np.array([gain.value for gain in fit.gains.values()]) / GAINS - 1)[1:3].max()
+        for fit in (plain, found)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
 def test_joints_that_disagree_widen_the_interval(ur5):
     rng = np.random.default_rng(3)
     alike = recorded(ur5, rng, noise=LEVEL)

@@ -14,6 +14,7 @@ from robotid.estimators.consistent.cones import SOLVERS, Subspace
 from robotid.estimators.consistent.constraints import Constraints
 from robotid.estimators.consistent.penalties import (
     METRICS,
+    Entropic,
     Penalty,
     WeightChoice,
     body_units,
@@ -280,7 +281,7 @@ class Consistent(BatchEstimator):
             prior["curve"] = [list(pair) for pair in self.choice.curve]
         return {
             "prior": prior,
-            "solver": self.solver,
+            "solver": "interior point" if isinstance(self.penalty, Entropic) else self.solver,
             "constraints": [*self.programme.cone.families, *(["equalities"] if is_bound else [])],
             "active": sorted(set(self.active(pi)[1])),
             "pinned": list(self.constraints.pinned),
