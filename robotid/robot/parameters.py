@@ -95,6 +95,12 @@ class ParameterLayout:
                         f"coupling {coupling.name!r}: the ratio of joint {joint!r} is {ratio!r}, "
                         f"wanted a number within +-{LARGEST:g} [-]"
                     )
+            if not any(ratio for _, ratio in coupling.ratios):
+                raise SettingsError(
+                    f"coupling {coupling.name!r} turns with no joint: its ratios are "
+                    f"{dict(coupling.ratios)}, wanted one that is not 0; state it, as "
+                    f"ratios = {{ {self.joints[0]} = 1.0 }}, or leave the coupling out"
+                )
             if sum(drive.name == coupling.name for drive in self.drives) > 1:
                 raise SettingsError(
                     f"coupling {coupling.name!r} has the name of a joint or of another drive; give "

@@ -262,4 +262,6 @@ def test_a_robot_without_links_to_keep_apart_moves_too(tmp_path, kind, capsys):
 def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(tmp_path, capsys):
     urdf = str(example_urdf("ur5_robot.urdf"))
     assert main(["excite", urdf, "--out", str(tmp_path / "motion.txt")]) == 1
-    assert "motion.txt: logs are written as .csv, .parquet" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert "motion.txt: motions are written as .csv, .parquet, " in said
+    assert ".yaml or .script files, not '.txt'" in said
