@@ -8,11 +8,12 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from helpers.hostile_arguments import ARGUMENT_KINDS
 from helpers.hostile_commands import COMMAND_KINDS
 from helpers.hostile_inputs import KINDS as INPUT_KINDS
 from hypothesis import HealthCheck, Phase, given, settings
 
-KINDS = INPUT_KINDS | COMMAND_KINDS
+KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
 EXAMPLES = {
     "values, identified": 12,
     "job file": 25,
@@ -22,6 +23,7 @@ EXAMPLES = {
     "drives of a job": 20,
     "loop of a job": 5,
     "report of result.json": 10,
+    "Python arguments": 150,
 }  # others: 40
 
 

@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 
+from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
@@ -49,6 +51,15 @@ class Coupling:
     name: str
     ratios: tuple[tuple[str, float], ...]
     replaces: bool = False
+
+    def __post_init__(self) -> None:
+        wanted = "pairs of a joint's name and a number"
+        require_kind(self.name, str, "name", "the name of a coupling")
+        require_flag(self.replaces, "replaces")
+        for pair in require_each(self.ratios, (tuple, list), "ratios", wanted):
+            is_pair = len(pair) == 2 and isinstance(pair[0], str) and isinstance(pair[1], Real)
+            if not is_pair or isinstance(pair[1], bool):
+                raise SettingsError(f"ratios of {self.name!r} has {pair!r}, wanted {wanted}")
 
 
 @dataclass(frozen=True)
