@@ -24,7 +24,7 @@ from helpers.corruptions import robot
 from helpers.misfits import EFFECTS, log_with
 
 from robotid.commands.job import read_job
-from robotid.identification.misfit import find_misfits
+from robotid.identification.misfit import find_misfits, take_sample
 from robotid.identification.pipeline import identify
 
 JOINTS = 4  # of the UR5, the first ones, which get a term: a wrist carries no load to speak of
@@ -45,7 +45,7 @@ def main():
 
 def misfits(model, seed, effect=None, joint=0, **options):
     logs = [log_with(model, seed, effect, joint, part=k, **options) for k in (0, 1)]
-    return find_misfits(identify(model, logs[:1], validation=logs[1:]))
+    return identify(model, logs[:1], validation=logs[1:]).misfits
 
 
 def spoilt(seeds):
@@ -96,8 +96,9 @@ def recordings():
         found = identify(
             model, fitted, validation=kept, signals=job.signals, estimator=job.estimator
         )
+        sample = take_sample(found)
         begin = time.process_time()
-        named = find_misfits(found)
+        named = find_misfits(sample)
         seconds = time.process_time() - begin
         for m in named:
             print(

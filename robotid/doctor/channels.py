@@ -40,17 +40,18 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         signals: Where velocities come from, and the delay of measured ones that is corrected.
 
     Yields:
-        "quantised" per kind of channel: a warning for torques of few steps, else a note; "spikes"
-        per channel: an error where they are absurd and strong enough to ruin a fit; notes "noise"
-        per kind of channel and "noisy_torque" where noise prevails; of measured velocities an
-        error "velocity_order" for each that is the derivative of another joint's position,
-        "unlike_velocity" for each other one that is not that of its own: an error where they are
-        used, a warning where "auto" leaves them out, else a note; at most one "velocity_delay",
-        with the scatter over the joints as its uncertainty, and "velocity_scale" per joint: an
-        error where they are used, else a note.
+        "quantised" per kind of channel: a warning for torques of few steps, and for velocities of
+        few steps unless they are differentiated, else a note; "spikes" per channel: an error where
+        they are absurd and strong enough to ruin a fit; notes "noise" per kind of channel and
+        "noisy_torque" where noise prevails; of measured velocities an error "velocity_order" for
+        each that is the derivative of another joint's position, "unlike_velocity" for each other
+        one that is not that of its own: an error where they are used, a warning where "auto"
+        leaves them out, else a note; at most one "velocity_delay", with the scatter over the
+        joints as its uncertainty, and "velocity_scale" per joint: an error where they are used,
+        else a note.
     """
     for kind, values in _channels(log):
-        yield from _quantisation(log, kind, values)
+        yield from _quantisation(log, kind, values, signals.velocity)
     for kind, values in _channels(log):
         yield from _spikes(log, kind, values)
     for kind, values in _channels(log):
@@ -66,8 +67,9 @@ def check_channels(log: Log, signals: SignalSettings) -> Iterator[Finding]:
         yield from _velocity_scale(log, slope, v, np.diag(alike), signals.velocity)
 
 
-def _quantisation(log: Log, kind: str, values: Array) -> Iterator[Finding]:
+def _quantisation(log: Log, kind: str, values: Array, velocity: str) -> Iterator[Finding]:
     """Yield the joints whose channel moves in steps: those of few steps, and the others."""
+    is_used = kind == "tau" or (kind == "dq" and velocity != "differentiated")
     steps = np.array([quantum(x) for x in values.T])
     count = np.ptp(values, axis=0) / np.where(steps > 0, steps, 1.0)
     for few in (True, False):
@@ -78,12 +80,12 @@ def _quantisation(log: Log, kind: str, values: Array) -> Iterator[Finding]:
         evidence = {f"steps_{log.joints[j]}": count[j] for j in chosen}
         todo = "it is uninformative: scale or log it finer" if few else "log more digits"
         if few and kind == "dq":
-            todo += "; velocity = 'auto' differentiates the position instead"
+            todo += ", or set velocity = 'differentiated'; 'auto' differentiates the position"
         message = (
             f"{kind} of {listed(names)} moves in steps of {steps[chosen].max():.3g}, "
             f"{count[chosen].min():.0f} of them over its range; {todo}"
         )
-        severity = "warning" if few and kind == "tau" else "note"
+        severity = "warning" if few and is_used else "note"
         yield log_finding(log.name, "quantised", severity, message, kind, **evidence)
 
 

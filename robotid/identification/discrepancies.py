@@ -11,23 +11,27 @@ recordings after the other (``misfit``). x is the size of what is otherwise, wit
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotid._typing import Array
 from robotid.findings import Finding, listed
-from robotid.identification.misfit import Sample, along, chance, trials
+from robotid.identification.misfit import Misfit, Sample, along, chance, find_misfits, trials
+from robotid.logs.data import Trajectory
 from robotid.regressor.prediction import inverse_dynamics
 from robotid.robot.model import RobotModel
 
 if TYPE_CHECKING:
     from robotid.identification.pipeline import Identification
 
-__all__ = ["discrepancy_findings"]
+__all__ = ["explain_residual"]
+
+_Applied = Callable[[Array], tuple[RobotModel, Sequence[Trajectory]]]
 
 _STEP = 1e-5  # of a derivative [-, rad or m]
-_STEPS = 5  # of a position's zero, that is sought anew from where it was found
+_STEPS = 5  # of sizes that are sought anew from where they were found
 _MOST = 3  # that are named of a result
 _CHANCE = 3e-4  # that one is named which is not there, each time that one is tried
 _LEAST = 0.1  # share of the squared residual from which one is named
@@ -51,6 +55,7 @@ class _Alteration:
         Z: Torque that a size of 1 adds, shape (N, n, c).
         least: Smallest size that changes a result.
         words: Returns the finding's sentence of sizes (c,) and their standard errors (c,).
+        applied: Returns the robot and its motions with sizes (c,), where torques bend with these.
     """
 
     code: str
@@ -58,58 +63,103 @@ class _Alteration:
     Z: Array
     least: float
     words: Callable[[Array, Array], str]
+    applied: _Applied | None = None
 
 
-def discrepancy_findings(identification: "Identification", sample: Sample | None) -> list[Finding]:
-    """Return warnings of what recordings or URDF have otherwise than stated.
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """An alteration that was found: its finding, and the rows as it leaves them."""
+
+    alteration: _Alteration
+    finding: Finding
+    there: Sample
+
+
+def explain_residual(
+    identification: "Identification", sample: Sample | None
+) -> tuple[tuple[Misfit, ...], tuple[Finding, ...]]:
+    """Return what the drives lack, and what recordings or URDF have otherwise than stated.
+
+    A spring imitates a zero that is off, and a zero a spring: what explains more of the residual of
+    all joints together is taken first, and what is found of the others alone is sought beside it.
 
     Args:
         identification: What was found.
         sample: Rows of its recordings; None if they are too few to judge by.
 
     Returns:
-        Findings "position_offset", "angle_scale", "torque_scale", "time_scale", "gravity" and
-        "joint_origin", what explains most of the residual first.
+        Terms that the drives lack, the largest first, and warnings "position_offset",
+        "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin", what explains
+        most of the residual first.
     """
     if sample is None:
-        return []
+        return (), ()
+    misfits = find_misfits(sample)
     own = list(_alterations(identification.model, identification.standard, sample))
+    found = list(_found(identification, sample, own))
+    if misfits and found:
+        altered = np.concatenate([one.alteration.Z for one in found], axis=2)
+        lacking = _columns(misfits, sample)
+        if _left(sample, altered) < _left(sample, lacking):
+            alone = {(misfit.joint, misfit.term.code) for misfit in misfits}
+            beside = find_misfits(found[0].there.beside(altered))
+            misfits = tuple(m for m in beside if (m.joint, m.term.code) in alone)
+        else:
+            among = {one.alteration for one in found}
+            beside_them = _found(identification, sample.beside(lacking), own)
+            found = [one for one in beside_them if one.alteration in among]
+    return misfits, tuple(one.finding for one in found)
 
-    def sharpened(found: _Alteration, size: float) -> tuple[float, float]:
-        return _offset(identification, sample, found.where, size)
 
-    return list(_found(sample, own, sharpened))
+def _columns(misfits: Sequence[Misfit], sample: Sample) -> Array:
+    """Return the torque of the parameters of terms that drives lack, shape (N, n, c)."""
+    columns = []
+    for misfit in misfits:
+        j = sample.joints.index(misfit.joint)
+        of_joint = misfit.term.columns(sample.motions[j])  # (N, k)
+        only = np.eye(len(sample.joints))[j]
+        columns.append(only[None, :, None] * of_joint[:, None, :])
+    return np.concatenate(columns, axis=2)
 
 
-def _offset(
-    identification: "Identification", sample: Sample, joint: str, size: float
-) -> tuple[float, float]:
-    """Return what is to be added to a joint's position, and its standard error [rad or m].
+def _left(sample: Sample, Z: Array) -> float:
+    """Return the squared residual that columns leave of stretches they were not fitted to."""
+    apart, _ = trials(sample, slice(None), Z)
+    return float(apart.left(list(range(Z.shape[2])))[: sample.fitted].sum())
 
-    Torques are no straight line over a tenth of a radian: it is sought anew from where it was
-    found, until it stays.
+
+def _refined(applied: _Applied, x: Array, pi: Array, sample: Sample) -> tuple[Array, Array, Sample]:
+    """Return the sizes of an alteration, their standard errors, and the rows as it leaves them.
+
+    Torques are no straight line over a tenth of a radian: sizes are sought anew from where they
+    were found, until they stay.
+
+    Args:
+        applied: Returns the robot and its motions with sizes (c,).
+        x: The sizes to first order, shape (c,).
+        pi: Standard parameters of the estimate, shape (p,).
+        sample: Rows of the recordings.
     """
-    model, pi = identification.model, identification.standard
-    only = np.eye(len(model.joints))[model.joints.index(joint)]
-    error = np.inf
+    every, error = list(range(len(x))), np.full(len(x), np.inf)
     for _ in range(_STEPS):
-        at = tuple(replace(m, q=m.q + size * only) for m in sample.at)
-        tau = _torques(model, pi, replace(sample, at=at))
-        there = along(sample, identification, at, tau)
-        beside = tuple(replace(m, q=m.q + _STEP * only) for m in at)
-        Z = (_torques(model, pi, replace(sample, at=beside)) - tau)[..., None] / _STEP
-        (step,), covariance = trials(there, slice(None), Z)[1].estimate([0], sample.fitted)
-        size, error = size + float(step), float(np.sqrt(covariance[0, 0]))
-        if abs(step) < 0.1 * error:
+        model, at = applied(x)
+        tau = _torques(model, pi, at)
+        sample = along(sample, model, at, tau)
+        beyond = [applied(x + _STEP * axis) for axis in np.eye(len(x))]
+        moved = [_torques(model, pi, at) for model, at in beyond]
+        Z = (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
+        step, covariance = trials(sample, slice(None), Z)[1].estimate(every, sample.fitted)
+        x, error = x + step, np.sqrt(np.diag(covariance))
+        if np.linalg.norm(step) < 0.1 * np.linalg.norm(error):
             break
-    return size, error
+    return x, error, sample
 
 
 def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alteration]:
     """Yield what may be otherwise, with what it would do to the torques of the sample."""
     n, size = len(model.joints), model.layout.n_inertial
     bodies = np.where(np.arange(len(pi)) < size, pi, 0.0)
-    tau = _torques(model, pi, sample)
+    tau = _torques(model, pi, sample.at)
 
     def moved(scale: Array, shift: Array) -> Array:
         """Return what positions (1 + e scale) q + e shift would change, over e."""
@@ -118,12 +168,18 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
             replace(m, q=factor * m.q + _STEP * shift, v=factor * m.v, a=factor * m.a)
             for m in sample.at
         ]
-        return (_torques(model, pi, replace(sample, at=tuple(change))) - tau)[..., None] / _STEP
+        return (_torques(model, pi, change) - tau)[..., None] / _STEP
+
+    def offset(joint: int, x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
+        """Return the motions with the position of a joint that was x farther."""
+        return model, [replace(m, q=m.q + x * np.eye(n)[joint]) for m in sample.at]
 
     for j, joint in enumerate(model.joints):
         only, none = np.eye(n)[j], np.zeros(n)
         unit = "m" if joint in model.layout.prismatic else "rad"
-        yield _Alteration("position_offset", joint, moved(none, only), 0.01, _zero(joint, unit))
+        applied = partial(offset, j)
+        Z = moved(none, only)
+        yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
         yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
         yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
     for first in range(1, n - 1):  # the drives of a wrist are of one kind
@@ -132,15 +188,19 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         yield _Alteration("torque_scale", ", ".join(model.joints[first:]), Z, 0.05, _gains(names))
     every = moved(np.ones(n), np.zeros(n))
     yield _Alteration("angle_scale", "", every, 0.02, _scale("every position"))
-    still = tuple(replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at)
-    inertial = _torques(model, bodies, sample) - _torques(model, bodies, replace(sample, at=still))
+    still = [replace(m, v=0.0 * m.v, a=0.0 * m.a) for m in sample.at]
+    inertial = _torques(model, bodies, sample.at) - _torques(model, bodies, still)
     yield _Alteration("time_scale", "", inertial[..., None], 0.04, _clock)
     down = np.array(model.pin_model.gravity.linear)
     if down.any():
         across = np.linalg.svd(down[None])[2][1:]  # two directions at right angles to gravity
-        pulls = [_torques(_pulled(model, axis), pi, sample) - tau for axis in across]
-        Z = np.linalg.norm(down) * np.stack(pulls, axis=-1) / _STEP
-        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down))
+
+        def tilted(x: Array) -> tuple[RobotModel, Sequence[Trajectory]]:
+            return _pulled(model, _turned(x, across, down)), sample.at
+
+        pulls = [_torques(tilted(_STEP * axis)[0], pi, sample.at) - tau for axis in np.eye(2)]
+        Z = np.stack(pulls, axis=-1) / _STEP
+        yield _Alteration("gravity", "", Z, 0.05, _tilt(across, down), tilted)
     origins = [_origins(model, pi, sample, joint, tau) for joint in model.joints]
     for joint, Z in zip(model.joints, origins, strict=True):
         yield _Alteration("joint_origin", joint, Z, 0.01, _origin(joint))
@@ -149,13 +209,13 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
 
 def _origins(model: RobotModel, pi: Array, sample: Sample, joint: str, tau: Array) -> Array:
     """Return what moving a joint in the frame of the one before would change, shape (N, n, 3)."""
-    moved = [_torques(_displaced(model, joint, axis), pi, sample) for axis in np.eye(3)]
+    moved = [_torques(_displaced(model, joint, axis), pi, sample.at) for axis in np.eye(3)]
     return (np.stack(moved, axis=-1) - tau[..., None]) / _STEP
 
 
-def _torques(model: RobotModel, pi: Array, sample: Sample) -> Array:
-    """Return the torques of the motions by standard parameters, shape (N, n)."""
-    return np.concatenate([inverse_dynamics(model, pi, m) for m in sample.at])
+def _torques(model: RobotModel, pi: Array, at: Sequence[Trajectory]) -> Array:
+    """Return the torques of motions by standard parameters, shape (N, n)."""
+    return np.concatenate([inverse_dynamics(model, pi, motion) for motion in at])
 
 
 def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:
@@ -166,18 +226,23 @@ def _displaced(model: RobotModel, joint: str, axis: Array) -> RobotModel:
     return replace(model, pin_model=pin_model)
 
 
-def _pulled(model: RobotModel, axis: Array) -> RobotModel:
-    """Return the robot with a little gravity more along an axis."""
+def _pulled(model: RobotModel, gravity: Array) -> RobotModel:
+    """Return the robot under another gravity (3,) [m/s^2]."""
     pin_model = model.pin_model.copy()
-    pin_model.gravity.linear = pin_model.gravity.linear + _STEP * axis
+    pin_model.gravity.linear = gravity
     return replace(model, pin_model=pin_model)
 
 
+def _turned(x: Array, across: Array, down: Array) -> Array:
+    """Return gravity turned towards the two axes across it, by tangents x of angles (2,)."""
+    size = np.linalg.norm(down)
+    turned = down + size * x @ across
+    return np.asarray(turned * size / np.linalg.norm(turned))
+
+
 def _found(
-    sample: Sample,
-    own: Sequence[_Alteration],
-    sharpened: Callable[[_Alteration, float], tuple[float, float]],
-) -> Iterator[Finding]:
+    identification: "Identification", sample: Sample, own: Sequence[_Alteration]
+) -> Iterator[_Found]:
     """Yield what explains the residual, one after the other, beside what was found before."""
     Z = np.concatenate([alteration.Z for alteration in own], axis=2)
     ends = np.cumsum([alteration.Z.shape[2] for alteration in own]).tolist()
@@ -210,9 +275,11 @@ def _found(
         least = best.least * (_FAINT_SIZE if is_faint else 1.0)
         if np.linalg.norm(size) < max(least, _SURE * float(np.linalg.norm(error))):
             return
-        if best.code == "position_offset" and len(chosen) == 1:
-            size, error = (np.array([x]) for x in sharpened(best, float(size[0])))
-        yield _finding(best, size, error, share, [one for one in alike if one is not best])
+        there = sample
+        if best.applied is not None and len(chosen) == len(which):
+            size, error, there = _refined(best.applied, size, identification.standard, sample)
+        others = [one for one in alike if one is not best]
+        yield _Found(best, _finding(best, size, error, share, others), there)
 
 
 def _complexity(one: _Alteration) -> tuple[int, int]:
@@ -276,8 +343,7 @@ def _clock(x: Array, error: Array) -> str:
 
 def _tilt(across: Array, down: Array) -> Callable[[Array, Array], str]:
     def words(x: Array, error: Array) -> str:
-        turned = down + np.linalg.norm(down) * x @ across
-        turned *= np.linalg.norm(down) / np.linalg.norm(turned)
+        turned = _turned(x, across, down)
         angle, sure = (np.degrees(np.arctan(np.linalg.norm(size))) for size in (x, error))
         shown = ", ".join(f"{value:.2f}" for value in turned)
         return (

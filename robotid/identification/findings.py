@@ -13,9 +13,8 @@ from robotid._typing import Array
 from robotid.doctor.urdf_geometry import audit_bodies
 from robotid.estimators.consistent.constraints import slabs
 from robotid.findings import Finding, listed
-from robotid.identification.discrepancies import discrepancy_findings
 from robotid.identification.drive_choice import TENFOLD
-from robotid.identification.misfit import Sample, misfit_findings
+from robotid.identification.misfit import misfit_findings
 from robotid.identification.parameter_table import correlated_parameters
 from robotid.identification.regressor_noise import encoder_findings
 from robotid.identification.settings import BoundedSettings, ConsistentSettings
@@ -52,12 +51,14 @@ _DENSEST = 12_000.0  # [kg/m^3] of a link: lead has 11,340
 _LIGHT = 0.05  # share of a link's mass below which next to nothing is left of it
 
 
-def fit_findings(identification: Identification, sample: Sample | None) -> list[Finding]:
+def fit_findings(
+    identification: Identification, discrepancies: Sequence[Finding] = ()
+) -> list[Finding]:
     """Return what a user should know of a fit: what it leaves open, outliers, costs of physics.
 
     Args:
         identification: What was found.
-        sample: Rows of its recordings; None if they are too few to judge by.
+        discrepancies: What recordings or URDF have otherwise than stated.
     """
     findings = _static_findings(identification)
     known = identification.determination
@@ -77,7 +78,7 @@ def fit_findings(identification: Identification, sample: Sample | None) -> list[
     findings += _outlier_findings(identification)
     findings += misfit_findings(identification)
     findings += [*_drive_findings(identification), *_correlated(identification)]
-    findings += discrepancy_findings(identification, sample)
+    findings += discrepancies
     findings += encoder_findings(identification)
     for evaluation in identification.refitted:
         message = (

@@ -72,7 +72,7 @@ _ONE_SIDED = 0.6  # share from which a coupling is named that the other joint do
 _SEEN = 0.005  # of the torque: a term smaller than this is not named
 _MATTERS = 0.02  # ... and than this is no warning
 _MAIN = 50.0  # [%] of the squared residual: a term that explains more outranks a guess
-_OF_POSITION = ("position_periodic", "spring")
+_OF_POSITION = ("position_periodic", "spring", "position_offset")
 _OF_MASSES = ("counterbalance", "current_for_torque", "urdf_mismatch")
 _SPRINGS = ("ripple", "spring")  # parts of the torque that follow the position
 _DIGITS = "0123456789"
@@ -80,6 +80,7 @@ _NEAR = 0.5  # periods of the filter's cut-off
 _OUTLIER = 12.0  # usual residuals from which a row is left out
 _ALIKE = 0.02  # of the squared residual, within which two terms explain alike
 _RIDGE = 1e-4  # share of a column that the regressor must leave of it
+_FREE = 1e3  # residuals that a column beside the base parameters may explain before the data
 _CONFIRMED = 0.25  # of the share, that a validation must show of it for a warning
 
 
@@ -283,8 +284,10 @@ class Sample:
         stretches: Which rows each of the K stretches has, those of the logs kept apart last.
         fitted: How many of the stretches are of fitted logs.
         rows: How many of the rows are.
-        W: Regressor of the base parameters over their spread before the data, shape (N, n, b).
+        W: Regressor of the base parameters over their spread before the data, shape (N, n, b), and
+            columns that are refitted beside them.
         r: Residual of the estimate, shape (N, n).
+        independent: Which columns of the regressor are those of base parameters, shape (b,), int.
         U: Factor of the covariance of base parameters before the data, C = U^T U, shape (b, b).
         A: W^T W of each stretch, all joints together, shape (K, b, b).
         B: W^T r likewise, shape (K, b).
@@ -302,9 +305,23 @@ class Sample:
     rows: int
     W: Array
     r: Array
+    independent: Array
     U: Array
     A: Array
     B: Array
+
+    def beside(self, Z: Array) -> "Sample":
+        """Return the same rows with more columns that are refitted as base parameters are.
+
+        Args:
+            Z: What sizes of 1 add to the torques, shape (N, n, c) [N m or N].
+        """
+        columns = self.weight[:, :, None] * Z
+        size = np.linalg.norm(columns, axis=(0, 1))
+        spread = _FREE * np.linalg.norm(self.r) / np.where(size > 0, size, np.inf)
+        W = np.concatenate([self.W, columns * spread], axis=2)
+        A, B = _products(W, self.r, self.stretches)
+        return replace(self, W=W, A=A, B=B)
 
     @cached_property
     def is_fitted(self) -> Array:
@@ -377,26 +394,26 @@ def take_sample(identification: "Identification", *, is_steady: bool = True) -> 
         rows=own,
         W=W,
         r=r,
+        independent=mapping.independent,
         U=U,
         A=A,
         B=B,
     )
 
 
-def along(
-    sample: Sample, identification: "Identification", at: Sequence[Trajectory], tau: Array
-) -> Sample:
-    """Return the same rows with other positions than the recordings have.
+def along(sample: Sample, model: RobotModel, at: Sequence[Trajectory], tau: Array) -> Sample:
+    """Return the same rows of another robot, or with other positions than the recordings have.
 
     Args:
         sample: The rows.
-        identification: What was found.
+        model: The robot, of the same parameters.
         at: The motions, as of ``Sample.at``.
         tau: Torques of the estimate along them, shape (N, n) [N m or N].
     """
-    model, independent = identification.model, identification.mapping.independent
-    Y = np.concatenate([_regressor(model, motion)[:, :, independent] for motion in at])
+    known = sample.independent
+    Y = np.concatenate([_regressor(model, motion)[:, :, known] for motion in at])
     W = sample.weight[:, :, None] * (Y @ sample.U.T)
+    W = np.concatenate([W, sample.W[:, :, W.shape[2] :]], axis=2)
     r = sample.weight * (np.concatenate([motion.tau for motion in at]) - tau)
     A, B = _products(W, r, sample.stretches)
     return replace(sample, at=tuple(at), W=W, r=r, A=A, B=B)
@@ -520,7 +537,7 @@ class Trial:
     Attributes:
         S: [Z r]^T M [Z r] of the rows fitted, shape (..., c + 1, c + 1).
         H: What [Z r] leaves of each stretch after the regressor's fit, shape (K, c + 1, c + 1).
-        T: What of base parameters, over their spread, imitates [Z r], shape (..., b, c + 1).
+        T: What of the columns of W imitates [Z r], shape (..., b, c + 1).
     """
 
     S: Array
@@ -648,7 +665,7 @@ def _of_joint(sample: Sample, j: int) -> Iterator[Misfit]:
                 std_error=std_error,
                 unit=unit,
                 error=error,
-                shift=-whole.T[:, place[best]] @ theta,
+                shift=-whole.T[: len(sample.U), place[best]] @ theta,
                 theta=theta,
                 scale=motion,
                 entries=_entries(sample, j, best),

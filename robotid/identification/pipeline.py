@@ -36,6 +36,7 @@ from robotid.identification.bands import (
     usual_friction,
 )
 from robotid.identification.baselines import urdf_with_drives
+from robotid.identification.discrepancies import explain_residual
 from robotid.identification.drive_choice import DriveChoice, choose_drives, wanted_families
 from robotid.identification.evaluation import Evaluation, evaluate_logs, hidden_joints, pool
 from robotid.identification.findings import fit_findings, log_findings, unwritten
@@ -44,7 +45,6 @@ from robotid.identification.metrics import Metrics
 from robotid.identification.misfit import (
     Misfit,
     counterbalanced,
-    find_misfits,
     settled,
     take_sample,
     with_known_springs,
@@ -687,10 +687,11 @@ def conclude(
         fit = with_drives(recordings, choice, wanted, balanced, progress=progress)
     report_stage(progress, "errors and intervals")
     sample = take_sample(fit)
-    fit = with_model_error(fit, sample, find_misfits(sample))
+    misfits, discrepancies = explain_residual(fit, sample)
+    fit = with_model_error(fit, sample, misfits)
     # what the motion excites the fit tells from all rows: finding "undetermined"
     told = [f for f in found if f.severity != "note" and f.code != "excitation"]
-    told = settled(with_known_springs(told, fit), fit_findings(fit, sample))
+    told = settled(with_known_springs(told, fit), fit_findings(fit, discrepancies))
     told = refuted(told, fit.predictions, fit.witness)
     alarms = alarming(told, ignore, is_robust=is_robust)
     heads = [log.head for log in (*recordings.fitted, *recordings.kept)]

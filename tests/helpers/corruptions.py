@@ -131,6 +131,17 @@ def noise(name):
     return column(name, function)
 
 
+def differenced(bits, name):
+    """Replace a velocity by the difference of an encoder's counts."""
+
+    def change(table):
+        step = 2 * np.pi / 2**bits
+        counts = np.round(table[name.replace("dq_", "q_")] / step) * step
+        return {**table, name: np.gradient(counts, table["time"])}
+
+    return change
+
+
 def compensated(table):
     """Take the gravity torque off that the URDF says, as a controller's channel does."""
     import pinocchio as pin
@@ -188,6 +199,7 @@ CASES = {
     "velocity in rpm": Case(("velocity_scale",), scaled("dq_", 9.5493)),
     "dead velocity channel": Case(("velocity_scale",), scaled("dq_elbow", 0.0)),
     "one velocity replaced by noise": Case(("unlike_velocity",), noise("dq_elbow_joint")),
+    "velocity of a 12-bit encoder": Case(("quantised",), differenced(12, "dq_elbow_joint")),
     "milliseconds": Case(("time_unit",), scaled("time", 1000)),
     "nanoseconds since 1970": Case(("time_unit",), column("time",
         lambda x, _t: np.round((x + 1.7e9) * 1e9))),

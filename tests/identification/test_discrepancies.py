@@ -10,8 +10,8 @@ from helpers.fitting import identify
 from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
-from robotid.identification.discrepancies import discrepancy_findings
-from robotid.identification.misfit import take_sample
+from robotid.identification.discrepancies import explain_residual
+from robotid.identification.misfit import find_misfits, take_sample
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
@@ -42,7 +42,7 @@ def found(model, change, robot="ur5_robot.urdf", turn=None):
         log = Log(run.t, run.q, run.tau, model.joints, run.v, path=f"run{part}.csv")
         logs.append(change(log))
     identification = fitted(model, logs)
-    findings = discrepancy_findings(identification, take_sample(identification))
+    _, findings = explain_residual(identification, take_sample(identification))
     doubted = {doubt.code for doubt in identification.doubts}
     assert {finding.code for finding in findings} <= doubted
     return findings
@@ -58,14 +58,15 @@ def on(model, joint, value, elsewhere):
 
 
 def test_nothing_is_said_of_a_robot_that_only_weighs_differently(model):
-    assert found(model, lambda log: log) == []
+    assert found(model, lambda log: log) == ()
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
     logs = [log_with(model, 3, effect, part=part) for part in (0, 1)]
     found = fitted(model, logs)
-    assert discrepancy_findings(found, take_sample(found)) == []
+    _, discrepancies = explain_residual(found, take_sample(found))
+    assert discrepancies == ()
 
 
 # sizes are of first order: those of large faults are off by a quarter
@@ -106,6 +107,43 @@ def test_a_large_offset_of_a_zero_has_its_size_and_makes_no_other_finding(model,
     assert 0 < finding.evidence["std_error"] < 0.05 * abs(offset)
 
 
+def both(truth, model, seed, joint, offset, **effect):
+    """Return what is found of logs with the effect on a joint, whose position is off besides."""
+    moved = offset * np.eye(len(model.joints))[joint]
+    logs = [log_with(truth, seed, joint=joint, part=part, **effect) for part in (0, 1)]
+    found = fitted(model, [replace(log, q=log.q + moved) for log in logs])
+    misfits, discrepancies = explain_residual(found, take_sample(found))
+    assert discrepancies == tuple(f for f in found.findings if f in discrepancies)
+    return find_misfits(take_sample(found)), misfits, [(f.code, f.where) for f in discrepancies]
+
+
+def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
+    joints = [f"panda_joint{i}" for i in range(1, 8)]
+    panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=joints)
+    alone, misfits, named = both(panda, panda, 2, 1, 0.15, rate=50.0)
+    assert [(m.joint, m.term.code, m.matters) for m in alone] == [("panda_joint3", "spring", True)]
+    assert misfits == ()
+    assert named == [("position_offset", "panda_joint2")]
+
+
+@pytest.mark.parametrize(("offset", "size"), [(0.1, 1.0), (0.03, 3.0)])  # what explains more
+def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size):
+    alone, (spring,), named = both(model, model, 3, 2, offset, effect="spring", size=size)
+    assert (spring.joint, spring.term.name) == ("elbow_joint", "linear spring")
+    assert spring.size == pytest.approx(alone[0].size, rel=0.01)
+    assert named == [("position_offset", "elbow_joint")]
+
+
+def test_a_base_that_is_not_level_makes_no_counterbalance(model):
+    turn = pin.exp3(np.array([np.radians(6), 0.0, 0.0]))
+    gravity = turn @ np.array([0.0, 0.0, -9.81])
+    truth = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=gravity)
+    alone, misfits, named = both(truth, model, 3, 1, 0.1)
+    assert [(m.joint, m.term.code) for m in alone] == [("shoulder_pan_joint", "position_periodic")]
+    assert misfits == ()
+    assert named == [("gravity", "all joints"), ("position_offset", "shoulder_lift_joint")]
+
+
 def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):
     text = example_urdf("ur5_robot.urdf").read_text()
     start = text.index('<joint name="elbow_joint"')
@@ -125,7 +163,7 @@ def test_a_base_that_is_not_level_is_named(model):
     turn = pin.exp3(np.array([0.15, 0.0, 0.0]))
     first = found(model, lambda log: log, turn=turn)[0]
     assert (first.code, first.where) == ("gravity", "all joints")
-    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.1)
+    assert first.evidence["size"] == pytest.approx(np.tan(0.15), rel=0.03)
     stated = [float(x) for x in first.message.split("gravity = [")[1].split("]")[0].split(",")]
     np.testing.assert_allclose(stated, turn @ [0.0, 0.0, -9.81], atol=0.15)
 

@@ -307,6 +307,7 @@ def test_a_term_stands_for_what_the_doctor_guessed_of_its_torque(ur5):
     assert (term.severity, term.evidence["replaces"]) == ("warning", 2.0)
     assert "It explains urdf_mismatch, unexplained_torque, and" in term.message
     assert [doubt.joint for doubt in doubts_of([term], ur5.joints)] == [LIFT]
+    assert said("position_offset", 90.0)[0] == [2, 3]
     assert said("load_friction", 90.0)[0] == [0, 2, 3]
     assert said("spring", 40.0) == ([0, 1, 2, 3], Finding(
         "spring", "note", LIFT, "It is.", {"share_pct": 40.0, "error_pct": 1.0}
@@ -322,11 +323,7 @@ def test_a_joint_that_follows_its_position_is_no_other_robot(ur5, effect, seed, 
     guesses = check_logs(ur5, logs[:1], validation=logs[1:])
     assert guess in {finding.code for finding in guesses}
     found = fitted(ur5, logs)
-    said = {
-        f.code
-        for f in settled(guesses, fit_findings(found, misfit.take_sample(found)))
-        if f.severity != "note"
-    }
+    said = {f.code for f in settled(guesses, fit_findings(found)) if f.severity != "note"}
     assert EFFECTS[effect].code in said
     assert not said & {"counterbalance", "urdf_mismatch", "current_for_torque"}
     assert "unexplained_torque" not in said

@@ -93,10 +93,9 @@ def test_friction_stands_beside_it_as_a_share_of_the_torque(ur5):
 
 def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is_its_own(ur5):
     from robotid.identification.findings import fit_findings
-    from robotid.identification.misfit import take_sample
 
     found = found_of(ur5, near_urdf(ur5))
-    shapes = {f.code for f in fit_findings(found, take_sample(found)) if f.severity == "warning"}
+    shapes = {f.code for f in fit_findings(found) if f.severity == "warning"}
     assert not shapes & {"com_outside", "gyration", "density"}
     i = ur5.layout.names.index("forearm_link.mcx")
 
@@ -105,10 +104,10 @@ def test_an_identified_body_that_cannot_be_so_is_not_good_and_the_urdfs_fault_is
 
     far = found.standard.copy()
     far[i] += 1.0 * far[i - 1]  # the centre of mass a metre aside
-    (finding,) = [f for f in fit_findings(replace(found, standard=far), None) if is_forearm(f)]
+    (finding,) = [f for f in fit_findings(replace(found, standard=far)) if is_forearm(f)]
     assert (finding.severity, finding.where) == ("warning", "link forearm_link")
     assert finding.message.startswith("as identified, link 'forearm_link'")
-    of_urdf = fit_findings(replace(found, standard=far, prior=far), None)
+    of_urdf = fit_findings(replace(found, standard=far, prior=far))
     (finding,) = [f for f in of_urdf if is_forearm(f)]
     assert finding.severity == "note"
     assert "so it is in the URDF already" in finding.message
@@ -120,7 +119,7 @@ def test_a_needle_denser_than_any_material_is_named_unless_the_urdf_has_it(ur5):
     found = found_of(ur5, near_urdf(ur5))
 
     def dense(found):
-        return [f for f in fit_findings(found, None) if f.code == "dense_body"]
+        return [f for f in fit_findings(found) if f.code == "dense_body"]
 
     assert dense(found) == []
     needle = found.standard.copy()
