@@ -233,3 +233,66 @@ def test_a_sample_that_is_none_changes_nothing(model, t, q, tau, words):
     with pytest.raises(DataError, match=words):
         online.update(t, q, tau)
     online.update(-1.0, [0.0, 0.0], [0, 0])  # earlier than the one that was refused
+
+
+def ghosts(*arrays):
+    return {"x": arrays}
+
+
+REFUSED = {
+    "start is ": lambda m, log: log.window(log.q, 1.0),
+    "end is ": lambda m, log: log.window(0.0, 10**400),
+    "constraints has 'weight', wanted some of mass": lambda m, log: robotid.EstimatorSettings(
+        constraints={"weight": 1.0}
+    ),
+    "joint 'joint_2' is locked at": lambda m, log: RobotModel.from_urdf(
+        URDF, locked={"joint_2": "x"}
+    ),
+    "ratios of 'c' has ('joint_2', 'x'), wanted pairs": lambda m, log: robotid.Coupling(
+        "c", (("joint_1", 1.0), ("joint_2", "x"))
+    ),
+    "the mass of the payload on link_2 is 'x' kg, wanted": lambda m, log: identify_payload(
+        m, log, log, masses={"link_2": "x"}
+    ),
+    "masses of 'x' have shape (3,), wanted 20 or 28 finite": lambda m, log: robotid.replay(
+        m, log.t, log.q, masses={"y": m.standard_parameters(), "x": np.zeros(3)}
+    ),
+    "ghost 'x' has 3 arrays, wanted two": lambda m, log: robotid.replay(
+        m, log.t, log.q, ghosts=ghosts(log.t, log.q, log.q)
+    ),
+    "gravity is ": lambda m, log: RobotModel.from_urdf(URDF, gravity=(0, 0, 10**400)),
+    "trajectory: rate is 'x', wanted": lambda m, log: robotid.Trajectory(
+        log.t, log.q, log.q, log.q, log.tau, log.joints, "x", np.zeros(60, dtype=int)
+    ),
+    "trajectory: segment is object of shape (), wanted": lambda m, log: robotid.Trajectory(
+        log.t, log.q, log.q, log.q, log.tau, log.joints, None, [[1], [1, 2]]
+    ),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_an_entry_of_another_kind_is_named(model, log, words):
+    with pytest.raises(RobotIdError) as error:
+        REFUSED[words](model, log)
+    assert str(error.value).startswith(words)
+
+
+@pytest.mark.parametrize("gain", [None, "x", np.nan, 0])
+def test_a_gain_that_is_no_number_is_refused(log, tmp_path, gain):
+    robotid.write_log(log, tmp_path / "log.csv")
+    gains = {"joint_1": 2.0, "joint_2": gain}
+    with pytest.raises(SettingsError, match=r"gain of 'joint_2' is .*, wanted a number other than"):
+        robotid.read_log(tmp_path / "log.csv", log.joints, gains=gains)
+
+
+def test_flags_and_numbers_of_numpy_are_flags_and_numbers(log):
+    assert RobotModel.from_urdf(URDF, free_flyer=np.True_).free_flyer
+    part = log.window(np.float32(0.1), np.int64(1))
+    assert (part.t[0], part.t[-1]) == (0.12, 1.0)
+    assert len(log.window(-np.inf, np.inf).t) == len(log.t)
+
+
+def test_files_of_a_page_are_named_by_text(found, tmp_path):
+    with pytest.raises(SettingsError, match=r"an entry of files is \['result', 5\]"):
+        robotid.write_report(found, tmp_path / "page.html", files={"result": 5})
+    assert not list(tmp_path.iterdir())
