@@ -204,7 +204,8 @@ def test_masked_values_are_not_predicted_with(found, log):
 
 
 @pytest.mark.parametrize(
-    "path", ["x" * 300, f"{'y' * 256}/x.csv", "x/" * 3000 + "x", "a\0b", "\ud800"]
+    "path",
+    ["x" * 300, f"x/{'y' * 256}/z", f"{'y' * 256}/x.csv", "x/" * 3000 + "x", "a\0b", "\ud800"],
 )
 def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
     for call in (
@@ -224,6 +225,7 @@ def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
         ("x", [0, 0], [0, 0], "t = x s is not finite"),
         (0.0, None, [0, 0], "q is None, wanted an array"),
         (0.0, [0, 0, 0], [0], r"q \(3,\) and tau \(1,\): wanted \(2,\) each"),
+        (0.0, [0, 0], [0, 0, 0], r"q \(2,\) and tau \(3,\): wanted \(2,\) each"),
         (0.0, [0, 0], ["x", 0], "tau is no array of real numbers"),
         (0.0, [0, 0], [np.nan, 0], "is not finite, so it was refused"),
     ],

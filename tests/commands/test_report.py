@@ -124,6 +124,16 @@ def test_inputs_that_are_not_those_of_the_settings_are_named(out, capsys, change
     assert contents(out) == before
 
 
+def test_a_recording_that_the_settings_lack_is_named(out, capsys):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    content["settings"]["validation"] = []
+    path.write_text(json.dumps(content))
+    assert main(["report", str(out)]) == 1
+    said = "has 1 inputs of the role 'validation', but its settings name 0"
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
     path = out / "result.json"
     content = json.loads(path.read_text())
