@@ -16,6 +16,7 @@ from robotid.exceptions import DataError, SettingsError
 __all__ = [
     "check_file",
     "check_folder",
+    "check_path",
     "file_sha256",
     "folder_beside",
     "missing_file",
@@ -24,6 +25,32 @@ __all__ = [
     "write_text",
     "written_whole",
 ]
+
+
+def check_path(path: str | Path) -> None:
+    """Refuse what no file system takes as the path of a file or folder.
+
+    Args:
+        path: The path.
+
+    Raises:
+        SettingsError: If it is no UTF-8, has a NUL, or is, or has a name that is, too long.
+    """
+    try:
+        raw = os.fsencode(path)
+    except UnicodeEncodeError:
+        raw = b"\0"
+    if b"\0" in raw or len(raw) > _LONGEST_PATH:
+        raise SettingsError(
+            f"{str(path)[:_SHOWN]!r} cannot name a file: wanted UTF-8 without NUL, at most "
+            f"{_LONGEST_PATH} bytes"
+        )
+    name = max(raw.split(os.fsencode(os.sep)), key=len)
+    if len(name) > _LONGEST:
+        raise SettingsError(
+            f"the name '{os.fsdecode(name)[:_SHOWN]}...' of a file has {len(name)} bytes, wanted "
+            f"at most {_LONGEST}; name a shorter one (names of results begin with that of the URDF)"
+        )
 
 
 def check_file(target: Path) -> None:
@@ -36,7 +63,7 @@ def check_file(target: Path) -> None:
         DataError: If its folder does not exist.
         SettingsError: If it is a folder, or its name is too long.
     """
-    _check_length(target.name)
+    check_path(target)
     if not target.parent.is_dir():
         raise DataError(f"there is no folder {str(target.parent)!r} to write {target.name} in")
     if target.is_dir():
@@ -56,6 +83,7 @@ def check_folder(target: Path, names: Iterable[str] = ()) -> None:
         SettingsError: If it, or a folder above it, is a file or not writable, or if one of its
             files is a folder or has a name that is too long.
     """
+    check_path(target)
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not there.is_dir():
         raise SettingsError(
@@ -64,12 +92,13 @@ def check_folder(target: Path, names: Iterable[str] = ()) -> None:
     if not os.access(there, os.W_OK | os.X_OK):
         raise SettingsError(f"the folder {str(there)!r} is not writable; name another")
     for name in names:
-        _check_length(name)
+        check_path(name)
         if there == target:
             check_file(target / name)
 
 
 _LONGEST = 255  # bytes of a file's name
+_LONGEST_PATH = 4095  # bytes of a whole path
 _HIDDEN = 32  # bytes that the name of a hidden file has beside it
 _SHOWN = 60  # characters of a name in a message
 
@@ -118,15 +147,6 @@ def _hidden(name: str) -> str:
     known = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
     kept = name if len(os.fsencode(name)) <= _LONGEST - _HIDDEN else known
     return f".{kept}.{os.getpid()}"
-
-
-def _check_length(name: str) -> None:
-    """Refuse a name that no file system takes."""
-    if (length := len(os.fsencode(name))) > _LONGEST:
-        raise SettingsError(
-            f"the name '{name[:_SHOWN]}...' of a file to write has {length} bytes, wanted at most "
-            f"{_LONGEST}; name a shorter one (names of results begin with that of the URDF)"
-        )
 
 
 def _is_stream(path: Path) -> bool:

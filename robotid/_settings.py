@@ -5,8 +5,10 @@ the settings in result.json all come from these fields.
 """
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
+from numbers import Real
 from typing import Any, ClassVar, Self, TypeGuard, get_args, get_origin
 
 from robotid.exceptions import SettingsError
@@ -20,6 +22,9 @@ __all__ = [
     "Range",
     "Settings",
     "check_keys",
+    "is_number",
+    "require_each",
+    "require_flag",
     "require_kind",
     "setting",
     "table_in",
@@ -57,6 +62,57 @@ def require_kind(value: object, kind: type | tuple[type, ...], name: str, wanted
     """
     if not isinstance(value, kind):
         raise SettingsError(f"{name} is {_shown(value)}, a {type(value).__name__}, wanted {wanted}")
+
+
+def require_each(
+    values: object, kind: type | tuple[type, ...], name: str, wanted: str
+) -> list[Any]:
+    """Return the entries of a list that a function takes, or refuse what is no list of such.
+
+    Args:
+        values: The argument: a list, a tuple, a set or an array of one dimension.
+        kind: What its entries may be.
+        name: What it is called.
+        wanted: What is wanted, in words.
+
+    Raises:
+        SettingsError: If it is something else: text, or a table, is no list.
+    """
+    is_list = isinstance(values, Collection) and not isinstance(values, str | bytes | Mapping)
+    entries = list(values) if is_list and getattr(values, "ndim", 1) == 1 else [None]  # type: ignore[call-overload]
+    if not all(isinstance(entry, kind) for entry in entries):
+        raise SettingsError(
+            f"{name} is {_shown(values)}, a {type(values).__name__}, wanted {wanted}"
+        )
+    return entries
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is one finite number, of Python or of NumPy; True and False are none.
+
+    Args:
+        value: The value.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float is as large as
+        return False
+
+
+def require_flag(value: object, name: str) -> None:
+    """Refuse an argument that is neither True nor False, of Python or of NumPy.
+
+    Args:
+        value: The argument.
+        name: What it is called.
+
+    Raises:
+        SettingsError: If it is something else.
+    """
+    if type(value).__name__ not in ("bool", "bool_"):
+        require_kind(value, bool, name, "True or False")
 
 
 POSITIVE = Range("a positive number", lambda x: x > 0)

@@ -1,20 +1,30 @@
 """Text for people: lines that fit the terminal, columns in line, digits that mean something."""
 
+import json
 import math
 import os
 import re
 import shutil
 import textwrap
 from collections.abc import Sequence
-from typing import TextIO
+from typing import Any, TextIO
 
-__all__ = ["columns", "in_digits_of", "terminal_width", "tinted", "wrapped"]
+__all__ = [
+    "columns",
+    "in_digits_of",
+    "terminal_width",
+    "tinted",
+    "wrapped",
+    "yaml_name",
+    "yaml_plain",
+]
 
 _PATH = re.compile(r"'[^' ]*/[^'\n]*'")  # a quoted path, which may have blanks
 _UNIT = re.compile(r"(?<=\d) (?=%|(?:m?s|kg|N|m|Hz|rad)\b)")  # between a number and its unit
 _PLAIN = (-3, 6)  # powers of ten that are written without an exponent
 _GAP = 2  # blanks between columns
 _NARROWEST = 40
+_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")  # no text in YAML 1.1
 _TONES = {"good": 32, "usable": 33, "poor": 31, "error": 31, "warning": 33}  # of ANSI terminals
 
 
@@ -121,3 +131,28 @@ def in_digits_of(value: float, error: float | None) -> tuple[str, str]:
     if _PLAIN[0] <= top < _PLAIN[1]:
         return f"{value:.{max(-last, 0)}f}", f"{error:.{max(-last, 0)}f}"
     return tuple(f"{x / 10**top:.{top - last}f}e{top:+03d}" for x in (value, error))  # type: ignore[return-value]
+
+
+def yaml_name(text: str) -> str:
+    """Return a name as YAML has it in one line, quoted unless it is a plain word.
+
+    Args:
+        text: The name.
+    """
+    is_plain = text.isascii() and text.isidentifier() and text.lower() not in _YAML_WORDS
+    return text if is_plain else yaml_plain(text)
+
+
+def yaml_plain(entry: Any) -> str:  # noqa: ANN401
+    """Return a plain value as YAML has it; characters that end a line of YAML are escaped.
+
+    Args:
+        entry: Text, which is quoted, a number, a boolean or None.
+    """
+    text = json.dumps(entry, ensure_ascii=False)
+    return "".join(c if c.isprintable() else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    number = ord(character)
+    return f"\\u{number:04x}" if number < 2**16 else f"\\U{number:08x}"

@@ -8,10 +8,23 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from helpers.hostile_inputs import KINDS
+from helpers.hostile_arguments import ARGUMENT_KINDS
+from helpers.hostile_commands import COMMAND_KINDS
+from helpers.hostile_inputs import KINDS as INPUT_KINDS
 from hypothesis import HealthCheck, Phase, given, settings
 
-EXAMPLES = {"values, identified": 12, "job file": 25, "result.json": 25}  # others: 40
+KINDS = INPUT_KINDS | COMMAND_KINDS | ARGUMENT_KINDS
+EXAMPLES = {
+    "values, identified": 12,
+    "job file": 25,
+    "result.json": 25,
+    "excite": 20,
+    "simulate": 20,
+    "drives of a job": 20,
+    "loop of a job": 5,
+    "report of result.json": 10,
+    "Python arguments": 150,
+}  # others: 40
 
 
 @pytest.mark.parametrize("kind", KINDS)

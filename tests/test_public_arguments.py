@@ -3,6 +3,7 @@
 A wrong keyword stays Python's TypeError.
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,7 @@ def test_a_masked_value_is_no_value(log, column):
         ({"q": [[1.0, 2.0], [3.0]]}, "wanted one of floats, with rows of equal length"),
         ({"q": np.full((60, 2), 1j)}, "q is no array of real numbers .numbers of kind 'c'"),
         ({"joints": 5}, "joints is 5, wanted at least one name in a tuple"),
+        ({"t": 10**400}, "t is no array of real numbers"),
         ({"joints": (1, 2)}, "wanted at least one name in a tuple"),
         ({"joints": {"joint_1": 0, "joint_2": 1}}, "wanted at least one name in a tuple"),
     ],
@@ -103,13 +105,46 @@ CALLS = {
     "target": lambda m, log: robotid.write_sdf(m, m.standard_parameters(), 5),
     "model  ": lambda m, log: robotid.write_mjcf(5, m.standard_parameters(), "x.xml"),
     "t": lambda m, log: robotid.replay(m, None, log.q),
+    "path     ": lambda m, log: Log(**fields(log, path=5)),
+    "has_torque": lambda m, log: Log(**fields(log, has_torque="x")),
+    "notes": lambda m, log: Log(**fields(log, notes=[5])),
+    "joints  ": lambda m, log: log.select(["joint_1", 5]),
+    "joints   ": lambda m, log: robotid.LogSource(joints=5),
+    "command": lambda m, log: robotid.LogSource(command=5),
+    "estimator ": lambda m, log: robotid.EstimatorSettings(["ols"]),
+    "constraints": lambda m, log: robotid.EstimatorSettings(constraints=5),
+    "name": lambda m, log: robotid.Coupling(5, (("joint_1", 1.0),)),
+    "ratios": lambda m, log: robotid.Coupling("c", "x"),
+    "replaces": lambda m, log: robotid.Coupling("c", (("joint_1", 1.0),), 1),
+    "free_flyer": lambda m, log: RobotModel.from_urdf(URDF, free_flyer=np.zeros(2)),
+    "free_flyer ": lambda m, log: robotid.inspect_urdf(URDF, free_flyer="x"),
+    "snap_angles": lambda m, log: RobotModel.from_urdf(URDF, snap_angles=None),
+    "terms": lambda m, log: RobotModel.from_urdf(URDF, terms=[5]),
+    "couplings ": lambda m, log: RobotModel.from_urdf(URDF, couplings=np.array("x")),
+    "own_terms of 'joint_2'": lambda m, log: RobotModel.from_urdf(URDF, own_terms={"joint_2": [5]}),
+    "prismatic": lambda m, log: robotid.read_log("x.csv", ["a"], prismatic=[["a"]]),
+    "transmissions": lambda m, log: robotid.read_log("x.csv", ["a"], transmissions=[None]),
+    "a key of columns": lambda m, log: robotid.read_log("x.csv", ["a"], columns={1: "t"}),
+    "columns['tau_a']": lambda m, log: robotid.read_log("x.csv", ["a"], columns={"tau_a": 1}),
+    "doctor": lambda m, log: identify(m, log, doctor="no"),
+    "links ": lambda m, log: identify_payload(m, log, log, links=[5]),
+    "unknown_gains ": lambda m, log: identify_payload(m, log, log, unknown_gains="joint_1"),
+    "noise of 'joint_2'": lambda m, log: robotid.preview(m, log, noise={"joint_2": "x"}),
+    "commanded": lambda m, log: robotid.write_mjcf(
+        m, m.standard_parameters(), "x.xml", commanded=["x"]
+    ),
+    "marks": lambda m, log: robotid.replay(m, log.t, log.q, marks=["x"]),
+    "notes ": lambda m, log: robotid.replay(m, log.t, log.q, notes=[5]),
+    "masses of 'x'": lambda m, log: robotid.replay(m, log.t, log.q, masses={"x": 5}),
+    "ghost 'x'": lambda m, log: robotid.replay(m, log.t, log.q, ghosts={"x": 5}),
+    "rate": lambda m, log: robotid.replay(m, log.t, log.q, rate=10**400),
 }
 
 
 @pytest.mark.parametrize("name", CALLS)
 def test_an_argument_of_another_kind_is_named(model, log, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SettingsError, match=rf"^{name.strip()} is .*, wanted "):
+    with pytest.raises(SettingsError, match=rf"^{re.escape(name.strip())} is .*, wanted "):
         CALLS[name](model, log)
     assert not list(Path(tmp_path).iterdir())
 
@@ -127,3 +162,139 @@ def test_a_payload_needs_logs_with_and_without_it(model, log, logs, reference):
     name = "logs" if not given[0] else "reference"
     with pytest.raises(DataError, match=rf"^{name} has no log, wanted at least one"):
         identify_payload(model, *given)
+
+
+@pytest.fixture(scope="module")
+def found(model, log):
+    return identify(model, log, estimator="ols", doctor=False, friction="none")
+
+
+CALLS_OF_A_RESULT = {
+    "q is no array of real numbers": lambda found, q: found.predict("x"),
+    "v is no array of real numbers": lambda found, q: found.predict(q, 1j * q),
+    "a is no array of real numbers": lambda found, q: found.predict(q, q, 10**400),
+    "joint is 5, a int, wanted the name of a joint": lambda found, q: found.friction(5),
+    "v is no array of real": lambda found, q: found.friction("joint_1", "x"),
+    "v has shape (3, 2), wanted finite speeds": lambda found, q: found.friction("joint_1", q),
+    "q is 'x', wanted a finite number": lambda found, q: found.friction("joint_1", q="x"),
+    "load is 'nan', wanted a finite": lambda found, q: found.friction("joint_1", load=np.nan),
+    "joint is None, a NoneType, wanted the name": lambda found, q: found.plot_why(None),
+    "recording is 5, a int, wanted": lambda found, q: found.plot_torques("joint_1", recording=5),
+    "name is ['wls'], wanted 'estimate' or 'wls'": lambda found, q: found.metrics(["wls"]),
+    "'a\\x00b' cannot name a file": lambda found, q: found.save("a\0b"),
+    "'\\ud800' cannot name a file": lambda found, q: robotid.write_report(found, "\ud800"),
+}
+
+
+@pytest.mark.parametrize("words", CALLS_OF_A_RESULT)
+def test_what_is_asked_of_a_result_is_checked(found, log, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RobotIdError) as error:
+        CALLS_OF_A_RESULT[words](found, log.q[:3])
+    assert str(error.value).startswith(words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_masked_values_are_not_predicted_with(found, log):
+    q = np.ma.masked_array(log.q[:3], mask=np.zeros((3, 2), dtype=bool))
+    assert np.array_equal(found.predict(q), found.predict(log.q[:3]))
+    q.mask[1, 1] = True
+    with pytest.raises(DataError, match=r"q is not finite in row 1"):
+        found.predict(q)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["x" * 300, f"x/{'y' * 256}/z", f"{'y' * 256}/x.csv", "x/" * 3000 + "x", "a\0b", "\ud800"],
+)
+def test_a_path_that_no_file_system_takes_is_refused(model, log, path):
+    for call in (
+        lambda: robotid.read_log(path, ["a"]),
+        lambda: identify(model, path),
+        lambda: robotid.load_result(path),
+        lambda: robotid.read_job(path),
+        lambda: robotid.write_log(log, f"{path}.csv"),
+    ):
+        with pytest.raises(SettingsError, match=r"cannot name a file|a file has .* bytes, wanted"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("t", "q", "tau", "words"),
+    [
+        ("x", [0, 0], [0, 0], "t = x s is not finite"),
+        (0.0, None, [0, 0], "q is None, wanted an array"),
+        (0.0, [0, 0, 0], [0], r"q \(3,\) and tau \(1,\): wanted \(2,\) each"),
+        (0.0, [0, 0], [0, 0, 0], r"q \(2,\) and tau \(3,\): wanted \(2,\) each"),
+        (0.0, [0, 0], ["x", 0], "tau is no array of real numbers"),
+        (0.0, [0, 0], [np.nan, 0], "is not finite, so it was refused"),
+    ],
+)
+def test_a_sample_that_is_none_changes_nothing(model, t, q, tau, words):
+    online = robotid.OnlineIdentifier(model)
+    with pytest.raises(DataError, match=words):
+        online.update(t, q, tau)
+    online.update(-1.0, [0.0, 0.0], [0, 0])  # earlier than the one that was refused
+
+
+def ghosts(*arrays):
+    return {"x": arrays}
+
+
+REFUSED = {
+    "start is ": lambda m, log: log.window(log.q, 1.0),
+    "end is ": lambda m, log: log.window(0.0, 10**400),
+    "constraints has 'weight', wanted some of mass": lambda m, log: robotid.EstimatorSettings(
+        constraints={"weight": 1.0}
+    ),
+    "joint 'joint_2' is locked at": lambda m, log: RobotModel.from_urdf(
+        URDF, locked={"joint_2": "x"}
+    ),
+    "ratios of 'c' has ('joint_2', 'x'), wanted pairs": lambda m, log: robotid.Coupling(
+        "c", (("joint_1", 1.0), ("joint_2", "x"))
+    ),
+    "the mass of the payload on link_2 is 'x' kg, wanted": lambda m, log: identify_payload(
+        m, log, log, masses={"link_2": "x"}
+    ),
+    "masses of 'x' have shape (3,), wanted 20 or 28 finite": lambda m, log: robotid.replay(
+        m, log.t, log.q, masses={"y": m.standard_parameters(), "x": np.zeros(3)}
+    ),
+    "ghost 'x' has 3 arrays, wanted two": lambda m, log: robotid.replay(
+        m, log.t, log.q, ghosts=ghosts(log.t, log.q, log.q)
+    ),
+    "gravity is ": lambda m, log: RobotModel.from_urdf(URDF, gravity=(0, 0, 10**400)),
+    "trajectory: rate is 'x', wanted": lambda m, log: robotid.Trajectory(
+        log.t, log.q, log.q, log.q, log.tau, log.joints, "x", np.zeros(60, dtype=int)
+    ),
+    "trajectory: segment is object of shape (), wanted": lambda m, log: robotid.Trajectory(
+        log.t, log.q, log.q, log.q, log.tau, log.joints, None, [[1], [1, 2]]
+    ),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_an_entry_of_another_kind_is_named(model, log, words):
+    with pytest.raises(RobotIdError) as error:
+        REFUSED[words](model, log)
+    assert str(error.value).startswith(words)
+
+
+@pytest.mark.parametrize("gain", [None, "x", np.nan, 0])
+def test_a_gain_that_is_no_number_is_refused(log, tmp_path, gain):
+    robotid.write_log(log, tmp_path / "log.csv")
+    gains = {"joint_1": 2.0, "joint_2": gain}
+    with pytest.raises(SettingsError, match=r"gain of 'joint_2' is .*, wanted a number other than"):
+        robotid.read_log(tmp_path / "log.csv", log.joints, gains=gains)
+
+
+def test_flags_and_numbers_of_numpy_are_flags_and_numbers(log):
+    assert RobotModel.from_urdf(URDF, free_flyer=np.True_).free_flyer
+    part = log.window(np.float32(0.1), np.int64(1))
+    assert (part.t[0], part.t[-1]) == (0.12, 1.0)
+    assert len(log.window(-np.inf, np.inf).t) == len(log.t)
+
+
+def test_files_of_a_page_are_named_by_text(found, tmp_path):
+    with pytest.raises(SettingsError, match=r"an entry of files is \['result', 5\]"):
+        robotid.write_report(found, tmp_path / "page.html", files={"result": 5})
+    assert not list(tmp_path.iterdir())

@@ -207,16 +207,18 @@ def design_motion(
     course = Course.of_design(designer, design)
     if settings.kind in _ROUTES:
         _check_jerk(course, model.joints)
-    write_motion(design.motion, model.joints, design.duration, settings.points, target)
-    content = _content(designer, design, course, settings)
-    if carried is not None:
-        content["payload"] = carried.to_dict()
-    if report is not None:
+    expected: Preview | list[str] | None = None
+    if report is not None:  # before anything is written: a motion may be too short for it
         expected = (
             _expected(job, model, design, settings, run, str(target))
             if carried is None
             else carried.in_words()
         )
+    write_motion(design.motion, model.joints, design.duration, settings.points, target)
+    content = _content(designer, design, course, settings)
+    if carried is not None:
+        content["payload"] = carried.to_dict()
+    if report is not None and expected is not None:
         write_motion_page(report, model, content, course, expected)
         content["report"] = str(report)
     return content

@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotid._files import missing_file
+from robotid._files import check_path, missing_file
 from robotid._settings import Entries, Range, Settings, check_keys, require_kind, setting
 from robotid.commanded.settings import LoopSettings
 from robotid.exceptions import SettingsError
@@ -322,6 +322,7 @@ def read_job(path: str | Path) -> Job:
         SettingsError: If the file is missing, is no TOML, or a key or a value is wrong.
     """
     require_kind(path, (str, Path), "path", "the path of a job file")
+    check_path(path)
     source = Path(path)
     if not source.is_file():
         raise SettingsError(missing_file(source, "job file"))

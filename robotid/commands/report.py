@@ -1,6 +1,6 @@
 """The report of a written result, made anew from its inputs; nothing else is written."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -134,6 +134,7 @@ def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
             "robotid.write_report(found, ...)"
         )
     logs = [entry.path for entry in (*job.identification, *job.validation)]
+    _check_counts(inputs, job, name)
     for path, entry in zip([job.urdf, *logs], chain(*inputs.values()), strict=True):
         what, wanted = "URDF" if entry["role"] == "urdf" else "log", entry["sha256"]
         if not path.exists():
@@ -151,6 +152,17 @@ def _check_inputs(job: Job, content: Mapping[str, Any], name: str) -> None:
                 f"the {what} {str(path)!r} was changed since {name} was made from it: its SHA-256 "
                 f"begins with {found[:12]}, wanted {wanted[:12]}; put the old file back, or "
                 "identify again"
+            )
+
+
+def _check_counts(inputs: Mapping[str, Sequence[Any]], job: Job, name: str) -> None:
+    """Refuse a result whose inputs are not those of its settings."""
+    stated = {"urdf": [job.urdf], "identification": job.identification}
+    for role, entries in (stated | {"validation": job.validation}).items():
+        if len(inputs[role]) != len(entries):
+            raise DataError(
+                f"{name} has {len(inputs[role])} inputs of the role {role!r}, but its settings "
+                f"name {len(entries)}: it was changed since it was written; identify again"
             )
 
 

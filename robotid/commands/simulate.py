@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,9 @@ def simulate_log(
         "motion": {"path": str(files.motion), "sha256": file_sha256(files.motion)},
         "outputs": [str(path) for path in (files.log, files.truth, files.urdf) if path],
     }
+    if files.urdf:  # what cannot be a URDF is refused before any file is written
+        with TemporaryDirectory(prefix="robotid-") as folder:
+            write_urdf(model, pi, Path(folder, files.urdf.name), dynamics=True)
     write_log(log, files.log)
     if files.urdf:
         write_urdf(model, pi, files.urdf, dynamics=True)

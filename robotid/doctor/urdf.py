@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._settings import require_kind
+from robotid._settings import require_flag, require_kind
 from robotid.doctor.urdf_base import faint_parameters, rounded_angles
 from robotid.doctor.urdf_geometry import audit_links
 from robotid.doctor.urdf_inertials import impossible_inertial, negative_masses
@@ -107,6 +107,7 @@ def inspect_urdf(path: str | Path, *, free_flyer: bool = False) -> Inspection:
         The inspection. A file that no model can be built from gives a finding, not an error.
     """
     require_kind(path, (str, Path), "path", "the path of a URDF")
+    require_flag(free_flyer, "free_flyer")
     where = f"file {Path(path).name}"
     try:
         robot = parse_urdf(path)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from robotid._files import write_text
+from robotid._text import yaml_name
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.logs.formats import check_suffix, write_columns
@@ -28,7 +29,7 @@ def check_motion_file(target: str | Path) -> None:
         DataError: If a motion cannot be written in its format.
     """
     if Path(target).suffix not in (".yaml", ".script"):
-        check_suffix(Path(target))
+        check_suffix(Path(target), "motions", also=(".yaml", ".script"))
 
 
 def write_motion(
@@ -73,7 +74,7 @@ def write_motion(
 
 def _ros(joints: Sequence[str], t: Array, q: Array, v: Array, a: Array) -> Iterator[str]:
     """Yield the lines of a trajectory_msgs/JointTrajectory."""
-    yield f"joint_names: [{', '.join(joints)}]"
+    yield f"joint_names: [{', '.join(map(yaml_name, joints))}]"
     yield "points:"
     for time, *state in zip(t, q, v, a, strict=True):
         seconds, nanoseconds = divmod(round(time * 1e9), 10**9)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robotid._settings import require_kind
+from robotid._settings import require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.export.commanded import CommandedDrive, limit_of
@@ -154,7 +154,7 @@ def write_mjcf(
     require_kind(model, RobotModel, "model", "a robotid.RobotModel")
     require_kind(step, (float, int), "step", "a time [s]")
     require_kind(delay, str, "delay", f"one of {listed(DELAYS)}")
-    require_kind(commanded, (list, tuple), "commanded", "a list of drives")
+    require_each(commanded, CommandedDrive, "commanded", "a list of drives")
     require_kind(notes, (list, tuple), "notes", "a list of sentences")
     if not 0 < step < np.inf:
         raise SettingsError(f"step is {step:g} s, wanted a positive time")

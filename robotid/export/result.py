@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid._files import file_sha256, read_json
+from robotid._files import check_path, file_sha256, read_json
 from robotid._settings import Range, require_kind
 from robotid._typing import Array
 from robotid.commanded.errors import OpenLoop
@@ -602,6 +602,7 @@ class Result:
         Raises:
             DataError: If the result states none of it.
         """
+        require_kind(joint, str, "joint", "the name of a joint")
         curves = {
             name: about["curve"]
             for name, about in self.content.get("friction", {}).items()
@@ -662,6 +663,7 @@ def load_result(path: str | Path) -> Result:
         DataError: If it is missing, no JSON, or of another schema.
     """
     require_kind(path, (str, Path), "path", "the path of a result.json or of its folder")
+    check_path(path)
     source = Path(path)
     source = source / "result.json" if source.is_dir() else source
     return Result(source, read_result(source))

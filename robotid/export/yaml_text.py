@@ -1,12 +1,12 @@
 """YAML of plain values, written by hand so that no reader of YAML need be installed."""
 
-import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from robotid._text import yaml_name, yaml_plain
+
 __all__ = ["yaml_text"]
 
-_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")  # no text in YAML 1.1
 _WIDEST = 120  # characters of a table in one line
 
 
@@ -24,7 +24,7 @@ def yaml_text(table: Mapping[str, Any], head: str) -> str:
 def _lines(value: Mapping[str, Any], indent: str) -> Iterator[str]:
     """Yield the lines of a table: one for each that holds no other table and fits a line."""
     for key, entry in value.items():
-        name = f"{indent}{_quoted(key)}:"
+        name = f"{indent}{yaml_plain(key)}:"
         if isinstance(entry, Mapping) and (
             any(isinstance(x, Mapping) for x in entry.values()) or len(_flow(entry)) > _WIDEST
         ):
@@ -37,27 +37,10 @@ def _lines(value: Mapping[str, Any], indent: str) -> Iterator[str]:
 def _flow(entry: Any) -> str:  # noqa: ANN401
     """Return a figure, a name, a list or a table in one line."""
     if isinstance(entry, Mapping):
-        return "{" + ", ".join(f"{_key(key)}: {_flow(x)}" for key, x in entry.items()) + "}"
+        return "{" + ", ".join(f"{yaml_name(key)}: {_flow(x)}" for key, x in entry.items()) + "}"
     if isinstance(entry, list):
         return "[" + ", ".join(map(_flow, entry)) + "]"
     if isinstance(entry, float):  # YAML 1.1 reads 1e-05 as text, and 1.0e-05 as a number
         mantissa, e, exponent = f"{entry:.6g}".partition("e")
         return mantissa + (".0" if e and "." not in mantissa else "") + e + exponent
-    return _quoted(entry)
-
-
-def _key(text: str) -> str:
-    """Return the key of a table in one line, quoted unless it is a plain word."""
-    is_plain = text.isascii() and text.isidentifier() and text.lower() not in _WORDS
-    return text if is_plain else _quoted(text)
-
-
-def _quoted(entry: Any) -> str:  # noqa: ANN401
-    """Return text, a number, a boolean or None; characters that end a line of YAML are escaped."""
-    text = json.dumps(entry, ensure_ascii=False)
-    return "".join(c if c.isprintable() else _escaped(c) for c in text)
-
-
-def _escaped(character: str) -> str:
-    number = ord(character)
-    return f"\\u{number:04x}" if number < 2**16 else f"\\U{number:08x}"
+    return yaml_plain(entry)

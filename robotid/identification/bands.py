@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotid._settings import is_number, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
 from robotid.identification.candidates import JointMotion
 from robotid.identification.model_error import open_torques
-from robotid.logs.data import Trajectory, suggestion
+from robotid.logs.data import Trajectory, real_numbers, suggestion
 from robotid.regressor.base_parameters import BaseMapping
 from robotid.regressor.friction_projection import DriveMoments, drive_moments
 from robotid.regressor.memory import drive_motion_along
@@ -233,6 +234,9 @@ def usual_friction(
     ratios, first = layout.drive_ratios[d], found.model.n_rows - len(found.model.joints)
     rows = [e.recording.mask[:, first:][:, ratios != 0.0].all(axis=1) for e in found.fitted]
     motions = [e.recording.trajectory for e in found.fitted]
+    for name, value in (("q", q), ("load", load)):
+        if not (value is None or is_number(value)):
+            raise DataError(f"{name} is {str(value)[:60]!r}, wanted a finite number, or none")
     if v is None:
         used = zip(motions, rows, strict=True)
         speeds = np.concatenate([np.abs(m.v[kept, first:] @ ratios) for m, kept in used])
@@ -251,7 +255,10 @@ def usual_friction(
         if any(term.name == "load" for term in layout.own.get(joint, ())):
             carried = [drive_motion_along(found.model, m).load[d] for m in motions]
             load = float(np.sqrt(np.mean(np.concatenate(carried)[np.concatenate(rows)] ** 2)))
-    return friction_curve(found, joint, np.asarray(v, dtype=float), q=q, load=load)
+    speeds = real_numbers(v, "v")
+    if speeds.ndim != 1 or not np.isfinite(speeds).all():
+        raise DataError(f"v has shape {speeds.shape}, wanted finite speeds, shape (k,)")
+    return friction_curve(found, joint, speeds, q=q, load=load)
 
 
 def fitted_moments(found: "Identification") -> dict[str, DriveMoments]:
@@ -302,6 +309,7 @@ def friction_curve(
 
 
 def _drive_number(found: "Identification", joint: str) -> int:
+    require_kind(joint, str, "joint", "the name of a joint, or of a coupling")
     names = [drive.name for drive in found.model.layout.drives]
     if joint not in names:
         raise DataError(

@@ -1,13 +1,13 @@
 """What hangs on a link: a run with it against a run without, and gains from a known mass."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robotid._settings import require_kind
+from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
 from robotid.estimators import Consistent, Constraints, Estimate
 from robotid.estimators.stretches import quantile
@@ -247,12 +247,12 @@ def identify_payload(
         NotConvergedError: If a solver fails.
     """
     require_kind(signals, (SignalSettings, type(None)), "signals", "a robotid.SignalSettings")
-    for name, value, kinds, wanted in (
-        ("links", links, Collection, "names of links"),
-        ("masses", masses, (Mapping, type(None)), "a table of masses [kg] by link"),
-        ("unknown_gains", unknown_gains, Collection, "names of joints"),
+    for name, value, wanted in (
+        ("links", links, "names of links"),
+        ("unknown_gains", unknown_gains, "names of joints"),
     ):
-        require_kind(value, kinds, name, wanted)
+        require_each(value, str, name, wanted)
+    require_kind(masses, (Mapping, type(None)), "masses", "a table of masses [kg] by link")
     model = robot_of(model, logs)
     settings, mapping = signals or SignalSettings(), structural_mapping(model)
     wanted_families(friction, model.joints)
@@ -442,9 +442,9 @@ def _check_known(
                 f"a mass of {link} is stated, but the payloads hang on {listed(links)}; name the "
                 "link among them"
             )
-        if not 0 < mass < 1e6:
+        if not (is_number(mass) and 0 < mass < 1e6):
             raise SettingsError(
-                f"the mass of the payload on {link} is {mass:g} kg, wanted more than 0 and less "
+                f"the mass of the payload on {link} is {mass!r} kg, wanted more than 0 and less "
                 "than 1e6"
             )
     unknown = [joint for joint in gains if joint not in model.joints]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robotid._settings import Settings, require_kind
+from robotid._settings import Settings, require_flag, require_kind
 from robotid._typing import Array, ProgressCallback, ignore_progress, report_stage
 from robotid.doctor.diagnosis import diagnose
 from robotid.doctor.motions import is_poorly_excited
@@ -312,6 +312,9 @@ class Identification:
         Raises:
             DataError: If there is no such joint.
         """
+        require_kind(
+            recording, (Evaluation, type(None)), "recording", "one of fitted or validation, or none"
+        )
         shown = shown_evaluation(self) if recording is None else recording
         band, rows = (
             self.band(shown),
@@ -364,6 +367,7 @@ class Identification:
 
     def _row(self, joint: str) -> int:
         """Return the number of a joint's torque row."""
+        require_kind(joint, str, "joint", "the name of a joint")
         names = self.model.row_names
         if joint not in names:
             raise DataError(
@@ -514,7 +518,12 @@ class Identification:
 
         Args:
             name: "estimate" or "wls".
+
+        Raises:
+            SettingsError: If it is neither.
         """
+        if not isinstance(name, str) or name not in ("estimate", "wls"):
+            raise SettingsError(f"name is {name!r}, wanted 'estimate' or 'wls'")
         return pool(self.model, self.fitted, name)
 
     @property
@@ -597,6 +606,7 @@ def identify(
     require_kind(
         estimator, (str, EstimatorSettings), "estimator", "a name or a robotid.EstimatorSettings"
     )
+    require_flag(doctor, "doctor")
     check_ignored(ignore)
     choice = EstimatorSettings(estimator) if isinstance(estimator, str) else estimator
     settings = signals or SignalSettings()

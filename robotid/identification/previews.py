@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from robotid._settings import require_kind
+from robotid._settings import is_number, require_kind
 from robotid._typing import Array
 from robotid.doctor.motions import excitation_finding
 from robotid.estimators import Estimate
@@ -373,10 +373,10 @@ def assumed_noise(
         if joint not in model.joints:
             raise SettingsError(
                 f"noise is stated of {joint!r}, which is not among the joints "
-                f"{listed(model.joints)}{suggestion(joint, model.joints)}"
+                f"{listed(model.joints)}{suggestion(str(joint), model.joints)}"
             )
-        if not 0 < value < np.inf:
-            raise SettingsError(f"noise of {joint!r} is {value:g}, wanted a positive number")
+        if not (is_number(value) and value > 0):
+            raise SettingsError(f"noise of {joint!r} is {value!r}, wanted a positive number")
     if correlation is not None and not 0 <= correlation < np.inf:
         raise SettingsError(f"correlation is {correlation:g} s, wanted 0 (white noise) or more")
     is_stated = np.isin(model.joints, list(stated))

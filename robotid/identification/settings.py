@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from robotid._settings import Range, Settings, setting
+from robotid._settings import Range, Settings, require_kind, setting
 from robotid.exceptions import SettingsError
 from robotid.findings import listed
 
@@ -136,6 +136,7 @@ class EstimatorSettings(Settings):
     name: str = setting("consistent", "which estimator")
 
     def __new__(cls, name: str = "consistent", **options: object) -> "EstimatorSettings":
+        require_kind(name, str, "estimator", f"one of {listed(ESTIMATORS)}")
         kind = ESTIMATORS.get(name)
         if cls is not EstimatorSettings:
             return super().__new__(cls)
@@ -228,6 +229,10 @@ class BoundedSettings(EstimatorSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_kind(self.constraints, Mapping, "constraints", "a table of bounds")
+        known = [each.name for each in fields(ConstraintSettings)]
+        if strange := [key for key in self.constraints if key not in known]:
+            raise SettingsError(f"constraints has {strange[0]!r}, wanted some of {listed(known)}")
         _ = self.bounds
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotid._settings import is_number, require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
@@ -31,6 +32,7 @@ COLUMNS = {
 }
 _SHORTEST = 1e-12  # [s] of a step, in the mean
 _REQUIRED = ("q", "tau")
+_NO_TORQUE = "; without torques, give zeros and has_torque=False"
 _LARGEST = 1e30  # in any unit; what is computed from it is still a number
 
 
@@ -67,6 +69,9 @@ class Log:
     has_torque: bool = True
 
     def __post_init__(self) -> None:
+        require_kind(self.path, (str, Path), "path", "the path of the log's file, or ''")
+        require_flag(self.has_torque, "has_torque")
+        require_each(self.notes, str, "notes", "a list of sentences")
         where = self.name
         _settle(self, where, {kind: getattr(self, name) for kind, name in COLUMNS.items()})
         if not self.has_torque and self.tau.any():
@@ -97,7 +102,8 @@ class Log:
             DataError: If fewer than two rows are left.
         """
         for name, limit in (("start", start), ("end", end)):
-            if not isinstance(limit, float | int | np.number | None):
+            is_end = isinstance(limit, float | np.floating) and bool(np.isinf(limit))
+            if not (limit is None or is_end or is_number(limit)):
                 raise DataError(f"{name} is {str(limit)[:60]!r}, wanted a time [s], or None")
         first = self.t[0] if start is None else start
         last = self.t[-1] if end is None else end
@@ -119,7 +125,7 @@ class Log:
         Raises:
             DataError: If a joint is not in the log.
         """
-        for name in joints:
+        for name in require_each(joints, str, "joints", "a list of names"):
             if name not in self.joints:
                 raise DataError(
                     f"joint {name!r} is not in {self.name}; joints: {listed(self.joints)}"
@@ -175,7 +181,10 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         _settle(self, "trajectory", {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau})
-        segment = np.asarray(self.segment)
+        try:
+            segment = np.asarray(self.segment)
+        except ValueError:  # rows of unequal length
+            segment = np.asarray(None)
         if segment.shape != self.t.shape or segment.dtype.kind not in "iu":
             raise DataError(
                 f"trajectory: segment is {segment.dtype} of shape {segment.shape}, wanted integers "
@@ -192,8 +201,8 @@ class Trajectory:
             names = [f"direction {k}" for k in range(direction.shape[1])]
             require_finite(direction, self.t, names, "trajectory")
             object.__setattr__(self, "direction", direction)
-        if self.rate is not None and not 0 < self.rate < np.inf:
-            raise DataError(f"trajectory: rate is {self.rate}, wanted a positive number or None")
+        if self.rate is not None and not (is_number(self.rate) and self.rate > 0):
+            raise DataError(f"trajectory: rate is {self.rate!r}, wanted a positive number or None")
 
     def __repr__(self) -> str:
         stretches = len(np.unique(self.segment))
@@ -262,7 +271,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
     joints = _names(owner.joints, where)
     if twice := repeated(joints):
         raise DataError(f"{where}: joints {listed(twice)} are named twice; name each joint once")
-    t = _numbers(owner.t, where, "t")
+    t = real_numbers(owner.t, f"{where}: t")
     if t.ndim != 1:
         raise DataError(f"{where}: t has shape {t.shape}, wanted (N,)")
     require_finite(t[:, None], t, ["time"], where)
@@ -270,7 +279,7 @@ def _settle(owner: Log | Trajectory, where: str, arrays: dict[str, Array | None]
     for name, values in arrays.items():
         if values is None and name not in _REQUIRED:
             continue
-        array = _numbers(values, where, name)
+        array = real_numbers(values, f"{where}: {name}", hint=_NO_TORQUE if name == "tau" else "")
         if array.shape != (len(t), len(joints)):
             raise DataError(
                 f"{where}: {name} has shape {array.shape}, wanted {(len(t), len(joints))}: a row "
@@ -293,11 +302,19 @@ def _names(joints: object, where: str) -> tuple[str, ...]:
     return found
 
 
-def _numbers(values: ArrayLike | None, where: str, name: str) -> Array:
-    """Return values as a read-only array of numbers; NaN where a masked array is masked."""
+def real_numbers(values: ArrayLike | None, name: str, *, hint: str = "") -> Array:
+    """Return values as a read-only array of numbers; NaN where a masked array is masked.
+
+    Args:
+        values: The values.
+        name: What they are called.
+        hint: What else can be done where there are none.
+
+    Raises:
+        DataError: If they are no real numbers, or rows have unequal lengths.
+    """
     if values is None:
-        hint = "; without torques, give zeros and has_torque=False" if name == "tau" else ""
-        raise DataError(f"{where}: {name} is None, wanted an array{hint}")
+        raise DataError(f"{name} is None, wanted an array{hint}")
     try:
         array: Array = np.ma.asanyarray(values)
         if array.dtype.kind not in "biufO":
@@ -307,8 +324,8 @@ def _numbers(values: ArrayLike | None, where: str, name: str) -> Array:
         return _frozen(values)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{where}: {name} is no array of real numbers ({str(error)[:100]}); wanted one of "
-            "floats, with rows of equal length"
+            f"{name} is no array of real numbers ({str(error)[:100]}); wanted one of floats, with "
+            "rows of equal length"
         ) from error
 
 

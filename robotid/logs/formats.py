@@ -1,6 +1,6 @@
 """Tables in files: named columns of numbers in any format that is known by its suffix."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from robotid._files import missing_file, written_whole
@@ -97,11 +97,13 @@ def write_columns(table: Mapping[str, Array], path: Path) -> None:
         form.write(table, beside)
 
 
-def check_suffix(path: Path) -> str:
+def check_suffix(path: Path, what: str = "logs", *, also: Sequence[str] = ()) -> str:
     """Return the suffix of a file to write, as before the work that makes its content.
 
     Args:
         path: The file.
+        what: What is written, for errors.
+        also: Suffixes of further formats that it is written in, for errors.
 
     Raises:
         DataError: If its suffix names no format that is written.
@@ -109,7 +111,8 @@ def check_suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in _WRITTEN:
         raise DataError(
-            f"{path.name}: logs are written as {_listed(list(_WRITTEN))} files, not {suffix!r}"
+            f"{path.name}: {what} are written as {_listed([*_WRITTEN, *also])} files, not "
+            f"{suffix!r}"
         )
     return suffix
 

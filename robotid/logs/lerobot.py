@@ -135,13 +135,15 @@ def _episode(path: Path, numbers: Sequence[int], wanted: str | None) -> int:
         listing = f"each is a log of its own, {len(names)} in all"
         chosen = names[0] if len(names) == 1 else choose(path.name, names, "episodes", listing)
         return numbers[names.index(chosen)]
-    found = re.fullmatch(r"(?:episode_)?0*(\d+)", wanted)
-    if not found or int(found[1]) not in numbers:
+    found = re.fullmatch(r"(?:episode_)?0*([0-9]+)", wanted)
+    chosen = f"episode_{found[1]}" if found else wanted
+    if chosen not in names:
+        shown = wanted if len(wanted) <= 40 else f"{wanted[:40]}..."
         raise DataError(
-            f"{path.name} has no episode {wanted!r}; episodes: {listed(names)}"
-            f"{suggestion(wanted, names)}"
+            f"{path.name} has no episode {shown!r}; episodes: {listed(names)}"
+            f"{suggestion(shown, names)}"
         )
-    return int(found[1])
+    return numbers[names.index(chosen)]
 
 
 def _read(

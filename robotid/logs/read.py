@@ -14,7 +14,8 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from robotid._settings import require_kind
+from robotid._files import check_path
+from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
@@ -123,7 +124,7 @@ def read_logs(
     logs: list[Any]
     if isinstance(given, Log | str | Path | Mapping) or is_frame(given):
         logs = [given]
-    elif isinstance(given, Iterable):
+    elif isinstance(given, Iterable) and getattr(given, "ndim", None) != 0:
         logs = list(given)
     else:
         raise _no_log(given)
@@ -309,11 +310,15 @@ def lay_out(
         ("gains", gains, (Mapping, type(None)), "a table of numbers by joint"),
         ("units", units, LogUnits, "a robotid.LogUnits"),
         ("source", source, LogSource, "a robotid.LogSource"),
-        ("prismatic", prismatic, (list, tuple, set, frozenset), "a list of names"),
-        ("transmissions", transmissions, (list, tuple), "a list of Transmission"),
     ):
         require_kind(value, kinds, name, wanted)
+    require_each(prismatic, str, "prismatic", "a list of names")
+    require_each(transmissions, Transmission, "transmissions", "a list of Transmission")
+    for key, name in (columns or {}).items():
+        require_kind(key, str, "a key of columns", "the standard name of a column")
+        require_kind(name, str, f"columns[{key!r}]", "the name of a column")
     if isinstance(path, str | Path):
+        check_path(path)
         where, opened = Path(path).name, open_table(Path(path), source)
     elif is_frame(path):
         where, opened = "log", with_own_names(open_frame(path), "log", "DataFrames", source)
@@ -473,7 +478,7 @@ class _Finder:
             )
         for joint, gain in self.gains.items():
             self._require_read(joint, "a gain is given for")
-            if not np.isfinite(gain) or gain == 0:
+            if not (is_number(gain) and np.isfinite(gain)) or gain == 0:
                 raise SettingsError(f"gain of {joint!r} is {gain}, wanted a number other than 0")
         for joint in self.source.joints:
             self._require_read(joint, "log.joints renames")
@@ -495,7 +500,7 @@ class _Finder:
         if joint not in (*self.joints, *self.motors.values()):
             raise SettingsError(
                 f"{self.where}: {what} {joint!r}, which is not among the joints read: "
-                f"{listed(self.joints)}{suggestion(joint, self.joints)}"
+                f"{listed(self.joints)}{suggestion(str(joint), self.joints)}"
             )
 
     def _find(self, standard: str, aliases: Sequence[str]) -> str | None:

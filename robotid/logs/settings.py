@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from robotid._settings import NOT_NEGATIVE, POSITIVE, Range, Settings, setting
+from robotid._settings import NOT_NEGATIVE, POSITIVE, Range, Settings, require_kind, setting
 from robotid.exceptions import SettingsError
 
 __all__ = ["PER_SECOND", "LogSource", "LogUnits", "SignalSettings"]
@@ -134,6 +134,9 @@ class LogSource(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_kind(self.joints, Mapping, "joints", "a table of names by joint")
+        for name, topic in (("topic", self.topic), ("command", self.command)):
+            require_kind(topic, (str, type(None)), name, "the name of a topic or group, or none")
         for joint, name in self.joints.items():
             if not isinstance(name, str):
                 raise SettingsError(f"log: joints.{joint} is {name!r}, wanted a name")

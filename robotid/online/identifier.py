@@ -6,11 +6,11 @@ from typing import overload
 
 import numpy as np
 
-from robotid._settings import require_kind
+from robotid._settings import is_number, require_kind
 from robotid._typing import Array
 from robotid.estimators import Estimate, Kalman, KalmanState
 from robotid.exceptions import DataError
-from robotid.logs.data import Trajectory
+from robotid.logs.data import Trajectory, real_numbers
 from robotid.online.change_detection import (
     ChangeDetector,
     Innovations,
@@ -29,6 +29,7 @@ from robotid.robot.prior import prior_spread
 
 __all__ = ["OnlineIdentifier"]
 
+_TAKEN = {1: ("q", "tau"), 3: ("q", "v", "a", "tau")}  # arrays, by how many follow t and q
 _OVERSAMPLED = 12.0  # filtered samples per period of the cut-off that reach the estimator
 _KEPT_EVERY = 0.1  # [s] between the states that a change may go back to
 _KEPT = 30  # ... and how many of them there are
@@ -99,22 +100,26 @@ class OnlineIdentifier:
             DataError: If a number is not finite, a shape is wrong or time does not increase; the
                 sample is then as if it had never been given.
         """
-        if len(rest) == 1:
-            for instant in self._signals.push(t, np.asarray(q), np.asarray(rest[0])):
-                self._skipped += 1
-                if self._skipped % self._every == 0:
-                    self._take(instant, t)
-        elif len(rest) == 3:
-            self._check(t, q, *rest)
-            if self.delay:  # nothing is filtered here, and nothing left out
-                self.delay, self._every = 0.0, 1
-                self._pace()
-            v, a, tau = map(np.asarray, rest)
-            self._take((t, np.asarray(q), v, a, tau), t)
-        else:
+        names = _TAKEN.get(len(rest))
+        if names is None:
             raise DataError(
                 f"update takes (t, q, tau) or (t, q, v, a, tau), found {2 + len(rest)} values"
             )
+        if not is_number(t):
+            raise DataError(f"the sample at t = {str(t)[:60]} s is not finite, so it was refused")
+        arrays = [real_numbers(x, name) for name, x in zip(names, (q, *rest), strict=True)]
+        if len(rest) == 1:
+            for instant in self._signals.push(t, *arrays):
+                self._skipped += 1
+                if self._skipped % self._every == 0:
+                    self._take(instant, t)
+        else:
+            self._check(t, *arrays)
+            if self.delay:  # nothing is filtered here, and nothing left out
+                self.delay, self._every = 0.0, 1
+                self._pace()
+            q, v, a, tau = arrays
+            self._take((t, q, v, a, tau), t)
         self._now = t
 
     @property

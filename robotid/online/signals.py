@@ -75,9 +75,9 @@ class LiveSignals:
         Raises:
             DataError: If a number is not finite or time does not increase; nothing is changed then.
         """
-        u = np.concatenate([q, tau])
-        if u.shape != (2 * self._n,):
+        if q.shape != (self._n,) or tau.shape != (self._n,):
             raise DataError(f"q {q.shape} and tau {tau.shape}: wanted ({self._n},) each")
+        u = np.concatenate([q, tau])
         if not (np.isfinite(t) and np.isfinite(u.sum())):
             raise DataError(f"the sample at t = {t:g} s is not finite, so it was refused")
         last = self._last

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from robotid._typing import Array
 from robotid.exceptions import DataError
 from robotid.findings import listed
-from robotid.logs.data import Trajectory
+from robotid.logs.data import Trajectory, real_numbers
 from robotid.regressor.columns import friction_directions, trajectory_values
 from robotid.regressor.compiled import work_per_sample
 from robotid.regressor.rows import BLOCK, COMPILED, TrajectoryRows, trajectory_rows
@@ -81,7 +81,7 @@ def predict_instants(
     Raises:
         DataError: If a shape does not fit, or a value is not finite.
     """
-    q = _numbers("q", q)
+    q = real_numbers(q, "q")
     wanted = (*q.shape[:-1], model.n_rows)
     width = len(model.joints) + 7 * model.free_flyer
     if q.ndim not in (1, 2) or q.shape[-1] != width:
@@ -91,7 +91,7 @@ def predict_instants(
             f"{listed(model.joints)}"
         )
     given = [
-        np.zeros(wanted) if x is None else _numbers(name, x) for name, x in (("v", v), ("a", a))
+        np.zeros(wanted) if x is None else real_numbers(x, name) for name, x in (("v", v), ("a", a))
     ]
     for name, x in zip("va", given, strict=True):
         if x.shape != wanted:
@@ -100,19 +100,14 @@ def predict_instants(
                 f"each of {listed(model.row_names)}"
             )
     q, v, a = (np.atleast_2d(x) for x in (q, *given))
+    for name, x in (("q", q), ("v", v), ("a", a)):
+        if not np.isfinite(x).all():
+            row = int(np.argmin(np.isfinite(x).all(axis=1)))
+            raise DataError(f"{name} is not finite in row {row}: {x[row].tolist()}")
     direction = friction_directions(model.layout, v, None)
     if model.is_static:
         v, a = np.zeros_like(v), np.zeros_like(a)
     return _rows_by_pi(model, pi, q, v, a, direction).reshape(wanted)
-
-
-def _numbers(name: str, values: ArrayLike) -> Array:
-    """Return values as an array of numbers."""
-    try:
-        array: Array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{name} is {str(values)[:60]!r}, wanted an array of numbers") from error
-    return array
 
 
 def rigid_parts(model: RobotModel, pi: Array, q: Array, v: Array, a: Array) -> list[Array]:

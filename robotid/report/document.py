@@ -6,7 +6,7 @@ from html import escape
 from pathlib import Path
 
 from robotid._files import write_text
-from robotid._settings import require_kind
+from robotid._settings import require_each, require_kind
 from robotid.findings import listed
 from robotid.identification.advice import Origin
 from robotid.identification.evaluation import Evaluation
@@ -67,6 +67,8 @@ def write_report(
     require_kind(identification, Identification, "identification", "a robotid.Identification")
     require_kind(target, (str, Path), "target", "the path of a page to write")
     require_kind(files, (Mapping, type(None)), "files", "a table of file names")
+    for what, name in (files or {}).items():
+        require_each([what, name], str, "an entry of files", "text, and the name of a file")
     require_kind(origin, (Origin, type(None)), "origin", "an Origin")
     found, made = identification, tables(identification)
     header = summary_screen(found, origin or Origin(), files or {}) + _made(found)

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from robotid._settings import is_number
 from robotid._typing import Array
 from robotid.exceptions import SettingsError
 from robotid.findings import listed, toml_key
@@ -40,6 +41,8 @@ __all__ = [
 ]
 
 _ANYWHERE = (-np.inf, np.inf)
+_POSITIVE = (1e-9, 1e9)  # numbers of a term's shape that it is divided by
+_ENDS = (-1e9, 1e9)  # other numbers of a term's shape
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,8 @@ class DriveTerm:
         usual: From where to where it usually lies, for simulated robots.
         dynamics: Attribute of the URDF's ``<dynamics>`` that states it, or None.
         part: What it counts as where a torque is split: "friction", "spring" and the like.
+        ends: Smallest and largest value of its numbers, by name; -1e9 and 1e9 of others.
+        rising: Names of numbers that increase in this order.
     """
 
     seen: tuple[float, float] = _ANYWHERE
@@ -116,6 +121,21 @@ class DriveTerm:
     usual: ClassVar[tuple[float, float]] = (0.2, 0.9)
     dynamics: ClassVar[str | None] = None
     part: ClassVar[str] = "friction"
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    rising: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        if not (len(self.seen) == 2 and self.seen[0] <= self.seen[1]):
+            raise SettingsError(f"{kind}: seen is {self.seen!r}, wanted (lowest, highest)")
+        shape = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "seen"}
+        for key, value in shape.items():
+            low, high = self.ends.get(key, _ENDS)
+            if not isinstance(value, bool) and not (is_number(value) and low <= value <= high):
+                raise SettingsError(f"{kind}: {key} is {value!r}, wanted {low:g} to {high:g}")
+        if any(shape[low] >= shape[high] for low, high in pairwise(self.rising)):
+            found = ", ".join(f"{key} = {shape[key]:g}" for key in self.rising)
+            raise SettingsError(f"{kind}: {found}, wanted each larger than the one before")
 
     @property
     def name(self) -> str:
@@ -262,6 +282,7 @@ class Stribeck(DriveTerm):
     speed: float = 0.1
 
     label = "stribeck"
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     follows_direction = True
     guards = "v"
 
@@ -277,6 +298,7 @@ class Tanh(DriveTerm):
     speed: float = 0.1
 
     label = "tanh"
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {"speed": _POSITIVE}
     is_nonnegative = True
     guards = "v"
 
@@ -291,6 +313,7 @@ class Power(DriveTerm):
     exponent: float = 1.0 / 3.0
 
     label = "power"
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {"exponent": (0.0, 10.0)}
     units = ("N m (s/rad)^p", "N (s/m)^p")
     follows_direction = True
     guards = "v"
@@ -307,6 +330,7 @@ class Ramp(DriveTerm):
     low: float = 0.0
     high: float = 1.0
 
+    rising: ClassVar[tuple[str, ...]] = ("low", "high")
     is_nonnegative = True
     follows_direction = True
 
@@ -349,6 +373,7 @@ class PositionCoulomb(DriveTerm):
     order: int = 1
     centre: float = 0.0
 
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {"order": (0, 10)}
     follows_direction = True
     is_shared = False
     guards = "q"
@@ -367,6 +392,7 @@ class Bristles(DriveTerm):
 
     displacement: float = 0.01
 
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {"displacement": _POSITIVE}
     is_nonnegative = True
     follows_direction = True
     remembers = True
@@ -414,6 +440,9 @@ class LuGre(Bristles):
     excess: float = 0.5
 
     label = "lugre"
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "displacement": _POSITIVE, "speed": _POSITIVE, "excess": (-0.99, 1e3),
+    }  # fmt: skip
 
     def level(self, v: Array) -> Array:
         return 1.0 + self.excess * np.exp(-((v / self.speed) ** 2))
@@ -461,6 +490,7 @@ class Hat(DriveTerm):
     before: float = -1.0
     after: float = 1.0
 
+    rising: ClassVar[tuple[str, ...]] = ("before", "at", "after")
     is_shared = False
     guards = "q"
     part = "spring"
@@ -489,6 +519,7 @@ class Counterbalance(DriveTerm):
     rest: float = 0.0
 
     label = "counterbalance"
+    ends: ClassVar[Mapping[str, tuple[float, float]]] = {"arm": _POSITIVE, "base": _POSITIVE}
     units = ("N/m", "N/m")
     is_nonnegative = True
     is_shared = False
@@ -749,17 +780,11 @@ def term_from_dict(table: Mapping[str, Any]) -> DriveTerm:
 
 def _read_field(kind: type[DriveTerm], key: str, value: object, default: object) -> object:
     if key == "seen":
-        if isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value)):
+        if isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value)):
             return (float(value[0]), float(value[1]))
         raise SettingsError(f"{kind.__name__}: seen is {value!r}, wanted [lowest, highest]")
     is_flag = isinstance(default, bool)
-    if is_flag is not isinstance(value, bool) or not (is_flag or _is_number(value)):
+    if is_flag is not isinstance(value, bool) or not (is_flag or is_number(value)):
         wanted = "true or false" if is_flag else "a finite number"
         raise SettingsError(f"{kind.__name__}: {key} is {value!r}, wanted {wanted}")
     return type(default)(value)  # type: ignore[call-arg]
-
-
-def _is_number(value: object) -> bool:
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )

@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from robotid._settings import require_kind
+from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, ModelError, SettingsError
 from robotid.findings import listed
@@ -116,17 +116,19 @@ class RobotModel:
         for name, value, kinds, wanted in (
             ("joints", joints, (list, tuple, str, type(None)), "a list of names"),
             ("locked", locked, (Mapping, type(None)), "a table of positions by joint"),
-            ("terms", terms, Collection, f"a list of some of {listed(DRIVE_TERMS)}"),
             ("own_terms", own_terms, Mapping, "a table of terms by joint"),
             ("mimic", mimic, str, "'independent' or 'coupled'"),
             ("dynamics", dynamics, str, f"one of {listed(DYNAMICS)}"),
-            ("couplings", couplings, Collection, "a list of robotid.Coupling"),
         ):
             require_kind(value, kinds, name, wanted)
-        for name in joints or ():
-            require_kind(name, str, "one of joints", "the name of a joint")
-        for coupling in couplings:
-            require_kind(coupling, Coupling, "one of couplings", "a robotid.Coupling")
+        for name in (*(joints or ()), *(locked or ())):
+            require_kind(name, str, "one of joints or locked", "the name of a joint")
+        require_each(terms, str, "terms", f"a list of some of {listed(DRIVE_TERMS)}")
+        require_each(couplings, Coupling, "couplings", "a list of robotid.Coupling")
+        for name, own in own_terms.items():
+            require_each(own, DriveTerm, f"own_terms of {name!r}", "a list of drive terms")
+        for name, flag in (("free_flyer", free_flyer), ("snap_angles", snap_angles)):
+            require_flag(flag, name)
         tree = path if isinstance(path, Tree) else read_tree(path)
         tree = tree.snapped() if snap_angles else tree
         if mimic not in ("independent", "coupled"):
@@ -492,7 +494,7 @@ def _build(tree: Tree, free_flyer: bool, gravity: Sequence[float]) -> pin.Model:
 def _gravity(gravity: Sequence[float]) -> Array:
     try:
         acceleration = np.asarray(gravity, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         acceleration = np.full(3, math.nan)
     if acceleration.shape != (3,) or not (np.abs(acceleration) <= _STRONGEST).all():
         shown = listed(gravity) if isinstance(gravity, list | tuple) else repr(gravity)

@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 
+from robotid._settings import require_each, require_flag, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
 from robotid.findings import listed
@@ -49,6 +51,15 @@ class Coupling:
     name: str
     ratios: tuple[tuple[str, float], ...]
     replaces: bool = False
+
+    def __post_init__(self) -> None:
+        wanted = "pairs of a joint's name and a number"
+        require_kind(self.name, str, "name", "the name of a coupling")
+        require_flag(self.replaces, "replaces")
+        for pair in require_each(self.ratios, (tuple, list), "ratios", wanted):
+            is_pair = len(pair) == 2 and isinstance(pair[0], str) and isinstance(pair[1], Real)
+            if not is_pair or isinstance(pair[1], bool):
+                raise SettingsError(f"ratios of {self.name!r} has {pair!r}, wanted {wanted}")
 
 
 @dataclass(frozen=True)
@@ -95,6 +106,12 @@ class ParameterLayout:
                         f"coupling {coupling.name!r}: the ratio of joint {joint!r} is {ratio!r}, "
                         f"wanted a number within +-{LARGEST:g} [-]"
                     )
+            if not any(ratio for _, ratio in coupling.ratios):
+                raise SettingsError(
+                    f"coupling {coupling.name!r} turns with no joint: its ratios are "
+                    f"{dict(coupling.ratios)}, wanted one that is not 0; state it, as "
+                    f"ratios = {{ {self.joints[0]} = 1.0 }}, or leave the coupling out"
+                )
             if sum(drive.name == coupling.name for drive in self.drives) > 1:
                 raise SettingsError(
                     f"coupling {coupling.name!r} has the name of a joint or of another drive; give "

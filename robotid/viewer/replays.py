@@ -16,9 +16,10 @@ import numpy as np
 import pinocchio as pin
 
 from robotid._files import write_text
-from robotid._settings import require_kind
+from robotid._settings import is_number, require_each, require_kind
 from robotid._typing import Array
 from robotid.exceptions import DataError, SettingsError
+from robotid.logs.data import real_numbers
 from robotid.robot.model import RobotModel
 from robotid.viewer.page import page
 from robotid.viewer.scene import Scene, coordinates, mass_marks, packed, robot_scene
@@ -174,14 +175,19 @@ def replay(
         ("masses", masses, (Mapping, type(None)), "a table of standard parameters by label"),
         ("ghosts", ghosts, (Mapping, type(None)), "a table of motions (t, q) by label"),
         ("bands", bands, (Bands, type(None)), "Bands"),
-        ("marks", marks, (list, tuple), "a list of marks"),
-        ("notes", notes, (list, tuple), "a list of sentences"),
     ):
         require_kind(value, kinds, name, wanted)
+    require_each(marks, Mark, "marks", "a list of marks")
+    require_each(notes, str, "notes", "a list of sentences")
+    for label, pi in (masses or {}).items():
+        _check_masses(model, label, pi)
     _check(t, q, rate)
     moved = _moved(model, t, q, rate)
     others = dict(ghosts or {})
-    for own in others.values():
+    for label, own in others.items():
+        require_each([label], str, "the label of a ghost", "text")
+        if len(require_each(own, np.ndarray, f"ghost {label!r}", "two arrays, t and q")) != 2:
+            raise SettingsError(f"ghost {label!r} has {len(own)} arrays, wanted two, t and q")
         _check(*own, rate)
     gaps = [Mark(float(t[k]), f"gap of {t[k + 1] - t[k]:.2f} s", "gap") for k in _gaps(t)]
     start = float(t[0])
@@ -256,14 +262,26 @@ def _data(
     return {"title": model.name, "live": live, "scene": scene.content, **content, "view": view}
 
 
+def _check_masses(model: RobotModel, label: str, pi: Array) -> None:
+    """Refuse what are no standard parameters, all or the inertial ones, under a label."""
+    require_kind(label, str, "the label of masses", "text")
+    require_kind(pi, np.ndarray, f"masses of {label!r}", "an array of standard parameters")
+    sizes = model.layout.n_inertial, len(model.layout.names)
+    values = real_numbers(pi, f"masses of {label!r}")
+    if values.shape not in [(size,) for size in sizes] or not np.isfinite(values).all():
+        raise DataError(
+            f"masses of {label!r} have shape {values.shape}, wanted {sizes[0]} or {sizes[1]} "
+            "finite numbers, as of model.standard_parameters()"
+        )
+
+
 def _check(t: Array, q: Array, rate: float) -> None:
-    require_kind(rate, (float, int), "rate", "a number of keyframes per second")
     for name, values in (("t", t), ("q", q)):
         require_kind(values, np.ndarray, name, "an array of numbers")
         if values.dtype.kind not in "biuf":
             raise DataError(f"{name} is an array of {values.dtype}, wanted numbers")
-    if not rate > 0 or not np.isfinite(rate):
-        raise SettingsError(f"rate is {rate}, wanted a positive number of keyframes per second")
+    if not (is_number(rate) and rate > 0):
+        raise SettingsError(f"rate is {rate!r}, wanted a positive number of keyframes per second")
     if t.ndim != 1 or q.ndim != 2 or len(t) != len(q):
         raise DataError(f"t has shape {t.shape} and q {q.shape}, wanted (N,) and (N, n)")
     if len(t) < 2:

@@ -259,7 +259,22 @@ def test_a_robot_without_links_to_keep_apart_moves_too(tmp_path, kind, capsys):
     assert (np.abs(q) <= [2.0, 1.0]).all()
 
 
+def test_a_motion_too_short_for_its_page_is_not_written_either(tmp_path, capsys):
+    urdf, out, page = (tmp_path / name for name in ("pan_tilt.urdf", "motion.csv", "page.html"))
+    urdf.write_text(PAN_TILT)
+    words = ["--duration", "0.1", "--seconds", "0.1", "--starts", "1", "--clearance", "none"]
+    words = ["excite", str(urdf), "--out", str(out), *words]
+    assert main([*words, "--report", str(page)]) == 1
+    assert "is long enough for the filter" in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+    assert not page.exists()
+    assert main(words) == 0
+    assert out.exists()
+
+
 def test_a_format_that_motions_are_not_written_in_is_refused_before_the_design(tmp_path, capsys):
     urdf = str(example_urdf("ur5_robot.urdf"))
     assert main(["excite", urdf, "--out", str(tmp_path / "motion.txt")]) == 1
-    assert "motion.txt: logs are written as .csv, .parquet" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert "motion.txt: motions are written as .csv, .parquet, " in said
+    assert ".yaml or .script files, not '.txt'" in said

@@ -105,6 +105,35 @@ def test_an_input_without_a_hash_is_named(out, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda inputs: inputs.pop(0), "has 0 inputs of the role 'urdf', but its settings name 1"),
+        (lambda inputs: inputs.pop(1), "has 0 inputs of the role 'identification', but its"),
+        (lambda inputs: inputs.append(inputs[1]), "has 2 inputs of the role 'identification', but"),
+    ],
+)
+def test_inputs_that_are_not_those_of_the_settings_are_named(out, capsys, change, words):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    change(content["inputs"])
+    path.write_text(json.dumps(content))
+    before = contents(out)
+    assert main(["report", str(out)]) == 1
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert contents(out) == before
+
+
+def test_a_recording_that_the_settings_lack_is_named(out, capsys):
+    path = out / "result.json"
+    content = json.loads(path.read_text())
+    content["settings"]["validation"] = []
+    path.write_text(json.dumps(content))
+    assert main(["report", str(out)]) == 1
+    said = "has 1 inputs of the role 'validation', but its settings name 0"
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_result_that_the_fit_does_not_give_again_has_no_page(out, capsys):
     path = out / "result.json"
     content = json.loads(path.read_text())

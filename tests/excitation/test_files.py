@@ -41,6 +41,14 @@ def test_ros_reads_it_as_a_joint_trajectory(motion, tmp_path):
         np.testing.assert_allclose(point[name], values[0], atol=1e-6)
 
 
+def test_joints_of_any_name_are_names_in_yaml(motion, tmp_path):
+    names = ("yes", "12", "a, b", '"]: {', "axis \u2028 \U0001f916", "elbow_joint")
+    path = write_motion(motion, names, 2.0, 10.0, tmp_path / "m.yaml")
+    text = path.read_text(encoding="utf-8")
+    assert yaml.safe_load(text)["joint_names"] == list(names)
+    assert text.splitlines()[0].endswith(", elbow_joint]")
+
+
 def test_a_ur_is_told_every_8_ms(motion, tmp_path):
     lines = write_motion(motion, JOINTS, 2.0, 10.0, tmp_path / "m.script").read_text().splitlines()
     moves = [line for line in lines if "servoj" in line]

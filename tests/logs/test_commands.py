@@ -444,6 +444,12 @@ def test_one_episode_of_several_is_stated(tmp_path, version):
         read_log(path, JOINTS, units=DEGREES, source=LogSource(topic="episode_4"))
 
 
+@pytest.mark.parametrize("topic", ["9" * 5000, "²", "episode_٠", "-0", "x"])
+def test_an_episode_that_no_dataset_has_is_refused(tmp_path, topic):
+    with pytest.raises(DataError, match=r"no episode '.{1,43}'; episodes: episode_0"):
+        read_log(dataset(tmp_path), JOINTS, units=DEGREES, source=LogSource(topic=topic))
+
+
 def test_a_dataset_is_converted_without_its_unit(tmp_path):
     done = convert(dataset(tmp_path), tmp_path / "run.csv")
     assert done.joints == JOINTS

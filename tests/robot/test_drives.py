@@ -435,3 +435,26 @@ def test_what_drives_remember_is_of_the_model_not_of_what_was_remembered_before(
     again = remember(other, remember(model, x))
     np.testing.assert_array_equal(again.memory, remember(other, x).memory)
     assert np.abs(again.memory - remember(model, x).memory).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: LuGre(displacement=0.1, speed=0, excess=0.5), "LuGre: speed is 0, wanted 1e-09"),
+        (lambda: LuGre(displacement=0.1, excess=-1.0), "excess is -1.0, wanted -0.99 to 1000"),
+        (lambda: Presliding(displacement=0.0), "Presliding: displacement is 0.0, wanted 1e-09 to"),
+        (lambda: Stribeck(speed=-0.1), "Stribeck: speed is -0.1, wanted 1e-09 to 1e"),
+        (lambda: Tanh(speed=1e-320), "Tanh: speed is 1e-320, wanted"),
+        (lambda: Power(exponent=1e300), r"Power: exponent is 1e\+300, wanted 0 to 10"),
+        (lambda: Harmonic(order="x"), "Harmonic: order is 'x', wanted -1e"),
+        (lambda: PositionCoulomb(order=-1), "order is -1, wanted 0 to 10"),
+        (lambda: Ramp(low=0.5, high=0.5), "Ramp: low = 0.5, high = 0.5, wanted each larger than"),
+        (lambda: Hat(before=0.0, at=0.5, after=0.2), "before = 0, at = 0.5, after = 0.2, wanted"),
+        (lambda: Counterbalance(arm=0.0), "Counterbalance: arm is 0.0, wanted 1e-09"),
+        (lambda: Cubic(seen=(1.0, 0.0)), r"Cubic: seen is \(1.0, 0.0\), wanted \(lowest, highest"),
+        (lambda: Spring(seen=(np.nan, 1.0)), "Spring: seen is"),
+    ],
+)
+def test_a_shape_that_divides_by_zero_is_refused(make, words):
+    with pytest.raises(SettingsError, match=words):
+        make()

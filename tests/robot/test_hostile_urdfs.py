@@ -65,6 +65,17 @@ def test_ratios_of_couplings_are_checked(ratio):
         RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=[coupling])
 
 
+@pytest.mark.parametrize("ratios", [(), (("elbow_joint", 0.0), ("wrist_1_joint", -0.0))])
+def test_a_coupling_turns_with_some_joint(ratios):
+    couplings = [Coupling("good", (("elbow_joint", 0.0), ("wrist_1_joint", 1.0)))]
+    model = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), couplings=couplings)
+    assert "good.armature" in model.layout.names
+    with pytest.raises(SettingsError, match=r"'motor' turns with no joint: its ratios are \{"):
+        RobotModel.from_urdf(
+            example_urdf("ur5_robot.urdf"), couplings=[*couplings, Coupling("motor", ratios)]
+        )
+
+
 def test_an_interpreter_survives_the_command_lines_that_aborted_it(tmp_path):
     urdf, log = str(example_urdf("ur5_robot.urdf")), str(tmp_path / "none.csv")
     job = tmp_path / "job.toml"

@@ -1,0 +1,497 @@
+"""Hostile inputs of excite, simulate, report, LeRobot datasets and the tables of drives in a job.
+
+As those of ``hostile_inputs``, whose ``KINDS`` these are beside.
+"""
+
+import copy
+import json
+import shutil
+import tempfile
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from hypothesis import strategies as st
+
+from helpers.hostile_inputs import (
+    JOINTS,
+    MARKUP,
+    URDF,
+    columns,
+    good_log,
+    good_result,
+    obey,
+    places,
+    plain,
+    replacements,
+    toml,
+    values,
+    write_csv,
+)
+from helpers.recorders import write_lerobot
+from robotid.commanded.settings import LoopSettings
+from robotid.logs.data import Log
+from robotid.logs.read import write_log
+from robotid.robot.drives import FAMILIES
+from robotid.simulation.settings import Simulation
+
+__all__ = ["COMMAND_KINDS"]
+
+# --- what is spoilt ------------------------------------------------------------------------------
+
+
+def edits(found, new=replacements, most=2):
+    """Return a strategy of what is done with values at some of the places of a JSON value."""
+    actions = st.sampled_from(["put", "put", "drop", "add"])
+    return st.lists(st.tuples(st.sampled_from(found), actions, new), max_size=most)
+
+
+def edited(content, given):
+    """Return a JSON value with values at some places replaced, removed or added."""
+    for path, action, value in given:
+        value = copy.deepcopy(value)
+        if not path:
+            content = value
+            continue
+        try:
+            inside = content
+            for key in path[:-1]:
+                inside = inside[key]
+            if action == "drop":
+                del inside[path[-1]]
+            elif action == "add" and isinstance(inside, list):
+                inside.append(value)
+            else:
+                inside[path[-1]] = value
+        except (KeyError, IndexError, TypeError):  # an earlier edit took that place away
+            continue
+    return content
+
+
+def flagged(pairs):
+    """Return the words of flags with their arguments."""
+    return [word for pair in pairs for word in pair]
+
+
+numbers = st.sampled_from(
+    ["0", "-1", "1", "2", "0.5", "1e-9", "1e-300", "1e9", "1e300", "100000", "nan", "inf", "x", ""]
+)
+
+# --- robotid excite ------------------------------------------------------------------------------
+
+#: Robots of few joints: two that cannot touch themselves, one that slides, one without limits.
+ROBOTS = {
+    "two links": "",
+    "pan and tilt": """
+        <joint name="joint_1" type="revolute"><parent link="base"/><child link="pan"/>
+          <axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="2" effort="20"/></joint>
+        <joint name="joint_2" type="revolute"><parent link="pan"/><child link="tilt"/>
+          <origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
+          <limit lower="-1" upper="1" velocity="2" effort="20"/></joint>""",
+    "slide": """
+        <joint name="joint_1" type="prismatic"><parent link="base"/><child link="pan"/>
+          <axis xyz="0 0 1"/><limit lower="0" upper="0" velocity="2" effort="20"/></joint>
+        <joint name="joint_2" type="continuous"><parent link="pan"/><child link="tilt"/>
+          <axis xyz="0 1 0"/><limit velocity="1e-6" effort="0.01"/></joint>""",
+    "no limits": """
+        <joint name="joint_1" type="continuous"><parent link="base"/><child link="pan"/>
+          <axis xyz="0 0 1"/></joint>
+        <joint name="joint_2" type="fixed"><parent link="pan"/><child link="tilt"/></joint>""",
+    "nothing moves": """
+        <joint name="joint_1" type="fixed"><parent link="base"/><child link="pan"/></joint>
+        <joint name="joint_2" type="fixed"><parent link="pan"/><child link="tilt"/></joint>""",
+}
+_LINK = """<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="0.05 0 0.02"/>
+  <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><geometry><box size="0.1 0.05 0.05"/></geometry></collision></link>"""
+
+
+def robot_file(name, mass, folder):
+    """Return the URDF of one of the robots."""
+    if not ROBOTS[name]:
+        return URDF
+    links = _LINK.format(name="base", mass=1) + _LINK.format(name="pan", mass=mass)
+    links += _LINK.format(name="tilt", mass=mass)
+    path = folder / "robot.urdf"
+    path.write_text(f'<robot name="r">{links}{ROBOTS[name]}</robot>', encoding="utf-8")
+    return path
+
+
+wild = numbers | st.sampled_from(["1e6", "1e-6", "0.1", "10", "1e12"])
+of_joint = st.tuples(st.sampled_from([*JOINTS, *JOINTS, "x", ""]), wild).map("=".join)
+#: What a flag may be, to its ends.
+RANGED = {
+    "--duration": ["0.1", "0.5", "1", "600", "3600"],
+    "--harmonics": ["2", "3", "20", "100"],
+    "--share": ["0.001", "0.5", "1"],
+    "--clearance": ["none", "0", "-0.01", "0.01", "0.3", "1000"],
+    "--floor": ["-1000", "-0.5", "0", "0.05", "1000"],
+    "--starts": ["1", "2"],
+    "--seconds": ["0.001", "0.1"],
+    "--points": ["0.1", "1", "1000", "100000"],
+    "--criterion": ["A", "E", "condition", "widest", "D"],
+    "--given": ["RESULT", "RESULT", "no", ""],
+    "--joints": ["joint_1", "joint_2,joint_1", "joint_2", "x", "", ","],
+}
+HANGING = {
+    "--moving": ["joint_1", "joint_2,joint_1", "joint_2,joint_2", "x", "", ","],
+    "--link": ["link_1", "link_2", "base", "tilt", "", MARKUP],
+    "--mass": ["1e-9", "1", "50", "1e9", "nan"],
+}
+BOXES = ["a=-1,-1,-1,1,1,1", "=0,0,0,0,0,0", f"{MARKUP}=2,2,2,3,3,3", "a=1,1,1,0,0,0", "a=nan"]
+
+
+def ranged(table):
+    """Return a strategy of flags with arguments that a table names."""
+    return st.sampled_from([(flag, word) for flag, some in table.items() for word in some])
+
+
+excite_flags = st.one_of(
+    ranged(RANGED),
+    ranged(RANGED),
+    st.tuples(st.sampled_from([*sorted(RANGED), "--seed", "--gain"]), numbers),
+    st.tuples(
+        st.sampled_from(["--max-acceleration", "--max-jerk", "--max-power", "--noise", "--lock"]),
+        of_joint,
+    ),
+    st.tuples(st.just("--box"), st.sampled_from(BOXES)),
+)
+kinds = st.sampled_from([["--kind", kind] for kind in ("fourier", "bspline", "sweeps", "stands")])
+payloads = st.lists(
+    ranged(HANGING) | ranged({"--com": ["0,0,1", "1e9,0,0", "nan,0,0", "1"]}), max_size=2
+).map(lambda given: ["--kind", "payload", "--mass", "2", *flagged(given)])
+excitements = st.tuples(
+    st.sampled_from([*["pan and tilt"] * 5, *sorted(ROBOTS)]),
+    st.sampled_from([*["1"] * 8, "0", "1e-12", "1e9", "nan"]),  # masses [kg]
+    st.sampled_from([".csv"] * 8 + [".parquet", ".yaml", ".script", ".txt", ""]),
+    kinds | payloads,
+    st.lists(excite_flags, max_size=3),
+)
+
+
+def run_excite(example, folder):
+    robot, mass, suffix, kind, given = example
+    given = [(flag, str(good_result()[0]) if x == "RESULT" else x) for flag, x in given]
+    urdf, out = robot_file(robot, mass, folder), folder / "made"
+    out.mkdir()
+    quick = ["--starts", "1", "--seconds", "0.2", "--harmonics", "2", "--duration", "3"]
+    obey(
+        "excite", urdf, "--out", out / f"motion{suffix}", "--report", out / "page.html",
+        *quick, *kind, *flagged(given), out=out,
+    )  # fmt: skip
+    page = out / "page.html"
+    if page.exists():
+        assert "<script>alert" not in page.read_text(encoding="utf-8"), "markup is not escaped"
+
+
+# --- robotid simulate ----------------------------------------------------------------------------
+
+
+def keys_of(schema, prefix=()):
+    """Yield the path and the kind of every key of a schema that is no table of its own."""
+    for key, kind in schema.items():
+        if isinstance(kind, dict):
+            yield from keys_of(kind, (*prefix, key))
+        else:
+            yield (*prefix, key), kind
+
+
+#: What the settings of a kind may be, to their ends.
+MILD = {
+    bool: st.booleans(),
+    str: st.sampled_from(
+        ["usual", "none", "pd", "feedforward", "computed_torque", "perfect", "joint", "motor",
+         "torque", "find", "urdf", "one", "group", "link_1", "link_2"]
+    ),
+    float: st.sampled_from([0, 1e-9, 1e-3, 0.05, 0.5, 1, 1.0, 5.0, 30.0, 1e3, 1e5, 1e9, 1e12]),
+    list: st.sampled_from([[0.0, 0.0, 0.1], [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], [1e9] * 6, [JOINTS]]),
+}  # fmt: skip
+NAMES = st.sampled_from([*JOINTS, *JOINTS, "x", "joint_1.viscous", "link_1.mass"])
+MILD[dict] = st.dictionaries(NAMES, MILD[float] | plain, max_size=3)
+
+
+def mild(kind):
+    """Return a strategy of values of the kind that a key of a schema has."""
+    outer = getattr(kind, "outer", None)
+    some = [outer] if outer is not None else kind if isinstance(kind, tuple) else [dict]
+    return st.one_of(*(MILD[float if one is int else one] for one in some))
+
+
+@st.composite
+def settings_of(draw, schema):
+    """A table of a schema with some values, most of the right kind."""
+    table = {}
+    for path, kind in draw(st.lists(st.sampled_from(list(keys_of(schema))), max_size=3)):
+        inside = table
+        for key in path[:-1]:
+            inside = inside.setdefault(key, {})
+        inside[path[-1]] = draw(mild(kind) if draw(st.integers(0, 9)) else values)
+    return table
+
+
+simulate_flags = st.one_of(
+    st.tuples(
+        st.sampled_from(
+            ["--seed", "--rate", "--duration", "--perturb", "--torque-noise", "--limits",
+             "--payload", "--cutoff"]
+        ),
+        wild,
+    ),
+    st.tuples(
+        st.just("--controller"),
+        st.sampled_from(["pd", "feedforward", "computed_torque", "perfect", "x"]),
+    ),
+    st.tuples(st.just("--joints"), st.sampled_from(["joint_1", "joint_2,joint_1", "x", ""])),
+    st.tuples(st.just("--lock"), of_joint),
+)  # fmt: skip
+
+
+def simulations():
+    """Tables of a plant, flags, a motion or None for a good one, and what is written."""
+    motion = st.none() | columns()
+    return st.tuples(
+        settings_of(Simulation.schema() | {"drives": {"joint_1": (list,)}}),
+        st.lists(simulate_flags, max_size=3),
+        motion,
+        st.sampled_from([".csv", ".csv", ".npz", ".x"]),
+    )
+
+
+def run_simulate(example, folder):
+    plant, given, motion, suffix = example
+    path, out = folder / "motion.csv", folder / "made"
+    out.mkdir()
+    if motion is None:
+        write_log(good_log(), path)
+    else:
+        write_csv(motion, path)
+    (folder / "plant.toml").write_text(_as_toml(plant), encoding="utf-8")
+    obey(
+        "simulate", URDF, path, "--rate", "100", "--plant", folder / "plant.toml",
+        "--out", out / f"log{suffix}", "--urdf", out / "true.urdf", *flagged(given), out=out,
+    )  # fmt: skip
+
+
+def _as_toml(table):
+    return "\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items())
+
+
+# --- LeRobot datasets ----------------------------------------------------------------------------
+
+
+@cache
+def good_dataset():
+    """Return a folder with a dataset, and the content of its info.json."""
+    folder = Path(tempfile.mkdtemp(prefix="robotid-fuzz-")) / "set"
+    log = good_log()
+    names = [f"{name}.pos" for name in JOINTS]
+    named = {"observation.state": names, "action": names}
+    write_lerobot(folder, {0: (np.rad2deg(log.q), np.rad2deg(log.q))}, named)
+    return folder, (folder / "meta" / "info.json").read_text(encoding="utf-8")
+
+
+deep = st.integers(50, 3000).map(lambda depth: json.loads("[" * depth + "]" * depth))
+odd_names = st.sampled_from(
+    [None, 5, "joint_1", ["joint_1"] * 2, ["joint_1", ["joint_2"]], {"motors": 5}, {"a": {"b": []}},
+     [None, None], [""], ["joint_1.pos", "joint_1"], [".pos", ".vel"], ["a\0b", "\ud800"],
+     ["joint_1", "joint_2", "joint_3"], [["joint_1", "joint_2"]], [MARKUP, "x" * 3000]]
+)  # fmt: skip
+odd_columns = st.sampled_from(
+    ["drop", "null", "text", "ragged", "scalar", "huge", "empty", "index", "two files", "no rows",
+     "bytes"]
+)  # fmt: skip
+
+
+@st.composite
+def datasets(draw):
+    """The text of an info.json, and what is done with the table of the episode."""
+    content = json.loads(good_dataset()[1])
+    content = edited(content, draw(edits(list(places(content)), replacements | odd_names)))
+    features = content.get("features") if isinstance(content, dict) else None
+    if isinstance(features, dict) and draw(st.booleans()):
+        feature = draw(st.sampled_from(["observation.state", "action", "observation.effort"]))
+        features[feature] = draw(
+            st.fixed_dictionaries({"names": odd_names, "shape": st.sampled_from([[2], None, 5])})
+            | replacements
+        )
+    text = json.dumps(content)
+    if draw(st.integers(0, 9)) == 0:
+        text = draw(st.sampled_from(["", "[" * 100_000, "{}", "null", text[:-20], "\ufeff" + text]))
+    column = draw(st.sampled_from(["observation.state", "action", "timestamp", "episode_index",
+                                   "frame_index"]))  # fmt: skip
+    return text, draw(st.none() | odd_columns), column, draw(st.sampled_from(TOPICS))
+
+
+TOPICS = [None, None, None, "episode_0", "episode_1", "0", "-1", "x", "9" * 5000, "²", "٠"]
+
+
+def run_dataset(example, folder):
+    text, what, column, topic = example
+    path = folder / "set"
+    shutil.copytree(good_dataset()[0], path)
+    (path / "meta" / "info.json").write_text(text, encoding="utf-8", errors="surrogatepass")
+    spoil_dataset(next(path.glob("data/**/*.parquet")), what, column)
+    words = [] if topic is None else ["--topic", topic]
+    obey("doctor", URDF, path, "--angle-unit", "deg", *words)
+    obey("convert", path, folder / "out.csv", *words, out=folder / "out.csv")
+
+
+def spoil_dataset(path, what, column):
+    """Write a table whose columns hold something else."""
+    table = pq.read_table(path)
+    place, rows = table.column_names.index(column), table.num_rows
+    other = {
+        "null": pa.nulls(rows),
+        "text": pa.array(["x"] * rows),
+        "ragged": pa.array([[1.0] * (k % 4) for k in range(rows)]),
+        "scalar": pa.array(np.arange(rows)),
+        "huge": pa.array([[1e308, -1e308]] * rows),
+        "empty": pa.array([[]] * rows, type=pa.list_(pa.float32())),
+        "index": pa.array([2**62 + k for k in range(rows)]),
+    }
+    if what in other:
+        pq.write_table(table.set_column(place, column, other[what]), path)
+    elif what == "drop":
+        pq.write_table(table.remove_column(place), path)
+    elif what == "no rows":
+        pq.write_table(table.slice(0, 0), path)
+    elif what == "two files":
+        pq.write_table(table.remove_column(place), path.with_name("other.parquet"))
+    elif what == "bytes":
+        path.write_bytes(path.read_bytes()[:200])
+
+
+# --- tables of drives in a job file --------------------------------------------------------------
+
+NEEDS = {
+    "Stribeck": ["speed"], "Tanh": ["speed"], "Power": ["exponent"], "Harmonic": ["order"],
+    "Ramp": ["number", "low", "high"], "LuGre": ["displacement", "speed", "excess"],
+    "Presliding": ["displacement"], "PositionCoulomb": ["order", "centre"], "x": ["speed"],
+}  # fmt: skip
+rarely = st.integers(0, 9).map(lambda n: n == 0)
+
+
+@st.composite
+def drive_terms(draw):
+    """A table of a drive's term, most of it as it should be."""
+    name = draw(st.sampled_from(sorted(NEEDS)))
+    term = {"term": name}
+    for key in NEEDS[name]:
+        term[key] = draw(plain if draw(rarely) else MILD[float])
+    if draw(rarely):
+        term["seen"] = draw(st.sampled_from([[0.0, 1.0], [1.0, 0.0], [1.0], ["x"], {}]))
+    return term
+
+
+drive_lists = st.lists(
+    st.one_of(st.sampled_from(sorted(FAMILIES)), drive_terms()), min_size=1, max_size=2
+) | st.sampled_from([[], [[]], [{}], [5], "x", ["x"], [None]])
+few = st.sampled_from([1.0, -1.0, 2.0, 50.0, 0.5, 1.0, 0.0, 1e-9, 1e30, 1e300, "x"])
+gears = st.fixed_dictionaries(
+    {
+        "joints": st.sampled_from([[*JOINTS], [*JOINTS], ["joint_1"], ["x"], [1]]),
+        "matrix": st.sampled_from(
+            [[50.0, 50.0], [[50.0, 0.0], [10.0, 50.0]], [[50, 50], [50, -50]], [50.0], "urdf",
+             [[1.0, 1.0], [1.0, 1.0]], [], [[]], [[1.0], 2.0], 5, [[1e30, 0], [0, 1e-30]]]
+        ),
+    },
+    optional={
+        "motors": st.sampled_from([["m1", "m2"], ["joint_2", "joint_1"], ["m1"], ["", "m"]]),
+        "efficiency": st.lists(few, min_size=1, max_size=2),
+        "offset": st.lists(few, min_size=1, max_size=2),
+    },
+)  # fmt: skip
+lacking = st.fixed_dictionaries({}, optional={"joints": st.just([*JOINTS]), "matrix": few})
+couplings = st.fixed_dictionaries(
+    {
+        "name": st.sampled_from(["c", "joint_1", "joint_2", "", MARKUP]),
+        "ratios": st.dictionaries(st.sampled_from([*JOINTS, *JOINTS, "x"]), few, max_size=3),
+    },
+    optional={"replaces": st.booleans() | plain},
+)
+loops = settings_of(LoopSettings.schema())
+
+
+of_robot = st.sampled_from([*JOINTS, *JOINTS, "x", ""])
+TABLES = {
+    "drives": st.dictionaries(of_robot, drive_lists, min_size=1, max_size=2),
+    "transmission": st.lists(gears | gears | lacking, min_size=1, max_size=2),
+    "coupling": st.lists(couplings, min_size=1, max_size=2),
+}
+
+
+@st.composite
+def drive_jobs(draw):
+    """The tables of a job file whose drives, gears and couplings are hostile."""
+    table = {
+        "estimator": {"name": draw(st.sampled_from(["ols", "wls", "consistent", "consistent"]))}
+    }
+    for name in draw(st.lists(st.sampled_from(sorted(TABLES)), min_size=1, max_size=2)):
+        table[name] = draw(TABLES[name])
+    return table
+
+
+@st.composite
+def loop_jobs(draw):
+    """The tables of a job file whose loop is hostile, of one joint: each takes seconds."""
+    window = draw(st.sampled_from([0.5, 1.0, 3.0, 1e9, 1e-9]))
+    table = {"joints": ["joint_1"], "estimator": {"name": "simulation", "window": window}}
+    table["controller"] = draw(loops)
+    if draw(rarely):
+        name = draw(st.sampled_from(sorted(TABLES)))
+        table[name] = draw(TABLES[name])
+    return table
+
+
+def run_drive_job(table, folder, samples=200):
+    log = good_log(samples)
+    log = Log(log.t, log.q, log.tau, log.joints, log.v, q_ref=log.q)
+    table = {"urdf": URDF, "identification": [{"log": "fit.csv"}]} | table
+    table["output"] = {"report": False}
+    write_log(log, folder / "fit.csv")
+    path, out = folder / "job.toml", folder / "out"
+    path.write_text(_as_toml(table), encoding="utf-8", errors="replace")
+    obey("identify", path, "--out", out, out=out)
+
+
+# --- robotid report ------------------------------------------------------------------------------
+
+
+@cache
+def report_places():
+    """Return the places in what ``report`` reads of a result, by where they begin."""
+    content = json.loads(good_result()[1])
+    return [
+        [path for path in places(content) if path[:1] == (key,)]
+        for key in ("settings", "inputs", "outputs", "base_parameters", "structure")
+    ] + [[(key,) for key in content]]
+
+
+def reported():
+    """Edits of a result.json."""
+    new = replacements | st.sampled_from(["/dev/zero", "/dev/stdin", ".", "/", "result.json"])
+    return st.sampled_from(report_places()).flatmap(lambda found: edits(found, new))
+
+
+def run_report(given, folder):
+    path, made = folder / "result.json", folder / "made"
+    text = json.dumps(edited(json.loads(good_result()[1]), given))
+    path.write_text(text, encoding="utf-8")
+    made.mkdir()
+    obey("report", path, "--out", made / "page.html", out=made)
+    assert path.read_text(encoding="utf-8") == text, "half-written: the result was changed"
+    if (made / "page.html").exists():
+        assert "<script>alert" not in (made / "page.html").read_text(encoding="utf-8")
+
+
+#: By name: a strategy of examples, and what is done with one in an empty folder.
+COMMAND_KINDS = {
+    "excite": (lambda: excitements, (), run_excite),
+    "simulate": (simulations, (), run_simulate),
+    "LeRobot dataset": (datasets, (), run_dataset),
+    "drives of a job": (drive_jobs, (), run_drive_job),
+    "loop of a job": (loop_jobs, (), partial(run_drive_job, samples=80)),
+    "report of result.json": (reported, (), run_report),
+}
