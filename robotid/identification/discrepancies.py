@@ -315,9 +315,9 @@ def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
 
 def _lost_motion(joint: str, unit: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
-        f"{joint}: its position is {abs(x[0]):.2g} +- {error[0]:.1g} {unit} farther in one direction "
-        "of motion than in the other: backlash between the joint and its encoder; remove it, or "
-        "log the position of an encoder on the joint"
+        f"{joint}: its position is {abs(x[0]):.2g} +- {error[0]:.1g} {unit} farther in one "
+        "direction of motion than in the other: backlash between the joint and its encoder; remove "
+        "it, or log the position of an encoder on the joint"
     )
 
 

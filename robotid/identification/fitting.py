@@ -22,7 +22,7 @@ from robotid.estimators import (
     NormalisedGradient,
     RecursiveEstimator,
 )
-from robotid.estimators.consistent.weighting import choose_weight, contradicted_extents
+from robotid.estimators.consistent.weighting import Segments, choose_weight, contradicted_extents
 from robotid.exceptions import SettingsError
 from robotid.identification.settings import (
     BoundedSettings,
@@ -141,12 +141,18 @@ def consistent_fit(
         check=settings.check,
     )
     folds = gather(prior.stretches, _FOLDS)
-    if extent:
-        beyond = contradicted_extents(fit, folds)
-        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
-    if not isinstance(weight, str) or (weight == "auto" and len(folds) < 2):
+    how = "" if not isinstance(weight, str) else "cv" if weight == "auto" else weight
+    if how == "cv" and len(folds) < 2:
+        how = ""
+    if not extent and not how:
         return fit
-    choice = choose_weight(fit, folds, "cv" if weight == "auto" else weight)
+    segments = Segments.of(fit, folds)
+    if extent:
+        beyond = contradicted_extents(fit, segments)
+        fit = replace(fit, constraints=fit.constraints.without_extent(beyond))
+    if not how:
+        return fit
+    choice = choose_weight(fit, segments, how)
     return replace(
         fit, prior_weight=choice.weight, plausible_weight=choice.plausible, choice=choice
     )

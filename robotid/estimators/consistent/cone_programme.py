@@ -178,15 +178,20 @@ class Programme:
             A, shape (k, r), and r, shape (k,), at a weight of 1, with the penalty expanded at its
             centre and r the number of directions that the equalities leave.
         """
+        beta, M = self._plausible
+        return rows[:, :-1] @ M, rows[:, -1] - rows[:, :-1] @ beta
+
+    @cached_property
+    def _plausible(self) -> tuple[Array, Array]:
+        """Base parameters by the prior, beta + M x, shapes (b,) and (b, r), as of ``whitened``."""
         centre, basis = self.penalty.centre / self.scale, self.space.basis
         S = self._scaled_root(self.penalty.centre)
         # the point of the subspace that is nearest to the centre
         away = np.linalg.lstsq(S @ basis, S @ (centre - self.space.origin), rcond=None)[0]
         nearest = self.space.origin + basis @ away
-        A = rows[:, :-1] @ self.K * self.scale
         L = scipy.linalg.qr(S @ basis, mode="r")[0][: basis.shape[1]]
-        directions = scipy.linalg.solve_triangular(L, (A @ basis).T, trans="T").T
-        return directions, rows[:, -1] - A @ nearest
+        K = self.K * self.scale
+        return K @ nearest, scipy.linalg.solve_triangular(L, (K @ basis).T, trans="T").T
 
     def noise(self, factors: Factors, sigma: Array, share: float, weight: float) -> Array:
         """Return the noise levels, shape (n,) [N m or N], by the fit without inequalities, never 0.
@@ -201,23 +206,22 @@ class Programme:
             share: Share of the rows that count as independent [-].
             weight: Weight of the penalty [-].
         """
-        n, size, _ = factors.R.shape
-        A, r = self.whitened(factors.R.reshape(n * size, size))
-        A, r = A.reshape(n, size, -1), r.reshape(n, size)
-        rows, p = np.maximum(factors.rows, 1), A.shape[2]
+        beta, M = self._plausible
+        rows = np.maximum(factors.rows, 1)
         torque = np.sqrt(factors.torque_squares() / rows)
         least = _FLOOR * np.where(torque > 0, torque, 1.0)
         sigma = np.maximum(sigma, least)
+        # M x = U x' with as few parameters as there are base parameters
+        U = scipy.linalg.qr(M.T, mode="r")[0][: len(M)].T
+        left = factors.without(beta)
         for _ in range(_NOISE_STEPS):
-            root = (np.sqrt(share) / sigma)[:, None, None]
-            stacked = np.vstack([(A * root).reshape(-1, p), np.sqrt(weight) * np.eye(p)])
-            right = np.concatenate([(r * root[:, 0]).reshape(-1), np.zeros(p)])
-            triangle = scipy.linalg.qr(np.column_stack([stacked, right]), mode="r")[0][:p]
-            inverse = scipy.linalg.solve_triangular(triangle[:, :-1], np.eye(p))
-            residual = r - A @ (inverse @ triangle[:, -1])
-            spent = ((A @ inverse * root) ** 2).sum(axis=(1, 2))
+            weights = share / sigma**2
+            information = U.T @ left.information(weights) @ U + weight * np.eye(U.shape[1])
+            factor = scipy.linalg.cho_factor(information)
+            x = scipy.linalg.cho_solve(factor, U.T @ left.score(np.zeros(len(U)), weights))
+            spent = weights * left.leverages(U @ scipy.linalg.cho_solve(factor, U.T))
             freedom = np.maximum(rows - spent / share, _LEAST_FREEDOM * rows)
-            updated = np.maximum(np.sqrt((residual**2).sum(axis=1) / freedom), least)
+            updated = np.maximum(np.sqrt(left.residual_squares(U @ x) / freedom), least)
             change = float(np.max(np.abs(updated / sigma - 1.0)))
             sigma = updated
             if change < _NOISE_SETTLED:

@@ -1,7 +1,8 @@
 """Decisions by held-out segments of the fitted data: the prior's weight, and bodies' extents."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from robotid.estimators.consistent.penalties import WeightChoice
 from robotid.exceptions import DataError, NotConvergedError
 from robotid.regressor.factors import Factors, merge
 
-__all__ = ["choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
+__all__ = ["Segments", "choose_weight", "contradicted_extents", "held_out_errors", "log_evidence"]
 
 _LIGHTEST, _HEAVIEST = -4.0, 2.0  # decades of the weights tried
 _LIGHTEST_ENTROPIC = -1.0  # below, bodies become thin, and fits take long
@@ -25,7 +26,48 @@ _CLEAR = 0.02  # share of the mean square by which an extent must be worse, to b
 _STEP = 0.5  # decades by which the best one is refined
 
 
-def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> WeightChoice:
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Contiguous segments of the fitted data, each held out of fits in turn.
+
+    Attributes:
+        kept: Their factors, K of them.
+        sigma: Noise level per joint, shape (n,) [N m or N].
+        rows: Information of all of them, shape (b + 1, b + 1), as of ``Consistent.rows``.
+        share: Share of the rows that count as independent [-].
+    """
+
+    kept: tuple[Factors, ...]
+    sigma: Array
+    rows: Array
+    share: float
+
+    @classmethod
+    def of(
+        cls, fit: Consistent, stretches: Sequence[Factors], sigma: Array | None = None
+    ) -> "Segments":
+        """Return segments with the noise level that a fit to all of them shows.
+
+        Args:
+            fit: The fit, whose constraints do not matter.
+            stretches: Factors of contiguous stretches of the fitted data.
+            sigma: The noise level, if it is known.
+        """
+        whole = merge(stretches)
+        level = fit.noise(whole) if sigma is None else sigma
+        return cls(tuple(stretches), level, fit.rows(whole, level), fit.independent_share)
+
+    @cached_property
+    def others(self) -> tuple[Array, ...]:
+        """Information of all segments but one, K arrays of shape (b + 1, b + 1)."""
+        level = self.sigma / np.sqrt(self.share)
+        return tuple(
+            merge([*self.kept[:k], *self.kept[k + 1 :]]).weighted(level)
+            for k in range(len(self.kept))
+        )
+
+
+def choose_weight(fit: Consistent, segments: Segments, how: str) -> WeightChoice:
     """Return the weight of the prior that the fitted data speak for.
 
     * "cv": the largest weight that predicts held-out segments as well as the best one. The error of
@@ -42,19 +84,16 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
 
     Args:
         fit: The fit, whose own weight does not matter.
-        stretches: Factors of contiguous stretches of the fitted data.
+        segments: The fitted data.
         how: "cv" or "evidence".
 
     Raises:
-        DataError: If "cv" has fewer than two stretches.
+        DataError: If "cv" has fewer than two segments.
         NotConvergedError: If the fit does not converge at the heaviest weight.
     """
-    sigma = fit.noise(merge(stretches))
     lightest = _LIGHTEST if fit.penalty.is_quadratic else _LIGHTEST_ENTROPIC
-    rows = fit.rows(merge(stretches), sigma)
-    by_evidence = _search(
-        lambda w: (-log_evidence(fit, rows, w), np.zeros(0)), "evidence", lightest
-    )
+    evidence = log_evidence(fit, segments.rows)
+    by_evidence = _search(lambda w: (-evidence(w), np.zeros(0)), "evidence", lightest)
     if how == "evidence":
         return by_evidence
 
@@ -63,30 +102,28 @@ def choose_weight(fit: Consistent, stretches: Sequence[Factors], how: str) -> We
     def score(weight: float) -> tuple[float, Array]:
         nonlocal starts
         try:
-            errors, starts = _held_out(fit, stretches, sigma, weight, starts)
+            errors, starts = _held_out(fit, segments, weight, starts)
         except NotConvergedError:
             if starts is None:
                 raise
-            return float("inf"), np.full((len(stretches), len(sigma)), np.inf)
+            return float("inf"), np.full((len(segments.kept), len(segments.sigma)), np.inf)
         return float(np.exp(0.5 * np.log(_by_joint(errors)).mean())), errors
 
     return replace(_search(score, how, lightest), plausible=by_evidence.plausible)
 
 
-def contradicted_extents(fit: Consistent, stretches: Sequence[Factors]) -> tuple[str, ...]:
+def contradicted_extents(fit: Consistent, segments: Segments) -> tuple[str, ...]:
     """Return the bodies whose mass the data put outside the box that should hold it.
 
     They are those that a fit without extents, at a weight of 1, puts outside by more than four
-    standard errors; if it also predicts held-out stretches better than the fit with extents, by
+    standard errors; if it also predicts held-out segments better than the fit with extents, by
     more than two standard errors and 2 % of the mean square.
 
     Args:
         fit: The fit, whose own weight does not matter.
-        stretches: Factors of contiguous stretches of the fitted data; one cannot be held out.
+        segments: The fitted data; one segment cannot be held out.
     """
-    whole, cone = merge(stretches), fit.programme.cone.linear
-    sigma = fit.noise(whole)
-    rows = fit.rows(whole, sigma)
+    cone, rows, count = fit.programme.cone.linear, segments.rows, len(segments.kept)
     free = replace(fit, constraints=fit.constraints.without_extent(fit.constraints.extent))
     try:
         solution = free.programme.minimise(rows, 1.0, is_exact=False)
@@ -97,71 +134,59 @@ def contradicted_extents(fit: Consistent, stretches: Sequence[Factors]) -> tuple
     beyond = G @ solution.x + cone.h < -_BEYOND * error
     outside = [label for label, is_out in zip(cone.labels, beyond, strict=True) if is_out]
     bodies = tuple(body for body in fit.layout.bodies if f"extent {body}" in outside)
-    if not bodies or len(stretches) < 2:
+    if not bodies or count < 2:
         return bodies
-    starts = [solution] * len(stretches)
     try:
-        unbound = _held_out(free, stretches, sigma, 1.0, starts)[0].sum(axis=1)
+        unbound = _held_out(free, segments, 1.0, [solution] * count)[0].sum(axis=1)
     except NotConvergedError:
         return ()
     try:
-        bound = _held_out(fit, stretches, sigma, 1.0, None)[0].sum(axis=1)
+        bound = _held_out(fit, segments, 1.0, None)[0].sum(axis=1)
     except NotConvergedError:  # data without noise cannot be fitted at all
         return bodies
     is_clear = bound.sum() > (1.0 + _CLEAR) * unbound.sum() and not _is_as_good(bound, unbound)
     return bodies if is_clear else ()
 
 
-def held_out_errors(
-    fit: Consistent, stretches: Sequence[Factors], sigma: Array, weight: float
-) -> Array:
-    """Return how well each stretch is predicted by the fit to all others, constraints included.
+def held_out_errors(fit: Consistent, segments: Segments, weight: float) -> Array:
+    """Return how well each segment is predicted by the fit to all others, constraints included.
 
     Args:
         fit: The fit, whose own weight does not matter.
-        stretches: Factors of contiguous stretches, at least two.
-        sigma: Noise level per joint, shape (n,) [N m or N].
+        segments: The fitted data, at least two segments.
         weight: Weight of the prior.
 
     Returns:
         Sum of squares of the prediction errors by segment and joint, over the joint's noise level
-        and its number of rows in all segments, shape (stretches, n) [-]: the sum over segments is
+        and its number of rows in all segments, shape (segments, n) [-]: the sum over segments is
         the mean square of each joint.
 
     Raises:
-        DataError: If there are fewer than two stretches.
+        DataError: If there are fewer than two segments.
         NotConvergedError: If a fit does not converge.
     """
-    return _held_out(fit, stretches, sigma, weight, None)[0]
+    return _held_out(fit, segments, weight, None)[0]
 
 
 def _held_out(
-    fit: Consistent,
-    stretches: Sequence[Factors],
-    sigma: Array,
-    weight: float,
-    starts: Sequence[ConeSolution] | None,
+    fit: Consistent, segments: Segments, weight: float, starts: Sequence[ConeSolution] | None
 ) -> tuple[Array, list[ConeSolution]]:
     """Return the errors of ``held_out_errors``, and the fits that made them, to start others."""
-    if len(stretches) < 2:
+    if len(segments.kept) < 2:
         raise DataError(
-            f"the prior's weight cannot be chosen from {len(stretches)} stretch; fit longer logs, "
-            "or use prior_weight = 'evidence'"
+            f"the prior's weight cannot be chosen from {len(segments.kept)} stretch; fit longer "
+            "logs, or use prior_weight = 'evidence'"
         )
     squares, fits = [], []
-    for k, kept in enumerate(stretches):
-        others = merge([*stretches[:k], *stretches[k + 1 :]])
+    for k, (kept, others) in enumerate(zip(segments.kept, segments.others, strict=True)):
         start = None if starts is None else starts[k]
-        solution = fit.programme.minimise(
-            fit.rows(others, sigma), weight, is_exact=False, start=start
-        )
-        fits.append(solution)
-        squares.append(kept.residual_squares(fit.K @ solution.x) / sigma**2)
-    rows = np.sum([kept.rows for kept in stretches], axis=0)  # (n,)
+        fits.append(fit.programme.minimise(others, weight, is_exact=False, start=start))
+        squares.append(kept.residual_squares(fit.K @ fits[-1].x) / segments.sigma**2)
+    rows = np.sum([kept.rows for kept in segments.kept], axis=0)  # (n,)
     return np.array(squares) / np.maximum(rows, 1), fits
 
 
-def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
+def log_evidence(fit: Consistent, rows: Array) -> Callable[[float], float]:
     """Return the log marginal likelihood of the data by the prior's weight, but for a constant.
 
     With x = L (pi - centre) ~ N(0, 1 / weight) before the data and r = A x + noise of unit
@@ -171,17 +196,23 @@ def log_evidence(fit: Consistent, rows: Array, weight: float) -> float:
     Args:
         fit: The fit, whose own weight does not matter.
         rows: Information, shape (k, b + 1), as of ``Consistent.rows``.
-        weight: Weight of the prior.
+
+    Returns:
+        The function of the weight [-].
 
     References:
         MacKay (1992), Bayesian interpolation, section 4.
     """
     A, r = fit.programme.whitened(rows)
     U, s, _ = np.linalg.svd(A, full_matrices=False)
-    spread = 1.0 + s**2 / weight
     along = U.T @ r
-    # |r|^2 outside the range of A is constant
-    return float(-0.5 * ((along**2 / spread).sum() + np.log(spread).sum()))
+
+    def likelihood(weight: float) -> float:
+        spread = 1.0 + s**2 / weight
+        # |r|^2 outside the range of A is constant
+        return float(-0.5 * ((along**2 / spread).sum() + np.log(spread).sum()))
+
+    return likelihood
 
 
 def _search(

@@ -10,7 +10,12 @@ from helpers.fitting import identify
 from helpers.synthetic import exact_log, truth
 
 from robotid.estimators import Consistent
-from robotid.estimators.consistent.weighting import choose_weight, held_out_errors, log_evidence
+from robotid.estimators.consistent.weighting import (
+    Segments,
+    choose_weight,
+    held_out_errors,
+    log_evidence,
+)
 from robotid.exceptions import DataError, SettingsError
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.signals import process
@@ -54,7 +59,7 @@ def test_the_evidence_is_the_density_of_the_data(case, metric):
         S = np.eye(len(d)) + D @ C @ D.T / weight
         mean = D @ fit.penalty.centre
         expected.append(scipy.stats.multivariate_normal(mean, S).logpdf(d))
-        stated.append(log_evidence(fit, rows, weight))
+        stated.append(log_evidence(fit, rows)(weight))
     np.testing.assert_allclose(np.diff(stated), np.diff(expected), rtol=1e-6, atol=1e-4)
 
 
@@ -71,7 +76,7 @@ def test_the_evidence_finds_the_spread_that_parameters_were_drawn_with(case):
         rows[:, :-1] = D @ np.linalg.pinv(fit.K)
         rows[:, -1] = rows[:, :-1] @ (fit.K @ pi) + 1e-3 * rng.standard_normal(58)
         weights = 10.0 ** np.arange(-1.0, 5.0, 0.25)
-        values = [log_evidence(fit, 1e3 * rows, weight) for weight in weights]
+        values = [log_evidence(fit, 1e3 * rows)(weight) for weight in weights]
         found.append(np.log10(weights[int(np.argmax(values))]))
     assert np.mean(found) == pytest.approx(2.0, abs=0.2)
 
@@ -88,7 +93,7 @@ def test_the_held_out_errors_are_those_of_a_loop_by_hand(case):
         part = slice(200 * 6 * k, 200 * 6 * (k + 1))
         residual = (tau - W @ (fit.K @ pi))[part].reshape(-1, 6) / NOISE
         total, count = total + (residual**2).sum(axis=0), count + len(residual)
-    error = np.sqrt(held_out_errors(fit, stretches, NOISE, 2.0).sum(axis=0))
+    error = np.sqrt(held_out_errors(fit, Segments.of(fit, stretches, NOISE), 2.0).sum(axis=0))
     # it is computed to the solver's tolerance only
     np.testing.assert_allclose(error, np.sqrt(total / count), rtol=2e-4)
 
@@ -115,11 +120,11 @@ def chosen(case, monkeypatch, excess):
     """Return the choice where mean squares rise by excess (6, n) per decade above 0.01."""
     fit, problem = case
 
-    def errors(fit, segments, sigma, w, starts):
+    def errors(fit, segments, w, starts):
         return (1.0 + abs(np.log10(w) + 2.0) * np.asarray(excess)) / 6.0, []
 
     monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
-    return choose_weight(fit, cut(problem, 6), "cv")
+    return choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
 
 
 @pytest.mark.parametrize(("gain", "weight"), [(0.009, 100.0), (0.03, 0.1), (0.5, 0.01)])
@@ -153,12 +158,12 @@ def test_no_joint_may_lose_more_than_five_percent(case, monkeypatch, loss, weigh
 def test_a_joint_at_rest_is_left_out_of_the_choice(case, monkeypatch):
     fit, problem = case
 
-    def errors(fit, segments, sigma, w, starts):
+    def errors(fit, segments, w, starts):
         squares = (1.0 + abs(np.log10(w) + 2.0) * (0.009 + CHANCE)) / 6.0
         return np.hstack([squares, np.zeros_like(squares)]), []
 
     monkeypatch.setattr("robotid.estimators.consistent.weighting._held_out", errors)
-    choice = choose_weight(fit, cut(problem, 6), "cv")
+    choice = choose_weight(fit, Segments.of(fit, cut(problem, 6)), "cv")
     assert choice.weight == pytest.approx(100.0)
     assert choice.curve[-1][1] == pytest.approx(np.sqrt(1.036))
 
@@ -169,8 +174,10 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
     true = fit.fit(compress(problem)).theta
     wrong = true + 30.0 * fit.prior_std
     for how in ("cv", "evidence"):
-        good = choose_weight(replace(fit, prior=true), stretches, how).weight
-        bad = choose_weight(replace(fit, prior=wrong), stretches, how).weight
+        good, bad = (
+            choose_weight(fit, Segments.of(fit, stretches), how).weight
+            for fit in (replace(fit, prior=true), replace(fit, prior=wrong))
+        )
         assert good == 100.0
         assert bad <= 0.1, how
 
@@ -178,7 +185,7 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
 def test_one_stretch_is_too_few(case):
     fit, problem = case
     with pytest.raises(DataError, match="cannot be chosen from 1 stretch"):
-        choose_weight(fit, [compress(problem)], "cv")
+        choose_weight(fit, Segments.of(fit, [compress(problem)]), "cv")
 
 
 def test_an_unknown_way_is_refused():
