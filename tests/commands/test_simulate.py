@@ -185,7 +185,7 @@ def test_a_plant_file_is_checked_key_by_key(folder, capsys):
 
 def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     """A part of a link that was drawn as a whole with what is locked to it may be impossible."""
-    words = ["--rate", "50", "--perturb", "5", "--lock", "elbow_joint=0.5"]
+    words = ["--controller", "perfect", "--perturb", "5", "--lock", "elbow_joint=0.5"]
     code, _ = simulated(folder, *words, "--urdf", f"{folder}/never.urdf", out="never.csv")
     assert code == 1
     assert "would be no possible body" in " ".join(capsys.readouterr().err.split())
