@@ -424,6 +424,7 @@ _AS_FOUND = (
     "joint_order",
     "joint_origin",
     "joint_torque_delay",
+    "lost_motion",
     "mass_matrix",
     "payload",
     "position_order",

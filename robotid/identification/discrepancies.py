@@ -89,8 +89,8 @@ def explain_residual(
 
     Returns:
         Terms that the drives lack, the largest first, and warnings "position_offset",
-        "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin", what explains
-        most of the residual first.
+        "lost_motion", "angle_scale", "torque_scale", "time_scale", "gravity" and "joint_origin",
+        what explains most of the residual first.
     """
     if sample is None:
         return (), ()
@@ -180,6 +180,8 @@ def _alterations(model: RobotModel, pi: Array, sample: Sample) -> Iterator[_Alte
         applied = partial(offset, j)
         Z = moved(none, only)
         yield _Alteration("position_offset", joint, Z, 0.01, _zero(joint, unit), applied)
+        lost = 0.5 * Z * sample.motions[j].direction[:, None, None]
+        yield _Alteration("lost_motion", joint, lost, 0.005, _lost_motion(joint, unit))
         yield _Alteration("angle_scale", joint, moved(only, none), 0.02, _scale(f"q_{joint}"))
         yield _Alteration("torque_scale", joint, (tau * only)[..., None], 0.05, _gain(joint))
     for first in range(1, n - 1):  # the drives of a wrist are of one kind
@@ -308,6 +310,14 @@ def _zero(joint: str, unit: str) -> Callable[[Array, Array], str]:
     return lambda x, error: (
         f"{joint}: the zero of its position is off by {-x[0]:.3g} +- {error[0]:.2g} {unit}: "
         f"correct q_{joint}, or the joint's origin in the URDF"
+    )
+
+
+def _lost_motion(joint: str, unit: str) -> Callable[[Array, Array], str]:
+    return lambda x, error: (
+        f"{joint}: its position is {abs(x[0]):.2g} +- {error[0]:.1g} {unit} farther in one direction "
+        "of motion than in the other: backlash between the joint and its encoder; remove it, or "
+        "log the position of an encoder on the joint"
     )
 
 

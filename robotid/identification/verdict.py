@@ -68,6 +68,7 @@ _WORDS = {
     "joint_order": "the columns may be those of another joint",
     "joint_torque_delay": "the torque is {delay:+.3f} s (+ late, - early) against the position, "
     "those of the other joints are not",
+    "lost_motion": "backlash may lie between the joint and its encoder",
     "mass_matrix": "the mass matrix is not positive definite everywhere",
     "payload_change": "its last link carries {mass:+.2g} kg against the fitted logs",
     "position_offset": "the zero of the position may be off",

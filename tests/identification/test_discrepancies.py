@@ -75,6 +75,8 @@ def test_nothing_is_said_of_drives_that_do_more_than_their_model(model, effect):
     [
         (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.1, 0.0)),
          "position_offset", "elbow_joint", -0.1, "zero of its position is off by 0."),
+        (lambda log, one: replace(log, q=log.q + one("elbow_joint", 0.02, 0.0) * np.sign(log.v)),
+         "lost_motion", "elbow_joint", -0.04, "position is 0.04"),
         (lambda log, one: replace(log, q=1.1 * log.q, v=None),
          "angle_scale", "all joints", 1 / 1.1 - 1, "every position fits best times 0.9"),
         (lambda log, one: replace(log, q=log.q * one("elbow_joint", 1.2, 1.0), v=None),
