@@ -200,4 +200,7 @@ def test_a_flag_is_not_named_as_a_key_of_the_plants_file(folder, capsys):
     assert "command line: locked.elbow_joint is 1e+300, wanted a number" in said
     (folder / "wrong.toml").write_text("[drives]\nelbow_joint = [{ term = 'Tanh', speed = 'x' }]")
     assert simulated(folder, "--plant", f"{folder}/wrong.toml", out="never.csv")[0] == 2
-    assert "wrong.toml: Tanh: speed is 'x', wanted a finite number" in capsys.readouterr().err
+    assert (
+        "wrong.toml: drives.elbow_joint: Tanh: speed is 'x', wanted a finite number"
+        in capsys.readouterr().err
+    )
