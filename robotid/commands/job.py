@@ -69,10 +69,14 @@ def _load_drives(table: Mapping[str, Sequence[Any]]) -> dict[str, tuple[str | Dr
                     f"drives.{joint} has {entry!r}, wanted some of {listed(FAMILIES)}, or a table "
                     "of a term with its shape"
                 )
-    return {
-        joint: tuple(e if isinstance(e, str) else term_from_dict(e) for e in entries)
-        for joint, entries in table.items()
-    }
+    return {joint: tuple(_load_term(joint, e) for e in entries) for joint, entries in table.items()}
+
+
+def _load_term(joint: str, entry: Any) -> str | DriveTerm:  # noqa: ANN401
+    try:
+        return entry if isinstance(entry, str) else term_from_dict(entry)
+    except SettingsError as error:
+        raise SettingsError(f"drives.{joint}: {error}") from error
 
 
 def _dump_drives(drives: Mapping[str, Sequence[str | DriveTerm]]) -> dict[str, list[Any]]:

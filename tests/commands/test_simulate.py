@@ -185,7 +185,7 @@ def test_a_plant_file_is_checked_key_by_key(folder, capsys):
 
 def test_a_robot_that_cannot_be_a_urdf_leaves_no_file(folder, capsys):
     """A part of a link that was drawn as a whole with what is locked to it may be impossible."""
-    words = ["--rate", "50", "--perturb", "5", "--lock", "elbow_joint=0.5"]
+    words = ["--controller", "perfect", "--perturb", "5", "--lock", "elbow_joint=0.5"]
     code, _ = simulated(folder, *words, "--urdf", f"{folder}/never.urdf", out="never.csv")
     assert code == 1
     assert "would be no possible body" in " ".join(capsys.readouterr().err.split())
@@ -200,4 +200,7 @@ def test_a_flag_is_not_named_as_a_key_of_the_plants_file(folder, capsys):
     assert "command line: locked.elbow_joint is 1e+300, wanted a number" in said
     (folder / "wrong.toml").write_text("[drives]\nelbow_joint = [{ term = 'Tanh', speed = 'x' }]")
     assert simulated(folder, "--plant", f"{folder}/wrong.toml", out="never.csv")[0] == 2
-    assert "wrong.toml: Tanh: speed is 'x', wanted a finite number" in capsys.readouterr().err
+    assert (
+        "wrong.toml: drives.elbow_joint: Tanh: speed is 'x', wanted a finite number"
+        in capsys.readouterr().err
+    )
