@@ -19,7 +19,6 @@ __all__ = ["Triangle"]
 
 _PANEL = 8  # columns eliminated at a time: measured fastest for 20 to 70 columns ...
 _WIDE, _WIDE_PANEL = 200, 24  # ... and from so many columns on, which leave a cache
-_ROUNDING = 1e-14  # share of a column
 
 
 class Triangle:
@@ -62,10 +61,7 @@ class Triangle:
             places: Which of the c columns it has, shape (m,), ascending.
         """
         first = int(places[0])
-        if len(other) > _WIDE:  # few rows leave most of a wide factor empty, but for rounding
-            size = np.abs(other)
-            other = other[(size > _ROUNDING * size.max(axis=0)).any(axis=1)]
-        rows = np.zeros((len(other), len(self.R) - first), order="F")
+        rows = np.zeros((len(places), len(self.R) - first), order="F")
         rows[:, places - first] = other
         self._fold(rows, first, len(rows))
 
