@@ -12,7 +12,7 @@ from robotid._typing import report_stage
 from robotid.commanded.identify import Commanded
 from robotid.commands.commanded import run_commanded
 from robotid.commands.job import Job, LogEntry
-from robotid.commands.logs import checkpoint_inputs, examine_logs, survey_logs
+from robotid.commands.logs import checkpoint_inputs, examine_logs, locked_as_logged, survey_logs
 from robotid.exceptions import DataError
 from robotid.export.result import build_result
 from robotid.export.urdf import DYNAMICS_TERMS, write_urdf
@@ -81,7 +81,9 @@ def run_job(
     found, checkpoint = identify_job(job, model, chosen, target)
     report_stage(chosen.progress, "writing")
     with released_on_error(checkpoint):
-        saved = _write(found, job, target, source=source, beside=beside)
+        asked = found.asked.job
+        done = asked if isinstance(asked, Job) else job
+        saved = _write(found, done, target, source=source, beside=beside)
     if checkpoint is not None:
         checkpoint.remove()
     return saved
@@ -225,8 +227,12 @@ def identify_job(
     if not fitted:
         raise DataError("no log was given; at least one is needed to identify anything")
     report_stage(plan.progress, "checking logs")
-    stated = model.locked if job.mimic == "coupled" else job.locked
-    found = [*locked_findings(model, stated), *examine_logs(job, model, fitted, kept)]
+    job, placed = locked_as_logged(job, model, (*fitted, *kept))
+    if placed:
+        model = job.model()
+        fitted, kept = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, kept))
+    locked = locked_findings(model, job.placed(model))
+    found = [*locked, *examine_logs(job, model, fitted, kept)]
     recordings = Recordings(model, structural_mapping(model), fitted, kept)
     checkpoint = None
     if not recordings.is_held:
@@ -250,4 +256,5 @@ def identify_job(
             friction=job.friction,
             progress=plan.progress,
         )
-    return replace(concluded, asked=replace(concluded.asked, job=job)), checkpoint
+    asked = replace(concluded.asked, job=job)
+    return replace(concluded, asked=asked, findings=(*placed, *concluded.findings)), checkpoint

@@ -127,7 +127,9 @@ class Job(Settings):
     joints: tuple[str, ...] | None = setting(
         None, "joints to identify, in order; all movable ones if not stated"
     )
-    locked: Mapping[str, float] = setting({}, "positions of joints held still [rad or m]")
+    locked: Mapping[str, float] = setting(
+        {}, 'positions of joints held still, `"*"` that of all others [rad or m]'
+    )
     gravity: tuple[float, float, float] = setting(
         (0.0, 0.0, -9.81), "gravity in the root link's frame [m/s^2]"
     )
@@ -263,6 +265,17 @@ class Job(Settings):
             dynamics=self.model_dynamics,
             snap_angles=self.snap_angles,
         )
+
+    def placed(self, model: "RobotModel") -> tuple[str, ...]:
+        """Return the locked joints of the model that stand where the job says.
+
+        Args:
+            model: The job's robot.
+        """
+        if "*" in self.locked:
+            return tuple(model.locked)
+        leaders = {joint.name: joint.mimic[0] for joint in model.tree.movable if joint.mimic}
+        return tuple(j for j in model.locked if {j, leaders.get(j)} & set(self.locked))
 
     @property
     def friction(self) -> dict[str, str]:

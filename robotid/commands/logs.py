@@ -6,11 +6,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from robotid._files import file_sha256
 from robotid._typing import STAGES, ProgressCallback, report_stage
 from robotid.commands.job import Job, LogEntry, job_from_settings
 from robotid.doctor.diagnosis import diagnose
-from robotid.doctor.locked_joints import check_locked
+from robotid.doctor.locked_joints import STILL, check_locked
 from robotid.exceptions import DataError
 from robotid.export.result import load_result, stated_model, stated_parameters
 from robotid.findings import Finding, by_severity
@@ -24,7 +26,14 @@ from robotid.regressor.base_parameters import structural_mapping
 from robotid.robot.model import RobotModel
 from robotid.versions import code_versions
 
-__all__ = ["checkpoint_inputs", "examine", "examine_logs", "job_of_result", "survey_logs"]
+__all__ = [
+    "checkpoint_inputs",
+    "examine",
+    "examine_logs",
+    "job_of_result",
+    "locked_as_logged",
+    "survey_logs",
+]
 
 _PIECES = 8  # pieces that the rows in memory are cut into: smoothing a piece takes some room
 _SHORTEST = 256  # rows of a piece
@@ -105,7 +114,42 @@ def examine(
     groups = job.identification, job.validation
     fitted, kept = survey_logs(job, model, *groups, refuse=refuse, needs="any")
     report_stage(progress, "checking logs", STAGES[:2])
-    return by_severity([*refused, *examine_logs(job, model, fitted, kept)])
+    job, found = locked_as_logged(job, model, (*fitted, *kept))
+    if found:
+        model = job.model()
+        fitted, kept = (tuple(replace(x, model=model) for x in logs) for logs in (fitted, kept))
+    return by_severity([*refused, *found, *examine_logs(job, model, fitted, kept)])
+
+
+def locked_as_logged(
+    job: Job, model: RobotModel, logs: Sequence[SurveyedLog]
+) -> tuple[Job, list[Finding]]:
+    """Return the job with joints locked where the logs have them, unless it says where.
+
+    A joint that moves, or stands elsewhere in another log, is left to ``check_locked``.
+
+    Args:
+        job: The job.
+        model: Its robot.
+        logs: Its logs.
+
+    Returns:
+        The job, and a note of the joints and their positions; none if there are none.
+    """
+    there = {}
+    for joint in [joint for joint in model.locked if joint not in job.placed(model)]:
+        found = [log.held[joint] for log in logs if joint in log.held]
+        if found and np.ptp(np.concatenate(found)) <= STILL:
+            there[joint] = float(np.median(np.concatenate(found)))
+    if not there:
+        return job, []
+    shown = ", ".join(f"{joint} = {position:.4g}" for joint, position in there.items())
+    message = (
+        f"locked where the logs have them: {shown}. State other positions with locked = {{ joint "
+        "= position }"
+    )
+    note = Finding("locked_as_logged", "note", ", ".join(there), message, there)
+    return replace(job, locked={**job.locked, **there}), [note]
 
 
 def examine_logs(
@@ -125,7 +169,7 @@ def examine_logs(
     findings: list[Finding] = []
     for log in (*fitted, *kept):
         name = Path(log.path).name
-        findings += check_locked(model, log.held, name, job.locked)
+        findings += check_locked(model, log.held, name, job.placed(model))
         if len(log.windows) > 1:  # the windows have no notes of their own
             notes = log.head.notes
             findings += [Finding("log_note", "note", name, f"{name}: {note}") for note in notes]

@@ -8,9 +8,10 @@ from robotid._typing import Array
 from robotid.findings import Finding, log_finding
 from robotid.robot.model import RobotModel
 
-__all__ = ["check_locked"]
+__all__ = ["STILL", "check_locked"]
 
-_STILL = 0.02  # [rad or m] a held joint may move, or stand elsewhere, by so much
+#: A held joint may move, or stand elsewhere, by so much [rad or m].
+STILL = 0.02
 
 
 def check_locked(
@@ -27,10 +28,10 @@ def check_locked(
     for joint, q in positions.items():
         stated = model.locked[joint]
         middle, reach = float(np.median(q)), float(np.ptp(q))
-        if reach <= _STILL and abs(middle - stated) <= _STILL:
+        if reach <= STILL and abs(middle - stated) <= STILL:
             continue
         said = f"the job holds {joint} at {stated:.4g}" + ("" if joint in asked else ", unasked")
-        if reach > _STILL:
+        if reach > STILL:
             what = f"moves over {reach:.3g} there"
             todo = f"identify {joint}, too, or cut the log to where it stands"
         else:

@@ -223,8 +223,8 @@ def _locks(found: Identification, origin: Origin, causes: Sequence[Cause]) -> St
         for finding in cause.findings
         if "median" in finding.evidence
     }
-    asked = places or dict.fromkeys(joints, "POSITION")
-    words = f"State where the locked joints {listed(asked, _NAMED)} truly stood."
+    asked = places or dict.fromkeys(joints if len(joints) <= _NAMED else ["*"], "POSITION")
+    words = f"State where the locked joints {listed(places or joints, _NAMED)} truly stood."
     flags = [x for joint, place in asked.items() for x in ("--lock", f"{joint}={place}")]
     line = "\n".join(f"{toml_key(joint)} = {place}" for joint, place in asked.items())
     return Step(words, origin.stating("[locked]", line, *flags))

@@ -253,7 +253,8 @@ def locked_findings(model: RobotModel, stated: Collection[str]) -> list[Finding]
         return []
     message = (
         f"neither identified nor locked in the job: {listed(assumed)}. They are taken to "
-        "stand at 0; state their true positions with locked = { joint = position }"
+        "stand at 0; state their true positions with locked = { joint = position }, or that all "
+        'others stand at 0 with locked = { "*" = 0.0 }'
     )
     return [Finding("locked_at_zero", "warning", ", ".join(assumed), message)]
 

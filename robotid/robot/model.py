@@ -92,8 +92,8 @@ class RobotModel:
             path: The URDF file, or what was read of it.
             joints: Names of the joints that move, in the order wanted; all movable ones, in
                 Pinocchio's order, if None.
-            locked: Positions of joints held still [rad or m]; a joint that is neither in
-                ``joints`` nor here is held at 0.
+            locked: Positions of joints held still [rad or m], "*" that of all others; a joint that
+                is neither in ``joints`` nor here is held at 0, or follows the one it mimics.
             free_flyer: Whether the base floats; its six rows then come first.
             mimic: "independent" treats a mimic joint as a joint of its own with its own torque;
                 "coupled" moves it with the joint it mimics, whose torque then carries both.
@@ -385,7 +385,12 @@ def _choose_joints(
     followers: Mapping[str, tuple[str, float, float]],
 ) -> tuple[tuple[str, ...], dict[str, float]]:
     """Return the joints that move, in order, and the positions of those that do not."""
-    _check_joints(tree, [*(joints or ()), *locked], followers)
+    _check_joints(tree, [*(joints or ()), *(name for name in locked if name != "*")], followers)
+    if joints is None and "*" in locked:
+        raise ModelError(
+            "locked has '*', all joints that are not named, and joints does not say which move; "
+            "name those that are to be identified in joints"
+        )
     moving = tuple(name for name in free if name not in locked) if joints is None else tuple(joints)
     both = [name for name in moving if name in locked]
     if both:
@@ -404,9 +409,11 @@ def _choose_joints(
                 f"joint {name!r} is locked at {position!r}, wanted a number within +-{LARGEST:g} "
                 "[rad or m]"
             )
-    positions = {name: float(locked.get(name, 0.0)) for name in free if name not in moving}
+    others = locked.get("*", 0.0)
+    positions = {name: float(locked.get(name, others)) for name in free if name not in moving}
     _check_mimic(tree, moving, positions, followers)
-    for name, (leader, ratio, offset) in followers.items():
+    beside = {j.name: j.mimic for j in tree.movable if j.mimic and j.name not in locked}
+    for name, (leader, ratio, offset) in {**beside, **followers}.items():
         if leader in positions:
             positions[name] = ratio * positions[leader] + offset
     return moving, positions

@@ -44,12 +44,36 @@ def found(job):
     return [f for f in examine(job) if f.code == "locked_position"]
 
 
-@pytest.mark.parametrize(("stated", "said"), [(0.5, "at 0.5,"), (None, "at 0, unasked,")])
-def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated, said):
-    (finding,) = found(job(stated))
+@pytest.mark.parametrize("stated", [HELD, "*"])
+def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated):
+    (finding,) = found(replace(job(None), locked={stated: 0.5}))
     assert (finding.severity, finding.where) == ("error", f"run.csv: {HELD}")
-    assert said in finding.message
+    assert "holds wrist_3_joint at 0.5, but the log" in finding.message
     assert f"state locked = {{ {HELD} = 0.7 }}" in finding.message
+
+
+def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_path):
+    unplaced = job(None, estimator=EstimatorSettings("wls"))
+    assert found(unplaced) == []
+    identification, result = run_job(unplaced, tmp_path / "out")
+    assert dict(identification.model.locked) == {HELD: 0.7}
+    assert result["settings"]["locked"] == {HELD: 0.7}
+    (note,) = [f for f in identification.findings if f.code == "locked_as_logged"]
+    assert note in examine(unplaced)
+    assert (note.severity, note.where) == ("note", HELD)
+    assert "wrist_3_joint = 0.7" in note.message
+    assert "locked_at_zero" not in {f.code for f in identification.findings}
+    stated, _ = run_job(replace(unplaced, locked={HELD: 0.7}), tmp_path / "stated")
+    np.testing.assert_array_equal(identification.standard, stated.standard)
+
+
+def test_logs_that_disagree_of_a_joint_place_it_nowhere(job, tmp_path):
+    one = job(None)
+    log = read_log(tmp_path / "run.csv", (*one.model().joints, HELD))
+    write_log(replace(log, q=log.q + 0.1 * (np.arange(6) == 5), a=None), tmp_path / "two.csv")
+    two = replace(one, validation=(LogEntry(tmp_path / "two.csv"),))
+    assert [f.where for f in found(two)] == [f"run.csv: {HELD}", f"two.csv: {HELD}"]
+    assert "at 0, unasked, but" in found(two)[0].message
 
 
 def test_a_joint_that_moves_is_named_and_leads_the_verdict(job, tmp_path):

@@ -180,6 +180,18 @@ def test_a_locked_joint_is_stated_where_the_log_has_it(identified):
     )
 
 
+def test_many_locked_joints_are_placed_together(identified):
+    locked = {f"hand_{i}": 0.0 for i in range(40)}
+    hand = replace(identified, model=replace(identified.model, locked=locked))
+    (step, *_) = next_steps(told(hand, warning("locked_at_zero", ", ".join(locked))), FLAGS)
+    assert "hand_0, hand_1" in step.words
+    assert step.blocks == (
+        "robotid identify arm.urdf first.csv --cutoff 8 --lock '*=POSITION' --out out",
+    )
+    (step, *_) = next_steps(told(hand, warning("locked_at_zero", ", ".join(locked))), JOB)
+    assert step.blocks[0] == '[locked]\n"*" = POSITION'
+
+
 def test_a_result_without_trouble_is_measured_used_and_played(identified):
     calm = told(identified, validation=identified.validation)
     result = "out/result.json"

@@ -113,6 +113,18 @@ def test_a_mimic_joint_moves_with_its_leader_when_coupled(tmp_path):
         RobotModel.from_urdf(path, joints=["shoulder"])
 
 
+def test_joints_that_are_not_named_are_locked_together_and_mimics_follow():
+    path, arm = example_urdf("panda.urdf"), [f"panda_joint{i}" for i in (1, 2, 4)]
+    model = RobotModel.from_urdf(path, joints=arm, locked={"panda_joint5": 0.3, "*": 0.02})
+    others = [f"panda_joint{i}" for i in (3, 5, 6, 7)]
+    assert model.joints == tuple(arm)
+    assert model.locked["panda_joint5"] == 0.3
+    assert {model.locked[j] for j in others if j != "panda_joint5"} == {0.02}
+    apart = RobotModel.from_urdf(path, joints=arm, locked={"panda_finger_joint1": 0.03})
+    assert apart.locked["panda_finger_joint2"] == 0.03
+    assert apart.locked["panda_joint3"] == 0.0
+
+
 def test_a_floating_base_comes_first(tmp_path):
     model = RobotModel.from_urdf(write(tmp_path), free_flyer=True)
     assert model.n_rows == 8
@@ -133,6 +145,7 @@ BAD = {
         dict(joints=["elbow2"]),
         "joint 'elbow2' is not in two.urdf; joints: shoulder, elbow. Did you mean 'elbow'?",
     ),
+    "all others locked, but of none": (dict(locked={"*": 0.0}), "name those that are to be"),
     "identified and locked": (
         dict(joints=["elbow"], locked={"elbow": 0.0}),
         "joints elbow are both identified and locked",
