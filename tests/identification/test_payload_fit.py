@@ -214,7 +214,7 @@ def test_what_cannot_be_asked_is_refused_by_name(ur5, rng):
     refused(ModelError, "link 'hook' is not in ur5_robot.urdf; links: ", links=["hook"])
     refused(SettingsError, "nothing sets their scale", unknown_gains=ur5.joints)
     refused(SettingsError, "a mass of ee_link is stated", masses={"ee_link": 1.0})
-    refused(SettingsError, "is -1 kg", masses={"wrist_3_link": -1.0})
+    refused(SettingsError, "is -1.0 kg", masses={"wrist_3_link": -1.0})
     refused(SettingsError, "gains of hip are wanted", unknown_gains=["hip"])
     short = [x.window(0.0, 1.0) for x in (log, without)]
     refused(DataError, "the motion does not show the mass of what hangs on wrist_3_link", short)
