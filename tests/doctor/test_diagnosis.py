@@ -82,6 +82,12 @@ def test_each_corruption_is_found_by_its_own_code(name, table, tmp_path):
     json.dumps(findings_to_dict(findings), allow_nan=False)
 
 
+def test_a_coarse_velocity_that_is_not_used_is_a_note(table, tmp_path):
+    _, job = spoil("velocity of a 12-bit encoder", table, tmp_path)
+    job = replace(job, signals=replace(job.signals, velocity="differentiated"))
+    assert "quantised" not in loud(examine(job))
+
+
 def test_where_names_the_joint_and_the_evidence_says_how_much(table, tmp_path):
     _, job = spoil("one torque negated", table, tmp_path)
     (found,) = [f for f in examine(job) if f.code == "torque_sign"]

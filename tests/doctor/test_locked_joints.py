@@ -54,6 +54,10 @@ def test_a_joint_that_stands_elsewhere_is_named_with_its_position(job, stated):
 
 def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_path):
     unplaced = job(None, estimator=EstimatorSettings("wls"))
+    log = read_log(tmp_path / "run.csv", (*unplaced.model().joints, HELD))
+    q = log.q.copy()
+    q[0, -1] += 0.01  # the first row is no better than others
+    write_log(replace(log, q=q, a=None), tmp_path / "run.csv")
     assert found(unplaced) == []
     identification, result = run_job(unplaced, tmp_path / "out")
     assert dict(identification.model.locked) == {HELD: 0.7}
@@ -65,6 +69,14 @@ def test_a_joint_that_nobody_placed_is_locked_where_the_logs_have_it(job, tmp_pa
     assert "locked_at_zero" not in {f.code for f in identification.findings}
     stated, _ = run_job(replace(unplaced, locked={HELD: 0.7}), tmp_path / "stated")
     np.testing.assert_array_equal(identification.standard, stated.standard)
+
+
+def test_a_mimic_joint_is_placed_with_its_leader(job):
+    arm = [f"panda_joint{i}" for i in range(1, 8)]
+    finger = {"panda_finger_joint1": 0.03}
+    panda = replace(job(None), urdf=example_urdf("panda.urdf"), joints=arm, locked=finger)
+    assert panda.placed(panda.model()) == ("panda_finger_joint1", "panda_finger_joint2")
+    assert replace(panda, locked={}).placed(panda.model()) == ()
 
 
 def test_logs_that_disagree_of_a_joint_place_it_nowhere(job, tmp_path):

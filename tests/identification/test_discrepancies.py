@@ -11,7 +11,7 @@ from helpers.misfits import EFFECTS, log_with
 from helpers.paths import ROOT
 
 from robotid.identification.discrepancies import explain_residual
-from robotid.identification.misfit import find_misfits, take_sample
+from robotid.identification.misfit import along, find_misfits, take_sample, trials
 from robotid.identification.settings import EstimatorSettings
 from robotid.logs.data import Log
 from robotid.robot.examples import example_urdf
@@ -116,34 +116,53 @@ def both(truth, model, seed, joint, offset, **effect):
     found = fitted(model, [replace(log, q=log.q + moved) for log in logs])
     misfits, discrepancies = explain_residual(found, take_sample(found))
     assert discrepancies == tuple(f for f in found.findings if f in discrepancies)
-    return find_misfits(take_sample(found)), misfits, [(f.code, f.where) for f in discrepancies]
+    return find_misfits(take_sample(found)), misfits, discrepancies
+
+
+def named(findings):
+    return [(finding.code, finding.where) for finding in findings]
 
 
 def test_a_zero_that_is_off_makes_no_spring_of_another_joint():
     joints = [f"panda_joint{i}" for i in range(1, 8)]
     panda = RobotModel.from_urdf(example_urdf("panda.urdf"), joints=joints)
-    alone, misfits, named = both(panda, panda, 2, 1, 0.15, rate=50.0)
+    alone, misfits, others = both(panda, panda, 2, 1, 0.15, rate=50.0)
     assert [(m.joint, m.term.code, m.matters) for m in alone] == [("panda_joint3", "spring", True)]
     assert misfits == ()
-    assert named == [("position_offset", "panda_joint2")]
+    assert named(others) == [("position_offset", "panda_joint2")]
 
 
 @pytest.mark.parametrize(("offset", "size"), [(0.1, 1.0), (0.03, 3.0)])  # what explains more
 def test_a_spring_is_named_beside_a_zero_that_is_off(model, offset, size):
-    alone, (spring,), named = both(model, model, 3, 2, offset, effect="spring", size=size)
+    alone, (spring,), others = both(model, model, 3, 2, offset, effect="spring", size=size)
     assert (spring.joint, spring.term.name) == ("elbow_joint", "linear spring")
     assert spring.size == pytest.approx(alone[0].size, rel=0.01)
-    assert named == [("position_offset", "elbow_joint")]
+    assert named(others) == [("position_offset", "elbow_joint")]
+    assert others[0].evidence["size"] == pytest.approx(-offset, rel=0.04)
+
+
+def test_columns_beside_the_base_parameters_are_refitted_with_them(model, rng):
+    found = fitted(model, [log_with(model, 3, "spring", part=part) for part in (0, 1)])
+    sample = take_sample(found)
+    Z = rng.standard_normal((*sample.r.shape, 2)) + sample.r[..., None]
+    together, _ = trials(sample, slice(None), Z)[1].estimate([0, 1], sample.fitted)
+    beside = sample.beside(Z[..., :1])
+    alone, _ = trials(beside, slice(None), Z[..., 1:])[1].estimate([0], sample.fitted)
+    assert alone[0] == pytest.approx(together[1], rel=2e-3)
+    tau = np.concatenate([m.tau for m in sample.at])
+    there = along(beside, found.model, sample.at, tau)
+    np.testing.assert_allclose(there.W, beside.W, atol=1e-9 * np.abs(beside.W).max())
+    assert not there.r.any()
 
 
 def test_a_base_that_is_not_level_makes_no_counterbalance(model):
     turn = pin.exp3(np.array([np.radians(6), 0.0, 0.0]))
     gravity = turn @ np.array([0.0, 0.0, -9.81])
     truth = RobotModel.from_urdf(example_urdf("ur5_robot.urdf"), gravity=gravity)
-    alone, misfits, named = both(truth, model, 3, 1, 0.1)
+    alone, misfits, others = both(truth, model, 3, 1, 0.1)
     assert [(m.joint, m.term.code) for m in alone] == [("shoulder_pan_joint", "position_periodic")]
     assert misfits == ()
-    assert named == [("gravity", "all joints"), ("position_offset", "shoulder_lift_joint")]
+    assert named(others) == [("gravity", "all joints"), ("position_offset", "shoulder_lift_joint")]
 
 
 def test_a_joint_that_lies_elsewhere_is_named(model, tmp_path):

@@ -182,6 +182,32 @@ def test_a_good_prior_gets_more_weight_than_a_bad_one(case):
         assert bad <= 0.1, how
 
 
+def test_the_information_of_all_segments_but_one_counts_the_share_that_is_independent(case):
+    fit, problem = case
+    fit, stretches = replace(fit, independent_share=0.25), cut(problem, 3)
+    segments = Segments.of(fit, stretches, NOISE)
+    for k, rows in enumerate(segments.others):
+        others = fit.rows(merge([s for i, s in enumerate(stretches) if i != k]), NOISE)
+        np.testing.assert_allclose(rows.T @ rows, others.T @ others, rtol=1e-9, atol=1e-6)
+
+
+def test_the_noise_level_is_that_of_the_whole_regressor(case):
+    fit, problem = case
+    fit = replace(fit, metric="euclidean", prior_weight=100.0, independent_share=0.5)
+    W, tau, _ = (np.concatenate(x) for x in zip(*problem.blocks(), strict=True))
+    W, tau = (W @ fit.K).reshape(-1, 6, fit.K.shape[1]), tau.reshape(-1, 6)
+    sigma = np.ones(6)
+    H = 100.0 * 0.5 * fit.penalty.hessian(fit.penalty.centre)
+    for _ in range(100):
+        weights = 0.5 / sigma**2
+        A = np.einsum("kjp,j,kjq->pq", W, weights, W) + H
+        b = np.einsum("kjp,j,kj->p", W, weights, tau) + H @ fit.penalty.centre
+        r = tau - W @ np.linalg.solve(A, b)
+        spent = np.einsum("kjp,pq,kjq->j", W, np.linalg.inv(A), W) * weights
+        sigma = np.sqrt((r**2).sum(axis=0) / (len(tau) - spent / 0.5))
+    np.testing.assert_allclose(fit.noise(compress(problem)), sigma, rtol=1e-3)
+
+
 def test_one_stretch_is_too_few(case):
     fit, problem = case
     with pytest.raises(DataError, match="cannot be chosen from 1 stretch"):
